@@ -22,8 +22,8 @@ import torch
 from facediff.cli.adapt import adapt
 from facediff.cli.lightning import run_cli
 from facediff.data import Puppet, collate
-from facediff.data.audio import SAMPLE_RATE
 from facediff.models import AnimationModel, StyleContentDisentanglement, load_model
+from facediff.speech.audio import SAMPLE_RATE
 from facediff.synthetic import SEEN_IDENTITIES, UNSEEN_IDENTITIES
 
 SYSTEMS = {

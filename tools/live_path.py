@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from facediff.data.windows import LOW_LATENCY, WindowPlan
-from facediff.live.resampling import Resampler
 from facediff.live.timing import MARGIN
+from facediff.speech.resampling import Resampler
+from facediff.speech.windows import LOW_LATENCY, WindowPlan
 
 WIDTH, LEFT, RIGHT = 1000, 40, 960
 TEXT, QUIET, LINE = "#223", "#334", "#556"

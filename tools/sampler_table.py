@@ -27,11 +27,11 @@ from statistics import fmean, stdev
 import torch
 
 from facediff.data import Batch, Sample, SpeechMotionDataModule, collate
-from facediff.data.audio import SAMPLE_RATE, samples_for
 from facediff.errors import FaceDiffError
 from facediff.metrics import Region, SampleDiversity
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.checkpoint import corpus_class
+from facediff.speech.audio import SAMPLE_RATE, samples_for
 
 SAMPLERS = ("ddpm:1000", "ddim:50", "ddim:25", "ddim:10", "dpm_solver:20", "dpm_solver:10", "dpm_solver:5")
 TIMED_SECONDS = 10.0

@@ -32,8 +32,8 @@ from scipy.signal import butter, fftconvolve, lfilter, sosfilt
 
 import facediff
 from facediff.data import Puppet, Sample
-from facediff.data.audio import fit_length
-from facediff.data.phonemes import closures, phonemes_file, read_phonemes
+from facediff.speech.audio import fit_length
+from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic
 from facediff.utils.tables import print_table

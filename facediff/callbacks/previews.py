@@ -29,7 +29,6 @@ from torch import Tensor
 from facediff import registry
 from facediff.callbacks.runs import run_folder
 from facediff.data import Sample, SpeechMotionDataModule, collate
-from facediff.data.audio import fit_length, samples_for
 from facediff.data.corpus import Clip
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.metrics import SequenceMetric
@@ -38,6 +37,7 @@ from facediff.models import AnimationModel
 from facediff.models.evaluation import regions_of
 from facediff.registry import checks_arguments
 from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
+from facediff.speech.audio import fit_length, samples_for
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 

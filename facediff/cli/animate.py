@@ -176,8 +176,8 @@ def animate(
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     check_model_source(checkpoint)
     check_scheduler(batch.scheduler)
-    from facediff.data.voice_activity import speech_problems
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, direction_for, read_recording
+    from facediff.speech.voice_activity import speech_problems
 
     several = len(speech) > 1 or speech[0].is_dir()
     files.check(batch.suffix if several else ".npy" if windows.stream else output.suffix)

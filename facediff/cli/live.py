@@ -120,11 +120,11 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
     """
     import numpy as np
 
-    from facediff.data.windows import LOW_LATENCY
     from facediff.live.model import LiveModel
     from facediff.models import load_model
     from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, usable_device
     from facediff.pipelines.stream import LiveAnimation
+    from facediff.speech.windows import LOW_LATENCY
     from facediff.utils.licences import licence_metadata
 
     model = load_model(options.model, usable_device(device))

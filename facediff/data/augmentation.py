@@ -23,9 +23,9 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import fit_length
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, augmentation, checks_arguments
+from facediff.speech.audio import fit_length
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 

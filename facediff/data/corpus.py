@@ -18,7 +18,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.data.audio import samples_for
 from facediff.data.manifest import LONGEST
 from facediff.data.manifest import read_manifest as read_manifest
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
@@ -28,6 +27,7 @@ from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
+from facediff.speech.audio import samples_for
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir, sha256
 from facediff.utils.limits import COORDINATE, LIMITS, quoted

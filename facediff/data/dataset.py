@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from facediff.data.audio import samples_for
 from facediff.data.augmentation import Augmenter, Example
 from facediff.data.batch import UNKNOWN_IDENTITY, Sample
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import samples_for
 from facediff.utils.arrays import ArrayStore
 
 # Features of an audio encoder's frozen part, kept on disk, one array for each clip.

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import read_stretch
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore, in_range, open_vertices
 from facediff.utils.limits import COORDINATE, quoted
 
@@ -85,7 +85,7 @@ class ClipFolder:
         return MotionFile(motion_path(self.root, name), self.n_vertices)
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
-        """Samples of the clip's .wav file; see :func:`~facediff.data.audio.read_stretch`."""
+        """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
         return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store)
 
     def version(self, name: str) -> object:

@@ -11,9 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from facediff.data.audio import SAMPLE_RATE, read_speech
 from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, read_manifest
-from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import (
     DEFAULT_PATTERNS,
@@ -31,6 +29,8 @@ from facediff.evaluation.report import Bootstrap, MethodTable, Report, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
+from facediff.speech.audio import SAMPLE_RATE, read_speech
+from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
 
 

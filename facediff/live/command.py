@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.errors import FaceDiffError, printable
 from facediff.live.frames import OPTION, Performance, Receiver, open_receivers
 from facediff.live.loop import Loop, Solver, Summary
@@ -16,6 +15,7 @@ from facediff.live.model import LiveModel, runtime_model, usual_gate
 from facediff.live.sound import SoundOut
 from facediff.live.sources import USUAL, Microphone, Pcm, Played, Source
 from facediff.registry import receiver
+from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.utils import ranges
 
 OFF, OUT, RECEIVERS = "off", "out", "receivers"

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import samples_for
 from facediff.live.frames import LiveFrame, Receiver
 from facediff.live.model import LiveModel
 from facediff.live.sources import Source, Speech
 from facediff.live.timing import Lags, Pacer, SpokenClock
+from facediff.speech.audio import samples_for
 from facediff.utils import SAMPLE_RATE
 
 Array = npt.NDArray[np.float32]

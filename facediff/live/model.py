@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.voice_activity import USUAL_GATE, EnergyGate, Openness, VoiceGate
+from facediff.speech.voice_activity import USUAL_GATE, EnergyGate, Openness, VoiceGate
 from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:

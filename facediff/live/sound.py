@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.live.frames import Address, LiveFrame, Performance, Receiver
-from facediff.live.resampling import Resampler
 from facediff.live.sources import USUAL, find_device, sound_library
 from facediff.live.timing import Pacer, SpokenClock
+from facediff.speech.resampling import Resampler
 from facediff.utils import SAMPLE_RATE
 
 Array = npt.NDArray[np.float32]

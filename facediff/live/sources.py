@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.pcm import pcm
 from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.live.resampling import Resampler
+from facediff.speech.pcm import pcm
+from facediff.speech.resampling import Resampler
 from facediff.utils import SAMPLE_RATE
 
 Speech = npt.NDArray[np.float32]
@@ -66,14 +66,14 @@ class Played(Source):
     """A recording in real time, as if it were spoken now.
 
     Args:
-        path: of any format, rate and number of channels that :func:`~facediff.data.audio.read_speech` takes.
+        path: of any format, rate and number of channels that :func:`~facediff.speech.audio.read_speech` takes.
 
     Raises:
         FaceDiffError: naming the file.
     """
 
     def __init__(self, path: Path) -> None:
-        from facediff.data.audio import read_speech
+        from facediff.speech.audio import read_speech
 
         self.name = str(path)
         self.samples = read_speech(path)

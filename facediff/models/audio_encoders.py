@@ -17,10 +17,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.data.frame_clock import CONVOLUTIONS, convolved
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
+from facediff.speech.frame_clock import CONVOLUTIONS, convolved
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import quoted
 from facediff.utils.ranges import Range

@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
 from facediff.data.packed.stores import address_of
-from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
@@ -33,6 +32,7 @@ from facediff.models.layers import frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.principal import PrincipalComponents
 from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, keeps_arguments, plain
+from facediff.speech.windows import WindowPlan
 from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_options import is_name, is_plain_text

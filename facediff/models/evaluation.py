@@ -13,10 +13,8 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
-from facediff.data.audio import SAMPLE_RATE
 from facediff.data.batch import pad
 from facediff.data.corpus import EYELID_PAIRS
-from facediff.data.phonemes import closures, phonemes_file, read_phonemes
 from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.metrics import (
@@ -34,6 +32,8 @@ from facediff.metrics import (
 )
 from facediff.metrics.by_name import parse_all
 from facediff.models.inference import Inference, Style
+from facediff.speech.audio import SAMPLE_RATE
+from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
 """Which identity unseen speakers are tested with. ``style_only``: none, with the style of their own reference.

@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.data.frame_clock import FrameClock
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import Lengths, Waves
 from facediff.models.layers import of_frames
+from facediff.speech.frame_clock import FrameClock
 
 if TYPE_CHECKING:
     from facediff.models.base import AnimationModel

@@ -30,11 +30,11 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, Example, OfSpeech, read_augmentations
-from facediff.data.windows import LOW_LATENCY, QUIETEST
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.layers import frame_mask
+from facediff.speech.windows import LOW_LATENCY, QUIETEST
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.jobs import processors
 from facediff.utils.ranges import USUAL_VOICE_STEPS

@@ -21,11 +21,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
-from facediff.data.audio import samples_for
-from facediff.data.frame_clock import FrameClock
-from facediff.data.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
+from facediff.speech.audio import samples_for
+from facediff.speech.frame_clock import FrameClock
+from facediff.speech.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 
 if TYPE_CHECKING:
     from facediff.models.graphs import Graphs
@@ -129,7 +129,7 @@ class Inference(ABC):
 
         Example:
             >>> model = facediff.models.load_model(Path("demo/puppet.ckpt"))  # doctest: +SKIP
-            >>> speech = torch.from_numpy(facediff.data.audio.read_speech(Path("speech.wav")))  # doctest: +SKIP
+            >>> speech = torch.from_numpy(facediff.speech.audio.read_speech(Path("speech.wav")))  # doctest: +SKIP
             >>> model.animate(speech, identity="F1", seed=3).vertices.shape  # doctest: +SKIP
             torch.Size([150, 1008, 3])
         """
@@ -529,7 +529,7 @@ class Inference(ABC):
 
 
 class SpeechStream(SpeechWindows[Motion]):
-    """Animates one clip from speech that arrives in pieces, as :class:`~facediff.data.windows.SpeechWindows` says.
+    """Animates one clip from speech that arrives in pieces, as :class:`~facediff.speech.windows.SpeechWindows` says.
 
     The result depends on the speech, the plan and the seeds only. It keeps the expressivity that the model has when it
     is made.

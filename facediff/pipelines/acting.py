@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prosody import ProsodicEvent, Prosody
-from facediff.data.voice_activity import HOP, Wave
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, acting, checks_arguments
+from facediff.speech.prosody import ProsodicEvent, Prosody
+from facediff.speech.voice_activity import HOP, Wave
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
@@ -99,7 +99,7 @@ def act(kind: Acting, animation: Animation, seed: int) -> Acted:
     """
     if animation.speech is None:
         raise FaceDiffError(f"{animation.name}: --acting: has no speech to act on; give it with --speech")
-    from facediff.data.audio import to_speech
+    from facediff.speech.audio import to_speech
 
     speech = animation.speech
     if animation.sample_rate != SAMPLE_RATE:

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from facediff.animation import Animation
     from facediff.data import Assets, Reference
-    from facediff.data.phonemes import Phoneme
-    from facediff.data.voice_activity import VoiceGate
     from facediff.editing.controlled import ControlledFace
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
@@ -36,6 +34,8 @@ if TYPE_CHECKING:
     from facediff.pipelines.acting import Acting, Performer
     from facediff.pipelines.directing import DirectedStream
     from facediff.pipelines.rest import MouthAtRest
+    from facediff.speech.phonemes import Phoneme
+    from facediff.speech.voice_activity import VoiceGate
 
 MIN_SECONDS = 0.2
 STEP_SECONDS = 0.01  # What a denoising step of a second of speech takes on two cores (tools/benchmarks/RESULTS.md)
@@ -99,14 +99,14 @@ class AnimationOptions:
     @property
     def gate(self) -> VoiceGate | None:
         """What finds the pauses in which the mouth comes to rest; None if nothing does."""
-        from facediff.data.voice_activity import read_gate
+        from facediff.speech.voice_activity import read_gate
 
         return read_gate(self.gate_text)
 
     @property
     def gate_text(self) -> str:
         """The gate's name with its options."""
-        from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE
+        from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE
 
         # The usual gate looks further ahead than windows of low latency do.
         return QUICK_GATE if self.low_latency and self.voice_gate == USUAL_GATE else self.voice_gate
@@ -271,7 +271,7 @@ class AnimationPipeline:
 
     def cost(self, speech: npt.NDArray[np.float32], output: Path) -> tuple[float, float]:
         """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech (S,)."""
-        from facediff.data.audio import SAMPLE_RATE
+        from facediff.speech.audio import SAMPLE_RATE
 
         count, heard = self.options.samples, len(speech) / SAMPLE_RATE
         frames = count * heard * self.model.frame_rate
@@ -316,7 +316,7 @@ class AnimationPipeline:
         seeds, name = [seed + i for i in range(self.options.samples)], valid_text(name)
         heard = speech
         if self.options.denoise:
-            from facediff.data.denoising import denoised
+            from facediff.speech.denoising import denoised
 
             heard = denoised(speech)
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
@@ -395,8 +395,8 @@ class AnimationPipeline:
     def closed(self, animation: Animation) -> Animation:
         """A sample whose lips touch where its phonemes say so, if their times are given."""
         alignment, transcript, speech = self.options.alignment, self.options.transcript, animation.speech
-        from facediff.data.phonemes import closed_times, read_alignment
         from facediff.editing.closures import BUDGET, close_lips
+        from facediff.speech.phonemes import closed_times, read_alignment
 
         if self._phonemes is None:
             if alignment is not None:
@@ -420,7 +420,7 @@ class AnimationPipeline:
         """How far the mouth may be open in each frame (frames,) of some speech (S,); None without a gate."""
         if self.rest is None:
             return None
-        from facediff.data.voice_activity import openness
+        from facediff.speech.voice_activity import openness
 
         return openness(speech, frames, self.model.frame_rate, self.rest.gate)
 
@@ -561,7 +561,7 @@ def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[
     Raises:
         FaceDiffError: if the file cannot be read, or lasts too short or too long.
     """
-    from facediff.data.audio import read_speech
+    from facediff.speech.audio import read_speech
 
     speech = read_speech(path, max_seconds=max_seconds)
     check_speech(speech, str(path))
@@ -574,7 +574,7 @@ def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
     Raises:
         FaceDiffError: naming ``name``, if it lasts too short.
     """
-    from facediff.data.audio import SAMPLE_RATE
+    from facediff.speech.audio import SAMPLE_RATE
 
     seconds = len(speech) / SAMPLE_RATE
     if seconds < MIN_SECONDS:

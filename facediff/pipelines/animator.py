@@ -510,7 +510,7 @@ def speech_of(
         return read_recording(Path(speech), max_seconds), Path(speech).stem
     import torch
 
-    from facediff.data.audio import to_speech
+    from facediff.speech.audio import to_speech
 
     if isinstance(speech, tuple):
         if rate is not None or len(speech) != 2:
@@ -573,7 +573,7 @@ def mono(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     import numpy as np
 
     if isinstance(chunk, bytes):
-        from facediff.data.pcm import samples_of
+        from facediff.speech.pcm import samples_of
 
         if len(chunk) % 2:
             raise FaceDiffError(f"chunks: one has {len(chunk)} bytes, half a sample too much; give 16-bit samples")

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facediff.data.windows import in_parts
 from facediff.editing.direction import Direction, Key, curve, text_shares
 from facediff.editing.expressiveness import ALL, region_weights
 from facediff.errors import FaceDiffError
 from facediff.models.inference import Progress, SpeechStream
 from facediff.models.styles import style_from
+from facediff.speech.windows import in_parts
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     import onnx
     import torch
 
-    from facediff.data.frame_clock import FrameClock
     from facediff.models.base import AnimationModel
     from facediff.models.graphs import Graph, Graphs
+    from facediff.speech.frame_clock import FrameClock
 
 Precision = Literal["float32", "float16", "int8"]
 

@@ -181,7 +181,7 @@ def _load_pipeline(options: AnimationOptions, seed: int, max_seconds: float | No
 
 def recordings(paths: Sequence[Path]) -> list[Path]:
     """Recordings, and those that lie in folders (not deeper), each once."""
-    from facediff.data.audio import CONTAINERS, SUFFIXES
+    from facediff.speech.audio import CONTAINERS, SUFFIXES
 
     known = SUFFIXES + CONTAINERS
     found: dict[Path, Path] = {}

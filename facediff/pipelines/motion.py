@@ -513,7 +513,7 @@ class Source:
             overrides |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
             overrides |= {} if mesh.colours is None else {"colours": mesh.colours}
         if self.speech is not None:
-            from facediff.data.audio import read_speech
+            from facediff.speech.audio import read_speech
             from facediff.utils import SAMPLE_RATE
 
             overrides |= {"speech": read_speech(self.speech), "sample_rate": SAMPLE_RATE}

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.voice_activity import Openness, VoiceGate, toward_rest
+from facediff.speech.voice_activity import Openness, VoiceGate, toward_rest
 
 
 class MouthAtRest:

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.data.pcm import pcm
 from facediff.errors import FaceDiffError
 from facediff.pipelines.animate import AnimationOptions, AnimationPipeline
+from facediff.speech.pcm import pcm
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic, check_writable
 
@@ -82,7 +82,7 @@ class LiveAnimation:
     def __init__(self, pipeline: AnimationPipeline, *, rate: int = SAMPLE_RATE, seed: int = 0) -> None:
         import numpy as np
 
-        from facediff.data.audio import resampler
+        from facediff.speech.audio import resampler
 
         self._pipeline, model, self._seed = pipeline, pipeline.model, seed
         self._chosen = model.choices()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.phonemes import Phoneme, spoken_by_machine
-from facediff.data.voice_activity import EnergyGate, openness
 from facediff.errors import FaceDiffError
+from facediff.speech.phonemes import Phoneme, spoken_by_machine
+from facediff.speech.voice_activity import EnergyGate, openness
 from facediff.utils import SAMPLE_RATE
 
 RATE = 100.0

@@ -10,11 +10,11 @@ from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
-from facediff.data.pcm import pcm
-from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.errors import FaceDiffError
 from facediff.runtime.gated import GatedStream
 from facediff.runtime.model import RuntimeModel, real_time_factor
+from facediff.speech.pcm import pcm
+from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.utils import SAMPLE_RATE
 from facediff.version import __version__
 
@@ -112,8 +112,8 @@ def run(options: argparse.Namespace) -> None:
             sys.stdout.buffer.write(np.ascontiguousarray(frames, "<f4").tobytes())
             sys.stdout.buffer.flush()
         return
-    from facediff.data.audio import read_speech
     from facediff.export.writing import write_animations
+    from facediff.speech.audio import read_speech
 
     speech = read_speech(Path(options.speech))
     before = time.perf_counter()

@@ -15,9 +15,9 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.frame_clock import FrameClock, Rule
-from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
+from facediff.speech.frame_clock import FrameClock, Rule
+from facediff.speech.windows import WindowPlan
 from facediff.utils.arrays import read_arrays
 from facediff.utils.plain_files import load_json
 
@@ -56,7 +56,7 @@ class Description:
         identities: training identities, in the order of the identity index.
         faces: identities with a neutral face, in the order of the array ``templates``.
         styles: names of the style vectors, in the order of the array ``styles``; a name of an identity is its default.
-        windows: how long speech is cut, as :class:`~facediff.data.windows.WindowPlan` takes it.
+        windows: how long speech is cut, as :class:`~facediff.speech.windows.WindowPlan` takes it.
         epsilon: added to the variance of speech before it is standardised.
         equal_lengths: whether all clips of a batch must be of one length.
         state: numbers in a frame of noisy motion.
@@ -69,7 +69,7 @@ class Description:
         generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
             said of the loop is 0, empty, and ``last_step`` −1, as in a model that predicts no mean.
         blending: where windows go over into one another: in all ``steps`` of the loop, or in the ``motion``.
-        clock: how the model counts frames, as :class:`~facediff.data.frame_clock.FrameClock` takes it.
+        clock: how the model counts frames, as :class:`~facediff.speech.frame_clock.FrameClock` takes it.
         style_source: what a style is: of a ``reference`` motion; a training ``identity``; ``none`` if there are none.
         longest: frames at most of what is animated in one pass; 0 for any number.
         drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.

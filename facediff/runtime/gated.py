@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.voice_activity import toward_rest
 from facediff.runtime.model import RuntimeStream
+from facediff.speech.voice_activity import toward_rest
 
 Array = npt.NDArray[np.float32]
 

@@ -14,13 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.data.audio import samples_for
-from facediff.data.voice_activity import EnergyGate, Openness, VoiceGate, openness, toward_rest
-from facediff.data.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.runtime.folder import Arrays, Description, read_folder
 from facediff.runtime.sampling import NAME, Conditions, Heard, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, read_style
+from facediff.speech.audio import samples_for
+from facediff.speech.voice_activity import EnergyGate, Openness, VoiceGate, openness, toward_rest
+from facediff.speech.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Expressivity, Seed, mismatch
 from facediff.version import __version__
@@ -336,7 +336,7 @@ class RuntimeModel:
 
 
 class RuntimeStream(SpeechWindows[Array]):
-    """Animates speech that arrives in pieces; see :class:`~facediff.data.windows.SpeechWindows`.
+    """Animates speech that arrives in pieces; see :class:`~facediff.speech.windows.SpeechWindows`.
 
     :meth:`feed` and :meth:`finish` give offsets (1, frames, vertices, 3) from the template, before any gate.
 

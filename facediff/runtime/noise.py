@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.windows import Window
+from facediff.speech.windows import Window
 
 Noise = npt.NDArray[np.float32]
 

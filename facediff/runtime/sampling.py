@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.windows import Window
 from facediff.runtime.noise import ClipNoise, SeedNoise, WindowNoise
+from facediff.speech.windows import Window
 
 if TYPE_CHECKING:
     from facediff.runtime.model import RuntimeModel

@@ -17,14 +17,14 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.animation.files import FORMAT as ARCHIVE
-from facediff.data.voice_activity import QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
-from facediff.data.windows import LOW_LATENCY
 from facediff.errors import FaceDiffError
 from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.export.viewer.page import assemble, script_of
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
 from facediff.runtime.onnxruntime_web import LICENCE
+from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
+from facediff.speech.windows import LOW_LATENCY
 from facediff.utils.files import atomic_folder
 from facediff.utils.server import HEADERS as SERVED
 from facediff.utils.server import OwnPagesOnly, WithHeaders, names_of, require_server, run_server

@@ -20,9 +20,9 @@ import torch
 
 from facediff.animation import read_archive
 from facediff.cli.app import main
-from facediff.data.audio import read_speech
 from facediff.mesh import read_mesh
 from facediff.models import DualPathDiffusion, load_model
+from facediff.speech.audio import read_speech
 from tests.fakes.words import last_of_each
 
 

@@ -15,7 +15,7 @@ import soundfile
 
 import facediff
 from facediff.cli.app import main
-from facediff.data.audio import read_speech
+from facediff.speech.audio import read_speech
 
 WINDOWS = {"window": 0.6, "overlap": 0.2, "voice_gate": "off"}
 WORDS = ["--window", "0.6", "--overlap", "0.2", "--voice-gate", "off"]

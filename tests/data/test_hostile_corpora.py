@@ -17,7 +17,7 @@ from facediff.data.prepare.biwi import read_vl
 from facediff.data.prepare.motion import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import quoted
-from tests.data.test_hostile_audio import wave
+from tests.speech.test_audio import wave
 
 FACE = np.random.default_rng(0).normal(size=(9, 3))
 

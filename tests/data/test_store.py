@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.data import audio
-from facediff.data.audio import read_speech, read_stretch
 from facediff.errors import FaceDiffError
+from facediff.speech import audio
+from facediff.speech.audio import read_speech, read_stretch
 from facediff.utils.arrays import ArrayStore
 
 

@@ -15,10 +15,10 @@ from torchmetrics import Metric
 
 import facediff.metrics as fm
 from facediff import registry
-from facediff.data.phonemes import closures, read_phonemes
 from facediff.errors import FaceDiffError
 from facediff.evaluation import Report, text
 from facediff.metrics import LipPairs, parse
+from facediff.speech.phonemes import closures, read_phonemes
 from tests.evaluation.conftest import LENGTHS, LIPS, VERTICES, Files, write_corpus
 
 PAIRS = [(1, 2), (7, 11)]

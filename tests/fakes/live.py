@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from facediff.data.audio import samples_for
 from facediff.live.frames import Address, LiveFrame, Performance, Receiver
 from facediff.live.model import LiveModel
 from facediff.live.sources import Deliver, Source
+from facediff.speech.audio import samples_for
 
 VERTICES = 4
 FRAME_RATE = 50.0

@@ -15,12 +15,12 @@ import soundfile
 from facediff.cli.app import main as facediff
 from facediff.cli.live import live
 from facediff.cli.parsing import flat, parameters_of
-from facediff.data.voice_activity import EnergyGate, Openness, read_gate
 from facediff.errors import FaceDiffError
 from facediff.live.app import main, parser
 from facediff.live.command import LiveOptions, perform
 from facediff.live.model import LiveModel, usual_gate
 from facediff.registry import Kind
+from facediff.speech.voice_activity import EnergyGate, Openness, read_gate
 from tests.fakes.live import FakeSound, Kept, device, fake_model
 
 MADE: list[Kept] = []

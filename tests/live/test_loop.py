@@ -9,10 +9,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from facediff.data.audio import samples_for
 from facediff.errors import FaceDiffError
 from facediff.live.loop import Backlog, Loop
 from facediff.live.sources import Deliver
+from facediff.speech.audio import samples_for
 from tests.fakes.live import AHEAD, FRAME_RATE, HOP, FakeStream, Kept, Spoken, fake_model
 
 FRAME = 1 / FRAME_RATE

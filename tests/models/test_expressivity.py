@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, collate
-from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, StyleContentDisentanglement
 from facediff.models.folding import FoldedSpace, VertexSpace
+from facediff.speech.windows import WindowPlan
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 Ready = Callable[..., DualPathDiffusion]

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, collate
-from facediff.data.windows import WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.dual_path.network import Hidden
 from facediff.models.folding import FoldedSpace, VertexSpace
+from facediff.speech.windows import WindowPlan
 from tests.fakes.tiny import Tiny
 
 Ready = Callable[..., DualPathDiffusion]

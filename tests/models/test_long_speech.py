@@ -13,11 +13,11 @@ from torch import Tensor
 
 from facediff import registry
 from facediff.data import collate
-from facediff.data.audio import samples_for
-from facediff.data.windows import FramePlan, Level, WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion, StyleContentDisentanglement
 from facediff.models.inference import SpeechStream, WindowOverlap, crossfaded
+from facediff.speech.audio import samples_for
+from facediff.speech.windows import FramePlan, Level, WindowPlan
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames

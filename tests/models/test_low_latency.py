@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.data.voice_activity import QUICK_GATE, Openness, read_gate
-from facediff.data.windows import LOW_LATENCY, LOW_LATENCY_STEPS, FramePlan, WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.model import DualPathDiffusion
 from facediff.models.inference import SpeechStream, WindowNoise
+from facediff.speech.voice_activity import QUICK_GATE, Openness, read_gate
+from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_STEPS, FramePlan, WindowPlan
 from tests.fakes.tiny import Tiny
 from tests.models.test_windows import CPU, Array, Echo, clip
 

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from facediff.data import Batch, Sample, collate
-from facediff.data.windows import FramePlan, Window, WindowPlan
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.inference import ClipNoise, Inference, SpeechStream, WindowNoise, with_speech
+from facediff.speech.windows import FramePlan, Window, WindowPlan
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
 HOP, FRAMES, SHARED, BEFORE, AFTER = 20, 30, 10, 12, 5

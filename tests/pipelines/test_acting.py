@@ -8,7 +8,7 @@ import pytest
 from facediff.editing.controlled import ACTED
 from facediff.errors import FaceDiffError
 from facediff.pipelines.acting import Acting, acted, gesture, read_acting
-from tests.data.test_prosody import RATE, SECONDS, SILENCE, voice
+from tests.speech.test_prosody import RATE, SECONDS, SILENCE, voice
 
 FRAMES = 100
 ACCENT = 2.0

@@ -15,7 +15,6 @@ import pytest
 import facediff
 from facediff.animation import read_archive
 from facediff.cli.app import main
-from facediff.data.audio import read_speech
 from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
 from facediff.editing.expressiveness import region_factors
@@ -23,6 +22,7 @@ from facediff.editing.eyes import puppet_eyes
 from facediff.errors import FaceDiffError
 from facediff.pipelines.animate import AnimationOptions
 from facediff.pipelines.folder import animate_folder
+from facediff.speech.audio import read_speech
 
 QUICK = {"identity": "F1", "steps": 2, "voice_gate": "off"}
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import facediff
-from facediff.data.audio import read_speech
-from facediff.data.phonemes import closed_times, read_phonemes
 from facediff.editing.closures import close_lips
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import read_speech
+from facediff.speech.phonemes import closed_times, read_phonemes
 from facediff.synthetic.speech import SENTENCES
 
 SENTENCE = SENTENCES[27]

@@ -282,13 +282,13 @@ def container(path: Path) -> None:
 
 
 def read_sound(path: Path) -> object:
-    from facediff.data.audio import read_speech
+    from facediff.speech.audio import read_speech
 
     return read_speech(path)
 
 
 def read_a_stretch(path: Path) -> object:
-    from facediff.data.audio import read_stretch
+    from facediff.speech.audio import read_stretch
 
     return read_stretch(path, 100, 2000, None)
 
@@ -592,7 +592,7 @@ def phonemes(path: Path) -> None:
 
 
 def read_the_phonemes(path: Path) -> object:
-    from facediff.data.phonemes import read_phonemes
+    from facediff.speech.phonemes import read_phonemes
 
     return read_phonemes(path)
 
@@ -604,7 +604,7 @@ def textgrid(path: Path) -> None:
 
 
 def read_the_textgrid(path: Path) -> object:
-    from facediff.data.phonemes import read_alignment
+    from facediff.speech.phonemes import read_alignment
 
     return read_alignment(path)
 

@@ -10,9 +10,9 @@ from types import FrameType
 import pytest
 
 import facediff
-from facediff.data import audio
 from facediff.errors import FaceDiffError
 from facediff.mesh import files as mesh_files
+from facediff.speech import audio
 from tests.robustness.mutations import EVIL, Law, mutate, run, small_world
 from tests.robustness.readers import READERS
 

@@ -16,12 +16,12 @@ import pytest
 import torch
 
 from facediff import registry
-from facediff.data.windows import LOW_LATENCY, WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.graphs import Graph
 from facediff.pipelines.export_model import arrays_of, describe, export_model
 from facediff.runtime import RuntimeModel
+from facediff.speech.windows import LOW_LATENCY, WindowPlan
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
 from tests.runtime.test_runtime import sound
 

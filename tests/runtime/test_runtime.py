@@ -19,8 +19,6 @@ import torch
 
 from facediff import registry
 from facediff.animation import write_archive
-from facediff.data.voice_activity import QUICK_GATE, EnergyGate, read_gate
-from facediff.data.windows import Window, WindowPlan
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
@@ -33,6 +31,8 @@ from facediff.runtime.app import main
 from facediff.runtime.gated import GatedStream
 from facediff.runtime.noise import ClipNoise, NormalStream, WindowNoise
 from facediff.runtime.styles import read_style
+from facediff.speech.voice_activity import QUICK_GATE, EnergyGate, read_gate
+from facediff.speech.windows import Window, WindowPlan
 from tests.fakes.tiny import Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)

@@ -12,12 +12,12 @@ import pytest
 import soundfile
 
 from facediff.animation import Animation, read_archive
-from facediff.data.audio import read_speech
-from facediff.data.voice_activity import QUICK_GATE, read_gate
 from facediff.pipelines.export_model import export_model
 from facediff.runtime import RuntimeModel
 from facediff.runtime.onnxruntime_web import web_runtime
 from facediff.runtime.site import make_site
+from facediff.speech.audio import read_speech
+from facediff.speech.voice_activity import QUICK_GATE, read_gate
 from tests.fakes.contrasts import CONTRASTS
 from tests.runtime.test_every_model import CASES, PLAN, Sources, ready, sources
 from tests.runtime.test_runtime import folder, largest, model, sound

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.data.windows import WindowPlan
 from facediff.models import DualPathDiffusion
+from facediff.speech.windows import WindowPlan
 from tests.fakes.tiny import Tiny
 
 FOLDER = Path(__file__).parents[2] / "tools" / "benchmarks"

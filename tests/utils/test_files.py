@@ -15,9 +15,9 @@ import pytest
 import soundfile
 import trimesh
 
-from facediff.data.audio import read_speech
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
+from facediff.speech.audio import read_speech
 from facediff.utils.files import (
     atomic,
     atomic_folder,

@@ -7,9 +7,9 @@ import pytest
 from scipy.signal import butter, sosfilt
 from scipy.spatial import cKDTree
 
-from facediff.data.voice_activity import SPEECH_BAND
 from facediff.render.meshes import VertexSums
-from facediff.utils.filters import BLOCK, RecursiveFilter
+from facediff.speech.filters import BLOCK, RecursiveFilter
+from facediff.speech.voice_activity import SPEECH_BAND
 from facediff.utils.without_scipy import nearest_by_chunks, nearest_distances, solve_block_chain
 
 

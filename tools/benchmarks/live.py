@@ -29,12 +29,12 @@ import numpy as np
 import numpy.typing as npt
 from sampling_tables import processor
 
-from facediff.data.audio import read_speech
 from facediff.data.puppet import Puppet
 from facediff.live.frames import Performance, open_receivers
 from facediff.live.loop import Loop
 from facediff.live.model import LiveModel
 from facediff.live.sources import Pcm
+from facediff.speech.audio import read_speech
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.tables import markdown_table
 

@@ -30,11 +30,11 @@ from sampling_parts import build
 from sampling_tables import processor
 
 from facediff.data import Batch, collate
-from facediff.data.audio import SAMPLE_RATE, samples_for
-from facediff.data.windows import Window, WindowPlan
 from facediff.models import AnimationModel, load_model
 from facediff.models.checkpoint import corpus_class
 from facediff.models.inference import SpeechStream
+from facediff.speech.audio import SAMPLE_RATE, samples_for
+from facediff.speech.windows import Window, WindowPlan
 
 Array = npt.NDArray[np.float64]
 

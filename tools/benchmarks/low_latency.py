@@ -35,8 +35,6 @@ from sampling_tables import processor
 
 from facediff import registry
 from facediff.data import Assets
-from facediff.data.audio import SAMPLE_RATE
-from facediff.data.windows import LOW_LATENCY, WindowPlan
 from facediff.metrics import LipVertexError, MotionLiveliness
 from facediff.models import AnimationModel, DualPathDiffusion, load_model
 from facediff.models.audio_encoders import HubertEncoder
@@ -44,6 +42,8 @@ from facediff.models.checkpoint import corpus_class
 from facediff.models.inference import Style
 from facediff.pipelines.export_model import export_model
 from facediff.runtime import RuntimeModel
+from facediff.speech.audio import SAMPLE_RATE
+from facediff.speech.windows import LOW_LATENCY, WindowPlan
 from facediff.utils.tables import markdown_table
 
 Array = npt.NDArray[np.float32]

@@ -17,8 +17,8 @@ import torch
 
 from facediff import registry
 from facediff.data import Assets, Sample, collate
-from facediff.data.audio import samples_for
 from facediff.models import DualPathDiffusion
+from facediff.speech.audio import samples_for
 
 FRAME_RATE = 25.0
 SAMPLERS = {

@@ -25,11 +25,11 @@ import numpy as np
 import soundfile
 from sampling_tables import processor
 
-from facediff.data.audio import SAMPLE_RATE
 from facediff.models import AnimationModel, load_model
 from facediff.models.checkpoint import corpus_class
 from facediff.pipelines.export_model import export_model
 from facediff.runtime import RuntimeModel
+from facediff.speech.audio import SAMPLE_RATE
 from facediff.utils.tables import markdown_table
 
 ROOT = Path(__file__).parents[2]

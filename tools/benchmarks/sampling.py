@@ -20,7 +20,7 @@ from sampling_parts import SPACES, Bench, Costs, build
 from sampling_tables import heading, peak_memory, tables
 
 from facediff import registry
-from facediff.data.audio import SAMPLE_RATE
+from facediff.speech.audio import SAMPLE_RATE
 
 PEER_STEPS = 500
 SAMPLERS = ("ddpm", "ddim", "dpm_solver")

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Sample, collate
-from facediff.data.audio import samples_for
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.decoders import StyleTransformer
@@ -23,6 +22,7 @@ from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise
 from facediff.models.samplers import Sampler
 from facediff.models.speaker_encoders import TcnGruTransformer
+from facediff.speech.audio import samples_for
 
 FRAME_RATE = 25.0
 REFERENCE_FRAMES = 100

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import open_sound
 from facediff.data.check.report import Findings, relative
-from facediff.data.cut_short import CUT, cut_short
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import open_sound
+from facediff.speech.cut_short import CUT, cut_short
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import sha256
 from facediff.utils.limits import LIMITS

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import open_sound
 from facediff.data.corpus import read_templates
 from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import (
@@ -43,6 +42,7 @@ from facediff.data.packed.shards import shard_key
 from facediff.data.packed.stores import is_packed
 from facediff.data.storage import MOTION_FOLDERS, motion_path, refuse_out_of_range
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.speech.audio import open_sound
 from facediff.utils.arrays import open_vertices
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import WorkerDied, run_tasks

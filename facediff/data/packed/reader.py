@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import fit_length, open_sound, read_speech, to_speech
 from facediff.data.packed.layout import (
     DAMAGED,
     EXACT,
@@ -31,6 +30,7 @@ from facediff.data.packed.shards import ShardedArray, chunks_of
 from facediff.data.packed.stores import Folder, Store, address_of, open_store
 from facediff.data.storage import refuse_out_of_range, within
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import atomic_folder, cache_dir

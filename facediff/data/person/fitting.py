@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import SAMPLE_RATE
 from facediff.data.corpus import MOTION_FOLDERS, find_region, read_manifest, read_templates
 from facediff.data.person.motion import MESHES, Array, Faces, Motion, differing_faces, scratch_array, spans
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
 from facediff.mesh.alignment import Indices, chunks
+from facediff.speech.audio import SAMPLE_RATE
 from facediff.utils.arrays import open_array
 
 Speech = npt.NDArray[np.float32]

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
 from facediff.data.manifest import FORMAT
 from facediff.data.person.fitting import (
     Auxiliary,
@@ -36,6 +35,7 @@ from facediff.data.prepare.runner import MANIFEST, version, write_clip, write_te
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
+from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
 from facediff.utils import ranges
 from facediff.utils.files import check_writable, describe_files, put_in_place, scratch_folder
 from facediff.utils.plain_files import write_json, write_rows

@@ -131,7 +131,7 @@ def prepare_clip(
     Raises:
         FaceDiffError: if a frame or the sound cannot be used; the file is named.
     """
-    from facediff.data.audio import read_speech
+    from facediff.speech.audio import read_speech
 
     template, faces = read_template(template_file)
     files = list(frame_files(folder).values())

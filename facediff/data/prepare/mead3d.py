@@ -178,7 +178,7 @@ def prepare_clip(
     Raises:
         FaceDiffError: if the parameters or the sound cannot be used; the file is named.
     """
-    from facediff.data.audio import read_speech
+    from facediff.speech.audio import read_speech
 
     parameters = read_parameters(file)
     shape = parameters.shape if shape is None else shape

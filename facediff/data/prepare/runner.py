@@ -380,7 +380,7 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
         import soundfile
     except ImportError as error:
         raise MissingExtraError("soundfile", "audio", "writing speech") from error
-    from facediff.data.audio import SAMPLE_RATE
+    from facediff.speech.audio import SAMPLE_RATE
 
     whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
     with atomic(path) as temporary:

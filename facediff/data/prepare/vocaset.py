@@ -130,7 +130,7 @@ def prepare_clip(
     Raises:
         FaceDiffError: if a row is missing or holds NaN, or the sound cannot be used.
     """
-    from facediff.data.audio import to_speech
+    from facediff.speech.audio import to_speech
 
     samples, rate = read_samples(recording.audio, recording.where)
     frames = min(len(recording.rows), round(len(samples) / rate * RAW_RATE))

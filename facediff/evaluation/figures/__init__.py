@@ -4,7 +4,6 @@ The numbers in a figure are computed by functions of their own (`motion_maps`, `
 `read_curves`), which need no matplotlib; drawing needs the extra ``figures``.
 """
 
-from facediff.data.phonemes import Phoneme, read_phonemes
 from facediff.evaluation.figures.frames import (
     Moment,
     draw_frames,
@@ -26,6 +25,7 @@ from facediff.evaluation.figures.training import (
     smooth,
 )
 from facediff.evaluation.files import read_pairs
+from facediff.speech.phonemes import Phoneme, read_phonemes
 
 __all__ = [
     "COLUMN",

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from facediff.data.phonemes import LENGTH, STRESS, Phoneme
 from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, Material, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
+from facediff.speech.phonemes import LENGTH, STRESS, Phoneme
 
 HIGHEST = 50.0  # Largest height of a picture in mm
 

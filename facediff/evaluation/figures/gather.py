@@ -12,16 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.audio import read_speech
 from facediff.data.check.layouts import by_name, list_folder, recognise
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-from facediff.data.phonemes import Phoneme, phonemes_file, read_phonemes
 from facediff.data.puppet import built_in_mesh, cache_root, made_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import Material, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
 from facediff.mesh.files import SUFFIXES, read_mesh
 from facediff.mesh.mesh import Mesh
+from facediff.speech.audio import read_speech
+from facediff.speech.phonemes import Phoneme, phonemes_file, read_phonemes
 from facediff.utils import ranges
 
 Module = type[SpeechMotionDataModule]

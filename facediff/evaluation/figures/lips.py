@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from facediff.data.phonemes import BILABIALS, Phoneme
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import TRUTH, Array, Material, chunks, shortest
 from facediff.evaluation.figures.page import (
@@ -32,6 +31,7 @@ from facediff.evaluation.figures.page import (
 )
 from facediff.metrics import LipPairs
 from facediff.metrics.mouth import opening
+from facediff.speech.phonemes import BILABIALS, Phoneme
 from facediff.utils import SAMPLE_RATE, ranges
 
 if TYPE_CHECKING:

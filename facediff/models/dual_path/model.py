@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.data.windows import LOW_LATENCY_STEPS, Window
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
@@ -51,6 +50,7 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
+from facediff.speech.windows import LOW_LATENCY_STEPS, Window
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
 

@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.data.frame_clock import FrameClock
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay, MotionScale
@@ -26,6 +25,7 @@ from facediff.models.graphs import Graphs, Spoken
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.registry import component_class
+from facediff.speech.frame_clock import FrameClock
 from facediff.utils.plain_options import fits, parameters
 
 Alignment = Literal["auto", "pairs", "interpolated"]

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.data.frame_clock import FrameClock
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
@@ -39,6 +38,7 @@ from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, Noi
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.speech.frame_clock import FrameClock
 from facediff.utils.ranges import Range
 
 Scheduler = Literal["published", "ddim"]

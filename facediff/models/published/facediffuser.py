@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.data.frame_clock import FrameClock, Rule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import WeightCache
@@ -30,6 +29,7 @@ from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, Noi
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.samplers import cosine_betas
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 

@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.data.frame_clock import FrameClock
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
@@ -27,6 +26,7 @@ from facediff.models.graphs import Spoken
 from facediff.models.layers import Width, exporting, frame_mask, sliding
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
+from facediff.speech.frame_clock import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 from facediff.utils.tensorflow_files import read_graph

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from facediff.data import Batch
-from facediff.data.audio import SAMPLE_RATE
 from facediff.errors import MissingExtraError
 from facediff.models.audio_encoders import mel_filters
 from facediff.models.losses import masked_std
+from facediff.speech.audio import SAMPLE_RATE
 
 Motion = Float[Tensor, "batch frames vertices 3"]
 Mask = Bool[Tensor, "batch frames"]

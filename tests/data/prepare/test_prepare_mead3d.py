@@ -13,7 +13,6 @@ import soundfile
 
 from facediff.cli.data import read_prepare
 from facediff.data import Mead3D
-from facediff.data.audio import read_speech
 from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_recordings, find_sounds
 from facediff.data.prepare.motion import read_parameters
@@ -21,6 +20,7 @@ from facediff.data.prepare.runner import Report, prepare
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import Flame
+from facediff.speech.audio import read_speech
 from facediff.utils.pickles import load_pickle
 from tests.fakes.flame import VERTICES, flame_arrays, write_flame
 from tests.fakes.mead3d import (

@@ -1,4 +1,4 @@
-// How many frames a model gives for speech: the rules of facediff.data.frame_clock, in their orders of operations.
+// How many frames a model gives for speech: the rules of facediff.speech.frame_clock, in their orders of operations.
 
 const CLOCK_RULES = ["rounded", "steps", "pairs", "seconds", "seconds_or_pairs", "rows"];
 const STEP_RATE = 50; // steps a second of pretrained speech networks

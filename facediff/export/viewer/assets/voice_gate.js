@@ -1,4 +1,4 @@
-// How far the mouth may be open in each frame: the energy gate of facediff.data.voice_activity, with its results.
+// How far the mouth may be open in each frame: the energy gate of facediff.speech.voice_activity, with its results.
 
 const GATE_HOP = 160; // samples of a step of 10 ms
 const QUIETEST_LEVEL = -65, SILENT_LEVEL = -120, LOUDEST_ABOVE = 40, FADING = 3;

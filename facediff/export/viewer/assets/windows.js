@@ -1,4 +1,4 @@
-// Long speech and streams by windows that blend into each other: the rules of facediff.data.windows, with its results.
+// Long speech and streams by windows that blend into each other: the rules of facediff.speech.windows, with its results.
 
 const SAMPLE_RATE = 16_000;
 /** Deviation below which speech is not amplified further: noise of a microphone, not speech. */

@@ -12,8 +12,8 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.cut_short import refuse_cut_short
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.speech.cut_short import refuse_cut_short
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.limits import LIMITS, SAMPLE_RATES, brief, check_number

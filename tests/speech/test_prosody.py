@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.data.prosody import SPAN, Prosody, pitch_of
+from facediff.speech.prosody import SPAN, Prosody, pitch_of
 
 RATE = 16_000
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.data.audio import read_speech, read_stretch
-from facediff.data.cut_short import cut_short
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import read_speech, read_stretch
+from facediff.speech.cut_short import cut_short
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.limits import SAMPLE_RATES
 
@@ -225,7 +225,7 @@ def test_bombs_are_refused_in_little_memory(tmp_path: Path) -> None:
         import resource, sys
         from pathlib import Path
         from facediff.errors import FaceDiffError
-        from facediff.data.audio import read_speech
+        from facediff.speech.audio import read_speech
         import numpy, soundfile, soxr
         used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + 60_000_000,) * 2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import fit_length
 from facediff.errors import MissingExtraError
+from facediff.speech.audio import fit_length
 from facediff.utils import SAMPLE_RATE
 
 

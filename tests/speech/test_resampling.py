@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import soxr
 
-from facediff.live.resampling import Resampler
+from facediff.speech.resampling import Resampler
 
 RATES = [(48_000, 16_000), (44_100, 16_000), (32_000, 16_000), (8_000, 16_000), (16_000, 48_000), (16_000, 44_100)]
 

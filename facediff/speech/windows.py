@@ -15,8 +15,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.audio import samples_for
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import samples_for
 from facediff.utils import SAMPLE_RATE
 
 Speech = npt.NDArray[np.float32]

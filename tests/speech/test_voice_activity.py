@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facediff.data.voice_activity import EnergyGate, Openness, VoiceGate, openness, read_gate, speech_problems
 from facediff.errors import FaceDiffError
 from facediff.registry import voice_gate
+from facediff.speech.voice_activity import EnergyGate, Openness, VoiceGate, openness, read_gate, speech_problems
 
 RATE = 16_000
 FRAMES = 25.0

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from facediff.data.phonemes import closed_times, closures, read_alignment
 from facediff.errors import FaceDiffError
+from facediff.speech.phonemes import closed_times, closures, read_alignment
 
 LONG = """File type = "ooTextFile"
 Object class = "TextGrid"

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.voice_activity import HOP, EnergyGate, VoiceGate
+from facediff.speech.voice_activity import HOP, EnergyGate, VoiceGate
 from facediff.utils import SAMPLE_RATE
 
 Wave = npt.NDArray[np.floating]

@@ -1,0 +1,1 @@
+"""Speech without PyTorch: reading recordings, windows and the frame clock, pauses, prosody, denoising, phonemes."""
