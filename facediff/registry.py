@@ -291,7 +291,7 @@ corpus = Kind(
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
 augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech", aliases=False)
 voice_gate = Kind("voice_gate", "facediff.speech.voice_activity", "finds the pauses of speech", aliases=False)
-acting = Kind("acting", "facediff.pipelines.acting", "moves brows, head and lids with the speech", aliases=False)
+acting = Kind("acting", "facediff.editing.acting", "moves brows, head and lids with the speech", aliases=False)
 export_format = Kind(
     "export_format",
     "facediff.export.arrays facediff.export.glb facediff.export.sequences facediff.export.usd facediff.export.video "

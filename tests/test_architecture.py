@@ -38,7 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     "speech": {"synthetic", *BASE},
     "animation": {"mesh", *BASE},
     "data": {"speech", "metrics", "mesh", "synthetic", *BASE},
-    "editing": {"animation", "metrics", "mesh", "synthetic", *BASE},
+    "editing": {"animation", "speech", "metrics", "mesh", "synthetic", *BASE},
     "models": {"version", "animation", "speech", "data", "metrics", "mesh", *BASE},
     "callbacks": {"version", "models", "speech", "data", "metrics", "mesh", "render", *BASE},
     "export": {"animation", "editing", "render", "mesh", *BASE},

@@ -44,7 +44,6 @@ def export(
     source.check(animations)
 
     from facediff.export import FORMATS, check_export, write_animations
-    from facediff.pipelines.acting import controlled
 
     footer = ""  # under a video: the corpus, and whether it is synthetic
     if source.checkpoint is not None and output.suffix == ".mp4":
@@ -55,8 +54,12 @@ def export(
     files.check(output.suffix)
     options = files.export(footer=footer, quiet=quiet)
     check_export(output, options, len(animations))
-    wanted = controls.controls()
-    finished = [controlled(source.read(path), wanted) for path in animations]
+    animation_controls = controls.controls()
+    finished = [source.read(path) for path in animations]
+    if not animation_controls.is_off:
+        from facediff.editing.controlled import apply_controls
+
+        finished = [apply_controls(animation, animation_controls) for animation in finished]
     for written in write_animations(output, with_different_names(finished, animations), options):
         inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
         counted = f"{len(inside)} files, " if written.is_dir() else ""

@@ -1,7 +1,8 @@
 """Animation controls on one face: what they need to know of it is found once, for all of its animations.
 
 From top to bottom: the amounts of all controls in each frame, from options, keys and acting together
-(:class:`Amounts`); and :class:`ControlledFace`, which applies them to whole animations or to a stretch of one.
+(:class:`Amounts`); :class:`ControlledFace`, which applies them to whole animations or to a stretch of one; and
+:func:`apply_controls`, which does all of that for a finished animation.
 """
 
 from __future__ import annotations
@@ -268,3 +269,36 @@ class ControlledFace:
             else:
                 made = Direction((*before.keys, *made.keys), METADATA)
         return replace(animation, metadata={**animation.metadata, name: made.text()})
+
+
+def apply_controls(animation: Animation, controls: AnimationControls, *, seed: int = 0) -> Animation:
+    """A finished animation with controls applied, acting among them; the same object if there are none.
+
+    Args:
+        animation: with frames as the model made them.
+        controls: what is changed.
+        seed: of blinks, gaze, sway and acting, unless the controls have their own.
+
+    Raises:
+        FaceDiffError: naming the option that does not fit the animation, or if its head moves already.
+    """
+    if controls.is_off:
+        return animation
+    direction = controls.keys(animation.frame_rate)
+    if direction is not None:
+        direction.refuse_model_channels()
+    acted = None
+    if controls.acting is not None:
+        from facediff.editing.acting import act, read_acting
+
+        acted = act(read_acting(controls.acting), animation, seed if controls.seed is None else controls.seed)
+    face = ControlledFace(
+        controls,
+        direction,
+        animation.template,
+        animation.faces,
+        animation.regions,
+        animation.unit,
+        animation.name,
+    )
+    return face.apply(animation, seed=seed, acted=acted)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -17,10 +13,7 @@ from facediff.utils.limits import FRAME_RATES
 
 # What edits an animation is imported where it is asked for: most animations have no controls.
 if TYPE_CHECKING:
-    from facediff.animation import Animation
-    from facediff.editing.controlled import ControlledFace
     from facediff.editing.direction import Direction
-    from facediff.editing.eyes import Array
 
 
 UNCHECKED = FRAME_RATES[1]
@@ -130,67 +123,3 @@ class AnimationControls:
         made = copy(self)
         object.__setattr__(made, "direction", None)
         return made
-
-    def check(
-        self,
-        template: npt.NDArray[np.floating],
-        faces: npt.NDArray[np.integer] | None,
-        regions: Mapping[str, npt.NDArray[np.integer]],
-        name: str,
-    ) -> None:
-        """Refuse what cannot work on a face, as :meth:`on_face` does, before anything is sampled."""
-        if not self.is_off:
-            self.on_face(template, faces, regions, name, direction=self.keys())
-
-    def on_face(
-        self,
-        template: npt.NDArray[np.floating],
-        faces: npt.NDArray[np.integer] | None,
-        regions: Mapping[str, npt.NDArray[np.integer]],
-        name: str,
-        *,
-        unit: str = "m",
-        direction: Direction | None = None,
-    ) -> ControlledFace:
-        """The controls on a face (V, 3), (F, 3), which errors call ``name``; all of its animations share it.
-
-        Args:
-            template: the neutral face.
-            faces: its triangles.
-            regions: vertex indices by name.
-            name: for errors.
-            unit: of length.
-            direction: the keys over time that hold; none if None.
-
-        Raises:
-            FaceDiffError: if a region is unknown, or blinks, gaze or brows are wanted and are not known.
-        """
-        from facediff.editing.controlled import ControlledFace
-
-        return ControlledFace(self, direction, template, faces, regions, unit, name)
-
-    def apply(self, animation: Animation, *, seed: int = 0, acted: Array | None = None) -> Animation:
-        """The animation with everything changed that is asked for; the very same one if nothing is.
-
-        Args:
-            animation: a finished animation.
-            seed: seed of blinks, gaze and sway, unless the controls have their own.
-            acted: what acting does in each frame (T, 5), where there is any.
-
-        Raises:
-            FaceDiffError: naming the option that does not fit the animation, or if its head sways already.
-        """
-        if self.is_off:
-            return animation
-        direction = self.keys(animation.frame_rate)
-        if direction is not None:
-            direction.refuse_model_channels()
-        face = self.on_face(
-            animation.template,
-            animation.faces,
-            animation.regions,
-            animation.name,
-            unit=animation.unit,
-            direction=direction,
-        )
-        return face.apply(animation, seed=seed, acted=acted)

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
     from facediff.animation import Animation
     from facediff.data import Assets, Reference
+    from facediff.editing.acting import Acting, Performer
     from facediff.editing.controlled import ControlledFace
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
     from facediff.models import AnimationModel, Style
     from facediff.models.styles import StyleLike
-    from facediff.pipelines.acting import Acting, Performer
     from facediff.pipelines.directing import DirectedStream
     from facediff.pipelines.rest import MouthAtRest
     from facediff.speech.phonemes import Phoneme
@@ -79,7 +79,7 @@ class AnimationOptions:
             raise FaceDiffError("--low-latency: chooses the windows; omit --window and --overlap")
         _ = self.expressivity_factors, self.guidance_scales, self.gate
         if self.controls.acting is not None:
-            from facediff.pipelines.acting import read_acting
+            from facediff.editing.acting import read_acting
 
             read_acting(self.controls.acting)
         if (keys := self.controls.keys()) is not None:
@@ -213,7 +213,7 @@ class AnimationPipeline:
             self.style = style_from(wanted, self.identity, self.model, template=options.style_template)
         self.acting: Acting | None = None
         if controls.acting is not None:
-            from facediff.pipelines.acting import read_acting
+            from facediff.editing.acting import read_acting
 
             self.acting = read_acting(controls.acting)
         self.direct(controls.keys(self.model.frame_rate))
@@ -236,10 +236,12 @@ class AnimationPipeline:
         finished = None if direction is None else direction.without_model_channels()
         self.face: ControlledFace | None = None
         if finished is not None or not controls.without_keys.is_off:
+            from facediff.editing.controlled import ControlledFace
+
             facts = facts_of(self.model.assets, self.identity)
             name = f"the checkpoint's corpus {self.model.assets.corpus}"
-            self.face = controls.on_face(
-                facts["template"], facts["faces"], facts["regions"], name, unit=facts["unit"], direction=finished
+            self.face = ControlledFace(
+                controls, finished, facts["template"], facts["faces"], facts["regions"], facts["unit"], name
             )
 
     def stream(self, seeds: Sequence[int]) -> DirectedStream:
@@ -388,7 +390,7 @@ class AnimationPipeline:
         """What acting does in each frame of a sample; None without it."""
         if self.acting is None:
             return None
-        from facediff.pipelines.acting import act
+        from facediff.editing.acting import act
 
         return act(self.acting, animation, seed if self.options.controls.seed is None else self.options.controls.seed)
 

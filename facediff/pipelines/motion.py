@@ -145,9 +145,9 @@ class Animation(finished.Animation):
             FaceDiffError: if a value is out of range, or does not fit the face.
         """
         wanted = controls_of(**_given(locals()))
-        from facediff.pipelines.acting import controlled
+        from facediff.editing.controlled import apply_controls
 
-        return Animation.of(controlled(self, wanted))
+        return Animation.of(apply_controls(self, wanted))
 
     @in_python_words
     def retarget(

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation, read_archive
+from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import Direction, Key
 from facediff.errors import FaceDiffError
@@ -24,7 +25,7 @@ DEGREES = {"head.pitch": 8.0, "head.yaw": -12.0, "head.roll": 5.0}
 def turned() -> Animation:
     """It goes from rest to the angles in two seconds, and stays there."""
     keys = [Key(time, name, value) for name, far in DEGREES.items() for time, value in ((0.0, 0.0), (2.0, far))]
-    return AnimationControls(direction=Direction(keys)).apply(clicks())
+    return apply_controls(clicks(), AnimationControls(direction=Direction(keys)))
 
 
 def test_head_is_taken_out_again(turned: Animation) -> None:

@@ -12,6 +12,7 @@ import trimesh
 
 from facediff.animation import Animation
 from facediff.editing.brows import brows_of
+from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import Direction, Key
 from facediff.errors import FaceDiffError
@@ -39,13 +40,13 @@ def test_a_file_says_where_they_are(make_animation: Callable[..., Animation], tm
     file = tmp_path / "eyes.json"
     file.write_text(json.dumps({"brows": named}))
     keys = Direction([Key(0, "brows", 3.0)])
-    made = AnimationControls(direction=keys, eyes=file).apply(animation)
+    made = apply_controls(animation, AnimationControls(direction=keys, eyes=file))
     moved = made.vertices[0] - animation.vertices[0]
     np.testing.assert_allclose(moved[named], np.tile([0, 0.003, 0], (20, 1)), atol=1e-6)
     assert not moved[animation.regions["lips"]].any()
     arrays = tmp_path / "eyes.npz"
     np.savez(arrays, brows=np.array(named))
-    again = AnimationControls(direction=keys, eyes=arrays).apply(animation)
+    again = apply_controls(animation, AnimationControls(direction=keys, eyes=arrays))
     np.testing.assert_array_equal(again.vertices, made.vertices)
 
 

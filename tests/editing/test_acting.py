@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from facediff.editing.acting import Acting, acted, gesture, read_acting
 from facediff.editing.controlled import ACTED
 from facediff.errors import FaceDiffError
-from facediff.pipelines.acting import Acting, acted, gesture, read_acting
 from tests.speech.test_prosody import RATE, SECONDS, SILENCE, voice
 
 FRAMES = 100

@@ -23,7 +23,6 @@ from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.editing.controls import AnimationControls
 
 Acted = npt.NDArray[np.float64]
 """Values of the channels :data:`facediff.editing.controlled.ACTED` in each frame, (T, 5)."""
@@ -105,18 +104,6 @@ def act(kind: Acting, animation: Animation, seed: int) -> Acted:
     if animation.sample_rate != SAMPLE_RATE:
         speech = to_speech(speech, animation.sample_rate, animation.name)
     return acted(kind, speech, len(animation.vertices), animation.frame_rate, seed)
-
-
-def controlled(animation: Animation, controls: AnimationControls, *, seed: int = 0) -> Animation:
-    """A finished animation with animation controls applied, acting among them; the very same one without any.
-
-    Raises:
-        FaceDiffError: naming the option that does not fit the animation.
-    """
-    moves = None
-    if controls.acting is not None:
-        moves = act(read_acting(controls.acting), animation, seed if controls.seed is None else controls.seed)
-    return controls.apply(animation, seed=seed, acted=moves)
 
 
 @acting.register("prosody")
