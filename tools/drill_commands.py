@@ -182,7 +182,7 @@ DRILLS = [
         pieces=True,
     ),
     Drill(
-        "yardsticks",
+        "generation-metrics",
         f"model.ckpt --corpus {TINY} --data-root corpus --samples 2 --references 1 --max-clips 1 --quiet --json a.json",
         f"model.ckpt --corpus {TINY} --data-root corpus --samples 3 --references 1 --max-clips 1 --quiet --json a.json",
     ),

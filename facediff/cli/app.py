@@ -51,7 +51,10 @@ COMMANDS = {
     "evaluate": Command("facediff.cli.evaluate:evaluate", "score anybody's predicted motion files by named protocols"),
     "benchmark": Command("facediff.cli.benchmark:benchmark", "train and score many methods, and write the tables"),
     "benchmark report": Command("facediff.cli.benchmark:report", "write the tables of benchmarks again"),
-    "yardsticks": Command("facediff.cli.yardsticks:yardsticks", "does a model generate? every score that tells"),
+    "generation-metrics": Command(
+        "facediff.cli.generation_metrics:generation_metrics",
+        "diversity, liveliness and calibration of a model's samples",
+    ),
     "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments"),
     "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex"),
     "figure error": Command("facediff.cli.figure:error", "error at every vertex"),

@@ -75,7 +75,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         region_help: where to get such files.
         reference_attributes: what a style reference shares with its target where possible.
         score_attributes: columns of the table of test scores of single clips; ``reference_attributes`` unless stated.
-        compared_speakers: among whom the yardsticks look for the nearest speaker and for another's references; all
+        compared_speakers: among whom generation metrics look for the nearest speaker and for another's references; all
             with a template if None.
         licence: the terms under which the corpus is distributed.
         commercial_use: whether these terms allow it: ``allowed``, ``forbidden`` or ``unknown``.

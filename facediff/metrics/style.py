@@ -215,7 +215,7 @@ class NearestSpeakerAccuracy(SequenceMetric):
     guessing gives 1 / speakers. Definition ours.
 
     Give a model only a reference and no label of the speaker to see whether the reference carries the person:
-    ``facediff yardsticks`` does.
+    ``facediff generation-metrics`` does.
 
     Args:
         gallery: Recordings whose speakers are known.

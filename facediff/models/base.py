@@ -390,7 +390,7 @@ class AnimationModel(LightningModule, Inference, ABC):
             if view.decoy_audio is not None:
                 decoy = replace(view, audio=view.decoy_audio, features=None)
                 self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)
-        # Further yardsticks: the model with speech that does not belong to the clip, and faces that do not move.
+        # Baselines: the model with speech that does not belong to the clip, and faces that do not move.
         self.evaluation.score_baselines(split, batch)
 
     def on_test_epoch_end(self) -> None:

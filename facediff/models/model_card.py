@@ -304,7 +304,7 @@ def score_section(model: AnimationModel, facts: Facts) -> str:
         f"Protocol `{text(first['protocol'])}`; lower is better; unit of length {text(model.assets.unit)}.",
         f"Regions: {'; '.join(taken)}." if taken else "",
         f"Unseen speakers were tested with the identity policy `{policy}`." if policy else "",
-        "The other rows are yardsticks: a face that never moves, the speaker's mean face, and this model with the "
+        "The other rows are baselines: a face that never moves, the speaker's mean face, and this model with the "
         "speech of another clip. docs/metrics.md of facediff defines every score.",
     ]
     return "## Scores\n\n" + table(header, rows) + "\n\n" + "\n".join(note for note in notes if note)

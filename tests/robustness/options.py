@@ -70,7 +70,8 @@ BASES: dict[str, str] = {
     "export": "WORLD/clicks.npz -o out.glb --quiet",
     "blendshapes": "WORLD/clicks.npz -o weights.csv --shapes WORLD/shapes",
     "retarget": "WORLD/clicks.npz --target-mesh WORLD/face.obj -o out.npz",
-    "yardsticks": "WORLD/model.ckpt --corpus tests.fakes.tiny.Tiny --samples 2 --references 1 --max-clips 1 --quiet",
+    "generation-metrics": "WORLD/model.ckpt --corpus tests.fakes.tiny.Tiny --samples 2 --references 1 --max-clips 1 "
+    "--quiet",
     "evaluate": "WORLD/ours WORLD/corpus --bootstrap 10 --workers 1 --quiet",
     "benchmark": "WORLD/plan.yaml -o benchmarks --dry-run",
     "benchmark report": "WORLD/benchmark --bootstrap 20 -o reports",

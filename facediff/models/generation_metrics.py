@@ -1,7 +1,8 @@
-"""The yardsticks of a generator: every score by which docs/generation.md judges a model, measured in one pass.
+"""Generation metrics: diversity, liveliness, calibration and errors of a model's samples, measured in one pass.
 
-From top to bottom: what the yardsticks are called and mean (:data:`YARDSTICKS`), how one model is measured on one split
-(:class:`Measurement`), and several models together (:func:`measure`, :class:`Yardsticks`).
+From top to bottom: names and meaning of the metrics (:data:`GENERATION_METRICS`; docs/generation.md judges models by
+them), how one model is measured on one split (:class:`Measurement`), and several models together (:func:`measure`,
+:class:`GenerationScores`).
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ REFERENCES = {
 }
 """Whose reference gives the style. Moods are equal or not by the corpus's ``reference_attributes``."""
 
-YARDSTICKS: dict[str, str] = {
+GENERATION_METRICS: dict[str, str] = {
     "liveliness_upper_face": "liveliness of the upper face (1)",
     "liveliness_lips": "liveliness of the lips (1)",
     "spectrum_upper_face": "spectrum of the upper face: decibels off (0)",
@@ -80,21 +81,21 @@ YARDSTICKS: dict[str, str] = {
     "nearest_speaker": "nearest speaker is right, identity hidden (1; chance {chance})",
     "true_nearest_speaker": "nearest speaker is right, truth",
     **{
-        f"mve_{label}_{whose}": f"MVE with {words} / own, identity {label}"
+        f"mve_{label}_{whose}": f"MVE with {title} / own, identity {label}"
         for label in ("hidden", "known")
-        for whose, words in REFERENCES.items()
+        for whose, title in REFERENCES.items()
         if whose != "own"
     },
     "mve_hidden_own": "MVE with own reference, identity hidden",
     "mve_known_own": "MVE with own reference, identity known",
     "real_time_factor": "real-time factor, one sample",
 }
-"""What the yardsticks are called in files and in words; in parentheses what the truth itself, or a model that draws
+"""Names of the metrics in files, and their titles; in parentheses what the truth itself, or a model that draws
 from the truth's distribution, would get."""
 
 
 @dataclass(frozen=True)
-class Sampling:
+class SamplingOptions:
     """How a model is asked for motion.
 
     Attributes:
@@ -120,7 +121,7 @@ class Sampling:
             raise FaceDiffError(f"--samples {self.samples}: the spread of a model needs two samples; give 2 or more")
 
 
-class Material:
+class EvaluationCorpus:
     """What measuring needs of a corpus in addition to its clips; made once for all models and splits."""
 
     def __init__(self, data: SpeechMotionDataModule) -> None:
@@ -158,10 +159,10 @@ class Material:
             return all(other.attributes.get(name) == clip.attributes.get(name) for name in attributes)
 
         sorts = {
-            "own": [each for each in mine if each.name == own],
-            "own_other_mood": [each for each in mine if not alike(each)],
-            "another": [each for each in others if alike(each)],
-            "another_other_mood": [each for each in others if not alike(each)],
+            "own": [other for other in mine if other.name == own],
+            "own_other_mood": [other for other in mine if not alike(other)],
+            "another": [other for other in others if alike(other)],
+            "another_other_mood": [other for other in others if not alike(other)],
         }
         # By chance, but the same for every model: moods and speakers are met about equally often.
         return {
@@ -176,13 +177,13 @@ class Measurement:
 
     Args:
         model: a trained model in evaluation mode.
-        material: of the corpus.
+        corpus: what it is measured on.
         sampling: how it is asked for motion.
     """
 
-    def __init__(self, model: AnimationModel, material: Material, sampling: Sampling) -> None:
-        self.model, self.material, self.sampling = model, material, sampling
-        lips, upper = material.regions["lips"], material.regions["upper_face"]
+    def __init__(self, model: AnimationModel, corpus: EvaluationCorpus, sampling: SamplingOptions) -> None:
+        self.model, self.corpus, self.sampling = model, corpus, sampling
+        lips, upper = corpus.regions["lips"], corpus.regions["upper_face"]
         # Without noise all samples are one: their spread is zero, and the energy score is the distance itself.
         self.drawn = sampling.samples if model.samples else 1
         self.compared = max(2, self.drawn)
@@ -205,17 +206,17 @@ class Measurement:
             "fdd": FaceDynamicsDeviation(upper),
             "fdd_signed": FaceDynamicsDeviation(upper, sign="signed"),
         }
-        if material.eyelids is not None:
-            rate = material.assets.frame_rate
+        if corpus.eyelids is not None:
+            rate = corpus.assets.frame_rate
             self.of_each |= {
-                "blink_ratio": BlinkRateRatio(material.eyelids),
-                "blinks_a_minute": BlinkRate(material.eyelids, frames_per_second=rate),
-                "true_blinks_a_minute": BlinkRate(material.eyelids, frames_per_second=rate, of="truth"),
+                "blink_ratio": BlinkRateRatio(corpus.eyelids),
+                "blinks_a_minute": BlinkRate(corpus.eyelids, frames_per_second=rate),
+                "true_blinks_a_minute": BlinkRate(corpus.eyelids, frames_per_second=rate, of="truth"),
             }
-        if material.lips is not None and "closures" not in material.missing:
+        if corpus.lips is not None and "closures" not in corpus.missing:
             self.of_each |= {
-                "closed": BilabialClosureRate(material.lips),
-                "truly_closed": BilabialClosureRate(material.lips, of="truth"),
+                "closed": BilabialClosureRate(corpus.lips),
+                "truly_closed": BilabialClosureRate(corpus.lips, of="truth"),
             }
         self.of_baselines: dict[str, Metric] = {
             "still_lve": LipVertexError(lips),
@@ -226,9 +227,9 @@ class Measurement:
         self.of_references: dict[str, Metric] = {
             f"{label}_{whose}": MeanVertexError() for label in ("hidden", "known") for whose in REFERENCES
         }
-        if material.gallery is not None:
-            self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(material.gallery)
-            self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(material.gallery)
+        if corpus.gallery is not None:
+            self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
+            self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
         self.speed = RealTimeFactor(device_name(model.device))
         for metrics in (self.of_samples, self.of_each, self.of_baselines, self.of_references):
             for metric in metrics.values():
@@ -242,7 +243,7 @@ class Measurement:
         truth, template = batch.motion[0], batch.template[0]
         for metric in self.of_samples.values():
             metric.update(motion.expand(self.compared, -1, -1, -1), truth)
-        closures = closures_of(self.material.data, clip.name) if "closed" in self.of_each else []
+        closures = closures_of(self.corpus.data, clip.name) if "closed" in self.of_each else []
         for drawn in motion:
             for metric in self.of_each.values():
                 if isinstance(metric, BilabialClosureRate):
@@ -257,7 +258,7 @@ class Measurement:
     def _samples(self, batch: Batch) -> Tensor:
         """Samples of a clip (drawn, frames, V, 3); the first one is timed, alone as `facediff animate` makes it."""
         seeds = range(self.sampling.seed, self.sampling.seed + self.drawn)
-        with self.speed.measure(batch.motion.shape[1] / self.material.assets.frame_rate):
+        with self.speed.measure(batch.motion.shape[1] / self.corpus.assets.frame_rate):
             first = self.model.sample_clip(batch, seeds[:1])
         return torch.cat([first, self.model.sample_clip(batch, seeds[1:])]) if self.drawn > 1 else first
 
@@ -267,7 +268,7 @@ class Measurement:
             self.model.sample_clip(collate([sample]).to(self.model.device), [self.sampling.seed])
 
     def _add_baselines(self, clip: Clip, truth: Tensor) -> None:
-        face = self.material.mean_faces.of([clip.identity]).to(truth).expand_as(truth)
+        face = self.corpus.mean_faces.of([clip.identity]).to(truth).expand_as(truth)
         for name, metric in self.of_baselines.items():
             if name == "true_nearest_speaker":
                 metric.update(truth, self._number(clip))
@@ -285,24 +286,24 @@ class Measurement:
                     self.of_references["nearest_speaker"].update(motion, self._number(clip))
 
     def _views(self, clip: Clip, sample: Sample) -> list[tuple[str, Sample]]:
-        found = []
-        data = self.material.data
-        for whose, source in self.material.references(clip, sample.reference_name).items():
+        views = []
+        data = self.corpus.data
+        for whose, source in self.corpus.references(clip, sample.reference_name).items():
             reference = sample.reference
             if whose != "own":
                 frames = min(data.corpus.frames(source), data.reference_frames)
                 reference = data.corpus.read_motion(source, 0, frames)
             styled = replace(sample, reference=reference, reference_name=source.name)
-            found.append((f"hidden_{whose}", replace(styled, identity=UNKNOWN_IDENTITY)))
+            views.append((f"hidden_{whose}", replace(styled, identity=UNKNOWN_IDENTITY)))
             if sample.identity != UNKNOWN_IDENTITY:
-                found.append((f"known_{whose}", styled))
-        return found
+                views.append((f"known_{whose}", styled))
+        return views
 
     def _number(self, clip: Clip) -> list[int]:
-        return [self.material.speakers.index(clip.identity)]
+        return [self.corpus.speakers.index(clip.identity)]
 
     def result(self) -> dict[str, float | None]:
-        """The value of every yardstick, in the order of :data:`YARDSTICKS`; None where there is none."""
+        """The value of every metric, in the order of :data:`GENERATION_METRICS`; None where there is none."""
         raw: dict[str, float] = {}
         everything = {**self.of_samples, **self.of_each, **self.of_baselines, **self.of_references}
         for name, metric in {**everything, "real_time_factor": self.speed}.items():
@@ -311,8 +312,8 @@ class Measurement:
                     raw[name] = float(metric.compute())
 
         def ratio(above: str, below: str) -> float | None:
-            found, by = raw.get(above), raw.get(below)
-            return None if found is None or not by else found / by
+            numerator, denominator = raw.get(above), raw.get(below)
+            return None if numerator is None or not denominator else numerator / denominator
 
         values: dict[str, float | None] = {
             **raw,
@@ -332,14 +333,14 @@ class Measurement:
             "mve_hidden_own": raw.get("hidden_own"),
             "mve_known_own": raw.get("known_own"),
         }
-        return {name: values.get(name) for name in YARDSTICKS}
+        return {name: values.get(name) for name in GENERATION_METRICS}
 
 
 # Several models, such as three training seeds of one method.
 
 
 @dataclass(frozen=True)
-class Yardsticks:
+class GenerationScores:
     """What several models of one method got.
 
     Attributes:
@@ -350,9 +351,9 @@ class Yardsticks:
         samples: of each clip; 1 for a model without noise.
         speakers: among how many the nearest one was looked for; 0 if it was not.
         clips: how many, by split.
-        values: one for each checkpoint, by split and yardstick.
-        missing: why yardsticks have no value.
-        against: mean values of another method, by split and yardstick.
+        values: one for each checkpoint, by split and metric.
+        missing: why metrics have no value.
+        against: mean values of another method, by split and metric.
         against_name: what that method is called.
     """
 
@@ -370,29 +371,29 @@ class Yardsticks:
 
     def mean(self, split: str, name: str) -> float | None:
         """Mean over the checkpoints that have a value."""
-        found = [value for value in self.values[split][name] if value is not None]
-        return statistics.fmean(found) if found else None
+        values = [value for value in self.values[split][name] if value is not None]
+        return statistics.fmean(values) if values else None
 
     def deviation(self, split: str, name: str) -> float | None:
         """Standard deviation over checkpoints (n − 1); None for less than two values."""
-        found = [value for value in self.values[split][name] if value is not None]
-        return statistics.stdev(found) if len(found) > 1 else None
+        values = [value for value in self.values[split][name] if value is not None]
+        return statistics.stdev(values) if len(values) > 1 else None
 
     def title(self, name: str) -> str:
-        """A yardstick in words."""
+        """Title of a metric in tables."""
         chance = f"1/{self.speakers}" if self.speakers else "unknown"
-        return YARDSTICKS[name].format(samples=self.samples, chance=chance)
+        return GENERATION_METRICS[name].format(samples=self.samples, chance=chance)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One flat row for each split and yardstick."""
+        """One flat row for each split and metric."""
         table = []
         for split, values in self.values.items():
-            for name in YARDSTICKS:
+            for name in GENERATION_METRICS:
                 mean, against = self.mean(split, name), self.against.get(split, {}).get(name)
                 row: dict[str, Any] = {
                     "split": split,
-                    "yardstick": name,
-                    "words": self.title(name),
+                    "metric": name,
+                    "title": self.title(name),
                     "mean": mean,
                     "std": self.deviation(split, name),
                 }
@@ -405,35 +406,35 @@ class Yardsticks:
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, as :func:`means_of` reads them again."""
         facts = {name: value for name, value in vars(self).items() if name not in ("values", "against")}
-        keys = ("split", "yardstick", "words", "mean", "std", "against", "ratio")
+        keys = ("split", "metric", "title", "mean", "std", "against", "ratio")
         scores = [
-            {key: row[key] for key in keys if key in row} | {"values": self.values[row["split"]][row["yardstick"]]}
+            {key: row[key] for key in keys if key in row} | {"values": self.values[row["split"]][row["metric"]]}
             for row in self.rows()
         ]
-        return {"format": FORMAT, **facts, "yardsticks": scores}
+        return {"format": FORMAT, **facts, "metrics": scores}
 
 
-FORMAT = "facediff yardsticks 1"
+FORMAT = "facediff generation metrics 1"
 
 
 def means_of(content: object, source: object) -> dict[str, dict[str, float | None]]:
-    """Mean values by split and yardstick from what :meth:`Yardsticks.as_dict` gave.
+    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave.
 
     Raises:
         FaceDiffError: if it is anything else.
     """
-    found: dict[str, dict[str, float | None]] = {}
+    means: dict[str, dict[str, float | None]] = {}
     try:
         if not isinstance(content, dict) or content["format"] != FORMAT:
             raise TypeError
-        for row in content["yardsticks"]:
+        for row in content["metrics"]:
             mean = row["mean"]
-            found.setdefault(str(row["split"]), {})[str(row["yardstick"])] = None if mean is None else float(mean)
+            means.setdefault(str(row["split"]), {})[str(row["metric"])] = None if mean is None else float(mean)
     except (TypeError, KeyError, ValueError) as error:
         raise FaceDiffError(
-            f"{source}: holds no yardsticks; expected a file of `facediff yardsticks --json`"
+            f"{source}: holds no generation metrics; expected a file of `facediff generation-metrics --json`"
         ) from error
-    return found
+    return means
 
 
 def measure(
@@ -441,11 +442,11 @@ def measure(
     data: SpeechMotionDataModule,
     *,
     splits: Sequence[str] | None = None,
-    sampling: Sampling | None = None,
+    sampling: SamplingOptions | None = None,
     most_clips: int | None = None,
     step: Callable[[], object] = lambda: None,
-) -> Yardsticks:
-    """Measure models by all yardsticks, one after another.
+) -> GenerationScores:
+    """Measure models by all generation metrics, one after another.
 
     Args:
         models: what loads each model, by the name of its checkpoint; one is in memory at a time.
@@ -458,16 +459,18 @@ def measure(
     Raises:
         FaceDiffError: if a split has no clip, a model is of another corpus, or the sampler does not fit.
     """
-    sampling = sampling or Sampling()
-    material = Material(data)
+    sampling = sampling or SamplingOptions()
+    corpus = EvaluationCorpus(data)
     datasets = {split: data.dataset(split) for split in splits or data.test_splits}
     chosen = {split: picked(dataset, most_clips) for split, dataset in datasets.items()}
-    values: dict[str, dict[str, list[float | None]]] = {split: {name: [] for name in YARDSTICKS} for split in datasets}
+    values: dict[str, dict[str, list[float | None]]] = {
+        split: {name: [] for name in GENERATION_METRICS} for split in datasets
+    }
     described: set[str] = set()
     drawn = 1
     for name, load in models.items():
         model = load()
-        if model.assets.identities != material.assets.identities or model.n_vertices != data.n_vertices:
+        if model.assets.identities != corpus.assets.identities or model.n_vertices != data.n_vertices:
             raise FaceDiffError(
                 f"{name}: is a model of {model.assets.corpus} with other speakers or vertices than those of "
                 f"{data.corpus_name} that are measured on; measure it by itself"
@@ -478,24 +481,24 @@ def measure(
             model.choose_expressivity(sampling.expressivity)
         described.add(sampler_of(model))
         for split, dataset in datasets.items():
-            measurement = Measurement(model, material, sampling)
+            measurement = Measurement(model, corpus, sampling)
             measurement.warm_up(dataset[chosen[split][0]])
             for place in chosen[split]:
                 measurement.add(dataset.clips[place], dataset[place])
                 step()
-            for yardstick, value in measurement.result().items():
-                values[split][yardstick].append(value)
+            for metric, value in measurement.result().items():
+                values[split][metric].append(value)
             drawn = measurement.drawn
-    return Yardsticks(
-        corpus=material.assets.corpus,
-        synthetic=material.assets.synthetic,
+    return GenerationScores(
+        corpus=corpus.assets.corpus,
+        synthetic=corpus.assets.synthetic,
         checkpoints=list(models),
         sampler=", ".join(sorted(described)),
         samples=drawn,
-        speakers=len({*material.gallery.speakers}) if material.gallery is not None else 0,
+        speakers=len({*corpus.gallery.speakers}) if corpus.gallery is not None else 0,
         clips={split: len(places) for split, places in chosen.items()},
         values=values,
-        missing=material.missing,
+        missing=corpus.missing,
     )
 
 
@@ -514,8 +517,8 @@ def sampler_of(model: AnimationModel) -> str:
     sampler = getattr(model, "sampler", None)
     if sampler is None:
         return type(model).__name__
-    found = f"{type(sampler).__name__} with {sampler.steps} steps"
+    description = f"{type(sampler).__name__} with {sampler.steps} steps"
     own = model.expressivity
     if isinstance(own, Tensor):
-        return f"{found}, expressivity by vertex"
-    return found if own == 1 else f"{found}, expressivity {own:g}"
+        return f"{description}, expressivity by vertex"
+    return description if own == 1 else f"{description}, expressivity {own:g}"

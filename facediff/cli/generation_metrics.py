@@ -1,4 +1,4 @@
-"""``facediff yardsticks``: does a model generate? Every score that tells, from one command."""
+"""``facediff generation-metrics``: diversity, liveliness and calibration of a model's samples."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from facediff.utils.hub import check_model_source
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
-    from facediff.models.yardsticks import Yardsticks
+    from facediff.models.generation_metrics import GenerationScores
 
 SPLITS = ("val", "test_a", "test_b")
 
 
-def yardsticks(
+def generation_metrics(
     checkpoints: Annotated[list[Path], Option(metavar="CHECKPOINT", reads=True)],
     *,
     samples: Annotated[ranges.Samples, Option(metavar="N")] = 10,
@@ -43,7 +43,7 @@ def yardsticks(
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     quiet: bool = False,
 ) -> None:
-    """Measure trained models by all that tells a generator from a regressor, on their corpus's test splits.
+    """Measure diversity, liveliness, calibration and errors of models' samples, on their corpus's test splits.
 
     Liveliness, spread over error, blinks, FDD, LVE of one sample, of the mean and of the best of several (as shares of
     a still face's and of the speaker's mean face's), energy scores, closures at p, b and m, whether the reference
@@ -51,9 +51,9 @@ def yardsticks(
     deviations.
 
     For example:
-      facediff yardsticks demo/puppet.ckpt
-      facediff yardsticks a.ckpt b.ckpt c.ckpt --sampler ddpm --steps 1000 --samples 4 --json abc.json
-      facediff yardsticks new.ckpt --against abc.json
+      facediff generation-metrics demo/puppet.ckpt
+      facediff generation-metrics a.ckpt b.ckpt c.ckpt --sampler ddpm --steps 1000 --samples 4 --json abc.json
+      facediff generation-metrics new.ckpt --against abc.json
 
     Args:
         checkpoints: trained models (.ckpt) of one corpus
@@ -72,13 +72,13 @@ def yardsticks(
         commercial_only: refuse models that are not cleared for commercial use
         seed: of the first sample; the others follow
         json: write everything as JSON
-        csv: write one row for each split and yardstick
+        csv: write one row for each split and metric
         quiet: no progress bar
     """
     for path in [*checkpoints, *([] if against is None else [against])]:
         check_model_source(path)
     if len({*map(str, checkpoints)}) < len(checkpoints):
-        raise FaceDiffError("a checkpoint is given twice; give each once")
+        raise FaceDiffError("a checkpoint is given twice; name it once")
     for name in splits or ():
         if name not in SPLITS:
             raise FaceDiffError(f"--splits {name}: there is no such split; expected one of {', '.join(SPLITS)}")
@@ -89,37 +89,37 @@ def yardsticks(
     from dataclasses import replace
 
     from facediff.models.checkpoint import load_model
-    from facediff.models.yardsticks import Sampling, means_of, measure
+    from facediff.models.generation_metrics import SamplingOptions, means_of, measure
     from facediff.pipelines.animate import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
     factor = None if expressivity is None else ranges.EXPRESSIVITY.read("--expressivity", expressivity)
-    sampling = Sampling(samples, references, sampler, steps, seed, factor)
+    sampling = SamplingOptions(samples, references, sampler, steps, seed, factor)
     device = usable_device(device)
-    known = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
+    reference = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
     splits = list(dict.fromkeys(splits)) if splits else data.test_splits
-    others = [] if against is None or known else [against]
+    others = [] if against is None or reference else [against]
     counts = [min(len(data.clips(name)), max_clips or 10**9) for name in splits]
     total = sum(counts) * (len(checkpoints) + len(others))
     with progress_bar("clips", total, shown=not quiet) as step:
 
-        def results(paths: list[Path]) -> Yardsticks:
+        def results(paths: list[Path]) -> GenerationScores:
             models = {str(path): partial(load_model, path, device, commercial_only=commercial_only) for path in paths}
             return measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
 
-        found = results(checkpoints)
+        scores = results(checkpoints)
         if others:
             other = results(others)
-            known = {name: {each: other.mean(name, each) for each in own} for name, own in other.values.items()}
+            reference = {split: {name: other.mean(split, name) for name in own} for split, own in other.values.items()}
     if against is not None:
-        found = replace(found, against=known, against_name=str(against))
+        scores = replace(scores, against=reference, against_name=str(against))
     if json is not None:
-        write_json(json, found.as_dict())
+        write_json(json, scores.as_dict())
     if csv is not None:
-        write_rows(csv, found.rows())
-    tell(*text(found).split("\n"))
+        write_rows(csv, scores.rows())
+    tell(*text(scores).split("\n"))
 
 
 def corpus_of_checkpoint(
@@ -142,35 +142,37 @@ def corpus_of_checkpoint(
     return data
 
 
-def text(found: Yardsticks) -> str:
-    """The yardsticks as a table, one row each, with what they were taken over."""
-    from facediff.models.yardsticks import YARDSTICKS
+def text(scores: GenerationScores) -> str:
+    """The metrics as a table, one row each, under a line that names corpus, clips and sampler."""
+    from facediff.models.generation_metrics import GENERATION_METRICS
     from facediff.utils.tables import format_table
 
-    kind = "SYNTHETIC corpus" if found.synthetic else "corpus"
-    counts = ", ".join(f"{count} of {split}" for split, count in found.clips.items())
-    drawn = f"{found.samples} samples each" if found.samples > 1 else "one motion each, since it has no noise: spread 0"
-    lines = [f"{kind} {found.corpus}; clips: {counts}; {drawn}; {found.sampler}"]
-    if len(found.checkpoints) > 1:
-        lines.append(f"mean ± standard deviation over {len(found.checkpoints)} checkpoints")
-    if found.against_name:
-        lines.append(f"in brackets: the ratio to {found.against_name}")
+    kind = "SYNTHETIC corpus" if scores.synthetic else "corpus"
+    counts = ", ".join(f"{count} of {split}" for split, count in scores.clips.items())
+    drawn = (
+        f"{scores.samples} samples each" if scores.samples > 1 else "one motion each, since it has no noise: spread 0"
+    )
+    lines = [f"{kind} {scores.corpus}; clips: {counts}; {drawn}; {scores.sampler}"]
+    if len(scores.checkpoints) > 1:
+        lines.append(f"mean ± standard deviation over {len(scores.checkpoints)} checkpoints")
+    if scores.against_name:
+        lines.append(f"in brackets: the ratio to {scores.against_name}")
     rows = []
-    for name in YARDSTICKS:
+    for name in GENERATION_METRICS:
         cells: list[str | None] = []
-        for split in found.values:
-            mean, deviation = found.mean(split, name), found.deviation(split, name)
+        for split in scores.values:
+            mean, deviation = scores.mean(split, name), scores.deviation(split, name)
             cell = None if mean is None else number(mean)
             if cell is not None and deviation is not None:
                 cell += f" ± {number(deviation)}"
-            other = found.against.get(split, {}).get(name)
+            other = scores.against.get(split, {}).get(name)
             if cell is not None and mean is not None and other:
                 cell += f" [{mean / other:.3f}]"
             cells.append(cell)
         if any(cell is not None for cell in cells):
-            rows.append([found.title(name), *cells])
-    lines.append(format_table(["", *found.values], rows))
-    lines += [f"no value: {found.title(name)}: {reason}" for name, reason in found.missing.items()]
+            rows.append([scores.title(name), *cells])
+    lines.append(format_table(["", *scores.values], rows))
+    lines += [f"no value: {scores.title(name)}: {reason}" for name, reason in scores.missing.items()]
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""The yardsticks against the metrics taken by hand, for a model with noise and for one without."""
+"""The generation metrics against the metrics taken by hand, for a model with noise and for one without."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 import facediff.metrics as fm
-from facediff.cli.yardsticks import text
+from facediff.cli.generation_metrics import text
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
-from facediff.models.yardsticks import YARDSTICKS, Sampling, Yardsticks, means_of, measure
+from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, means_of, measure
 from tests.fakes.tiny import RATE, SEEN, VERTICES, Tiny
 
 LIPS, UPPER = range(12), range(12, 24)
@@ -54,13 +54,13 @@ def noisy(batch: Batch, seed: int) -> Tensor:
     return batch.motion + noise
 
 
-def run(data: Tiny, *models: AnimationModel, **options: Any) -> Yardsticks:  # noqa: ANN401
+def run(data: Tiny, *models: AnimationModel, **options: Any) -> GenerationScores:  # noqa: ANN401
     return measure({f"{place}.ckpt": lambda model=model: model for place, model in enumerate(models)}, data, **options)
 
 
-def test_every_yardstick_is_the_metric_that_it_names(tiny: Tiny) -> None:
+def test_every_generation_metric_is_the_metric_that_it_names(tiny: Tiny) -> None:
     model = scripted(tiny, noisy)
-    found = run(tiny, model, splits=["test_a"], sampling=Sampling(samples=4, references=1))
+    scores = run(tiny, model, splits=["test_a"], sampling=SamplingOptions(samples=4, references=1))
     drawn, truths, still, faces = [], [], [], []
     clips = tiny.dataset("test_a")
     people = {
@@ -105,11 +105,11 @@ def test_every_yardstick_is_the_metric_that_it_names(tiny: Tiny) -> None:
     }
     del fm.metric_of_samples  # type: ignore[attr-defined]
     for name, value in expected.items():
-        assert found.mean("test_a", name) == pytest.approx(value, rel=1e-5), name
-    assert found.mean("test_a", "real_time_factor") > 0  # type: ignore[operator]
-    assert found.clips == {"test_a": 4}
-    assert {"blink_ratio", "closures"} <= found.missing.keys()
-    assert found.mean("test_a", "blink_ratio") is None
+        assert scores.mean("test_a", name) == pytest.approx(value, rel=1e-5), name
+    assert scores.mean("test_a", "real_time_factor") > 0  # type: ignore[operator]
+    assert scores.clips == {"test_a": 4}
+    assert {"blink_ratio", "closures"} <= scores.missing.keys()
+    assert scores.mean("test_a", "blink_ratio") is None
 
 
 def test_a_reference_is_followed_with_the_label_and_without(tiny: Tiny) -> None:
@@ -119,47 +119,47 @@ def test_a_reference_is_followed_with_the_label_and_without(tiny: Tiny) -> None:
         styled = batch.reference.mean(1, keepdim=True).expand_as(batch.motion)
         return torch.where(batch.identity[:, None, None, None] >= 0, batch.motion + 0.001, styled)
 
-    found = run(tiny, scripted(tiny, script), sampling=Sampling(samples=2, references=1))
-    assert found.mean("test_a", "nearest_speaker") == 1.0
-    assert found.mean("test_a", "true_nearest_speaker") == 1.0
-    assert "chance 1/3" in found.title("nearest_speaker")
-    assert found.mean("test_a", "mve_hidden_another") > 1.2  # type: ignore[operator]
-    assert found.mean("test_a", "mve_known_another") == pytest.approx(1.0)
-    assert found.mean("test_b", "mve_known_another") is None  # nobody has trained on C, whose label says nothing
-    assert found.mean("test_b", "nearest_speaker") is not None
+    scores = run(tiny, scripted(tiny, script), sampling=SamplingOptions(samples=2, references=1))
+    assert scores.mean("test_a", "nearest_speaker") == 1.0
+    assert scores.mean("test_a", "true_nearest_speaker") == 1.0
+    assert "chance 1/3" in scores.title("nearest_speaker")
+    assert scores.mean("test_a", "mve_hidden_another") > 1.2  # type: ignore[operator]
+    assert scores.mean("test_a", "mve_known_another") == pytest.approx(1.0)
+    assert scores.mean("test_b", "mve_known_another") is None  # nobody has trained on C, whose label says nothing
+    assert scores.mean("test_b", "nearest_speaker") is not None
 
 
 def test_a_model_without_noise_has_no_spread_and_is_scored_by_its_distance(tiny: Tiny) -> None:
     model = scripted(tiny, lambda batch, seed: torch.zeros_like(batch.motion), noise=False)
-    found = run(tiny, model, sampling=Sampling(samples=5))
-    assert found.samples == 1
-    assert "spread 0" in text(found)
+    scores = run(tiny, model, sampling=SamplingOptions(samples=5))
+    assert scores.samples == 1
+    assert "spread 0" in text(scores)
     for split in ("test_a", "test_b"):
-        assert found.mean(split, "spread_face") == 0.0
+        assert scores.mean(split, "spread_face") == 0.0
         for name in ("lve_still", "lve_mean_still", "lve_best_still", "fdd_still"):
-            assert found.mean(split, name) == pytest.approx(1.0)
+            assert scores.mean(split, name) == pytest.approx(1.0)
         distances = [sample.motion[:, :12].square().sum((1, 2)).div(12).sqrt() for sample in tiny.dataset(split)]
-        assert found.mean(split, "energy_lips") == pytest.approx(torch.cat(distances).mean().item(), rel=1e-5)
+        assert scores.mean(split, "energy_lips") == pytest.approx(torch.cat(distances).mean().item(), rel=1e-5)
 
 
 def test_several_checkpoints_have_means_and_deviations_and_others_ratios(tiny: Tiny) -> None:
     models = [
         scripted(tiny, lambda batch, seed, share=share: share * batch.motion, noise=False) for share in (0.5, 0.8)
     ]
-    found = run(tiny, *models, splits=["test_b"])
-    assert found.values["test_b"]["liveliness_lips"] == [pytest.approx(0.5), pytest.approx(0.8)]
-    assert found.mean("test_b", "liveliness_lips") == pytest.approx(0.65)
-    assert found.deviation("test_b", "liveliness_lips") == pytest.approx(0.3 / 2**0.5)
-    stored = json.loads(json.dumps(found.as_dict()))
+    scores = run(tiny, *models, splits=["test_b"])
+    assert scores.values["test_b"]["liveliness_lips"] == [pytest.approx(0.5), pytest.approx(0.8)]
+    assert scores.mean("test_b", "liveliness_lips") == pytest.approx(0.65)
+    assert scores.deviation("test_b", "liveliness_lips") == pytest.approx(0.3 / 2**0.5)
+    stored = json.loads(json.dumps(scores.as_dict()))
     assert means_of(stored, "f")["test_b"]["liveliness_lips"] == pytest.approx(0.65)
     with pytest.raises(FaceDiffError, match="f:"):
         means_of({"format": "other"}, "f")
-    rows = {row["yardstick"]: row for row in found.rows()}
-    assert rows.keys() == YARDSTICKS.keys()
+    rows = {row["metric"]: row for row in scores.rows()}
+    assert rows.keys() == GENERATION_METRICS.keys()
     assert rows["liveliness_lips"]["value_2"] == pytest.approx(0.8)
-    assert "0.650 ± 0.212" in text(found)
+    assert "0.650 ± 0.212" in text(scores)
     with pytest.raises(FaceDiffError, match="samples"):
-        Sampling(samples=1)
+        SamplingOptions(samples=1)
 
 
 def test_the_command_writes_what_it_prints(
@@ -170,7 +170,15 @@ def test_the_command_writes_what_it_prints(
     trainer = make_trainer(limit_train_batches=1, limit_val_batches=0)
     trainer.fit(make_model(), datamodule=tiny)
     trainer.save_checkpoint(tmp_path / "a.ckpt")
-    words = ["yardsticks", str(tmp_path / "a.ckpt"), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", "--samples", "2"]
+    words = [
+        "generation-metrics",
+        str(tmp_path / "a.ckpt"),
+        "--corpus",
+        "tests.fakes.tiny.Tiny",
+        "--quiet",
+        "--samples",
+        "2",
+    ]
     words += ["--references", "1", "--max-clips", "1"]
     assert main([*words, "--json", str(tmp_path / "a.json"), "--csv", str(tmp_path / "a.csv")]) == 0
     printed = capsys.readouterr().out

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("espeakng_loader")
 
 from facediff.synthetic.corpus import generate
-from tools.yardsticks_of_truth import OtherTruths, other_truth
+from tools.generation_metrics_of_truth import OtherTruths, other_truth
 
 
 def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_path: Path) -> None:

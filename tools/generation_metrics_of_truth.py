@@ -1,11 +1,11 @@
-"""What a perfect generator gets on Puppet's yardsticks: other truths of the same speech, as a table.
+"""Puppet's generation metrics for a perfect generator: other truths of the same speech, as a table.
 
 The built-in corpus draws blinks, drift and habits of the brows at random, so it can be asked for another truth of the
 same sentence by the same speaker. Scored like samples of a model, these are the best that a model can be: no score
 below is reached by drawing from the right distribution, and some of them are not where one might expect them. FDD of
 single clips, for instance, cannot vanish, since the clip that was recorded is one of many.
 
-    $ python tools/yardsticks_of_truth.py
+    $ python tools/generation_metrics_of_truth.py
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from torch import Tensor
 
 from facediff.data import Batch, Puppet
 from facediff.models.base import AnimationModel
-from facediff.models.yardsticks import YARDSTICKS, Sampling, Yardsticks, measure
+from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, measure
 from facediff.synthetic.corpus import clips, generate_clip, rig_of
 from facediff.utils.files import atomic
 
 SKIPPED = ("mve_", "nearest", "real_time")
-"""Yardsticks that ask for the motion of another reference, or for a time."""
+"""Metrics that ask for the motion of another reference, or for a time."""
 
 
 class OtherTruths(AnimationModel):
@@ -53,16 +53,16 @@ class OtherTruths(AnimationModel):
 
 @lru_cache(maxsize=1024)
 def other_truth(name: str, seed: int) -> Tensor:
-    """Offsets from the template (frames, vertices, 3) of a clip, with its random part drawn anew."""
-    clip = next(each for each in clips() if each.name == name)
+    """Offsets from the template (frames, vertices, 3) of a clip, with its random part drawn again."""
+    clip = next(clip for clip in clips() if clip.name == name)
     rig = rig_of(clip.identity)
     weights = generate_clip(clip, seed)[1]
     still = rig.pose(torch.zeros(1, weights.shape[1]).numpy())
     return torch.from_numpy(rig.pose(weights) - still).float()
 
 
-def measured(root: Path | None = None, samples: int = 10, most_clips: int | None = None) -> Yardsticks:
-    """The yardsticks of other truths.
+def measured(root: Path | None = None, samples: int = 10, most_clips: int | None = None) -> GenerationScores:
+    """The generation metrics of other truths.
 
     Args:
         root: the corpus; the user's cache if None.
@@ -81,18 +81,18 @@ def measured(root: Path | None = None, samples: int = 10, most_clips: int | None
         model.adopt(data.assets())
         return model.eval()
 
-    sampling = Sampling(samples=samples, references=1)
+    sampling = SamplingOptions(samples=samples, references=1)
     return measure({"another truth": load}, data, sampling=sampling, most_clips=most_clips)
 
 
-def table(found: Yardsticks) -> str:
-    """Markdown: a row for each yardstick, a column for each split."""
-    lines = ["| yardstick | " + " | ".join(found.values) + " |", "|---|" + "---|" * len(found.values)]
-    for name in YARDSTICKS:
-        values = [found.mean(split, name) for split in found.values]
+def table(scores: GenerationScores) -> str:
+    """Markdown: a row for each metric, a column for each split."""
+    lines = ["| metric | " + " | ".join(scores.values) + " |", "|---|" + "---|" * len(scores.values)]
+    for name in GENERATION_METRICS:
+        values = [scores.mean(split, name) for split in scores.values]
         if name.startswith(SKIPPED) or None in values:
             continue
-        lines.append(f"| {found.title(name)} | " + " | ".join(f"{value:.4g}" for value in values if value is not None))
+        lines.append(f"| {scores.title(name)} | " + " | ".join(f"{value:.4g}" for value in values if value is not None))
         lines[-1] += " |"
     return "\n".join(lines)
 
@@ -104,11 +104,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--samples", type=int, default=10, help="other truths of each clip (default: 10)")
     parser.add_argument("--clips", type=int, help="clips of a split (default: all)")
     parser.add_argument("--output", type=Path, help="also write the table to this file")
-    given = parser.parse_args(arguments)
-    text = table(measured(given.data_root, given.samples, given.clips))
+    options = parser.parse_args(arguments)
+    text = table(measured(options.data_root, options.samples, options.clips))
     print(text)
-    if given.output is not None:
-        with atomic(given.output) as partial:
+    if options.output is not None:
+        with atomic(options.output) as partial:
             partial.write_text(text + "\n", encoding="utf-8")
 
 
