@@ -17,7 +17,8 @@ from typing import Any, Literal
 
 from facediff.benchmark.plan import MOST_CELLS, Before, CorpusEntry, MethodEntry, Options, Plan, Variant, find_config
 from facediff.errors import FaceDiffError, choices
-from facediff.utils.files import describe_files, sha256, short_name
+from facediff.utils.checksums import describe_files, sha256
+from facediff.utils.files import short_name
 from facediff.utils.hub import check_model_source, model_hash
 from facediff.utils.yaml_files import load_yaml
 

@@ -26,8 +26,8 @@ from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
 from facediff.utils.files import cache_dir, discard
-from facediff.utils.jobs import THREAD_VARIABLES
 from facediff.utils.plain_files import load_json, read_json, write_json
+from facediff.utils.workers import THREAD_VARIABLES
 
 RUNS, LOGS = "runs", "logs"
 STATE = "state.json"

@@ -24,7 +24,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.files import sha256
+from facediff.utils.checksums import sha256
 from facediff.utils.hub import model_hash
 from facediff.utils.provenance import Provenance, recipe_of
 from facediff.version import __version__

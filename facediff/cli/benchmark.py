@@ -54,7 +54,8 @@ def benchmark(
         dry_run: say what would run, and for how long by the last timings
     """
     from facediff.benchmark.plan import find_plan, read_plan
-    from facediff.utils.jobs import check_scheduler, is_cluster, processors
+    from facediff.utils.jobs import check_scheduler, is_cluster
+    from facediff.utils.workers import processors
 
     check_scheduler(scheduler)
     found = read_plan(find_plan(plan), corpus_folders(root or []))

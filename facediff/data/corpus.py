@@ -29,7 +29,8 @@ from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.speech.audio import samples_for
 from facediff.utils.arrays import ArrayStore
-from facediff.utils.files import cache_dir, sha256
+from facediff.utils.checksums import sha256
+from facediff.utils.files import cache_dir
 from facediff.utils.limits import COORDINATE, LIMITS, quoted
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_table

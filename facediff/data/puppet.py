@@ -22,9 +22,9 @@ from facediff.synthetic.further_speech import further_speech
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN, drawn_names
 from facediff.utils.files import cache_dir
-from facediff.utils.jobs import processors
 from facediff.utils.licences import Commercial
 from facediff.utils.ranges import Range
+from facediff.utils.workers import processors
 
 
 def cache_root(seed: int, drawn_speakers: int = 0) -> Path:

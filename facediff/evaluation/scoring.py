@@ -29,8 +29,9 @@ from facediff.metrics import (
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.one_pass import one_pass
 from facediff.utils.arrays import in_range, open_vertices
-from facediff.utils.jobs import WorkerDied, run_tasks
+from facediff.utils.jobs import run_tasks
 from facediff.utils.limits import COORDINATE
+from facediff.utils.workers import WorkerDied
 
 METRICS = "metrics"  # Stands in place of a protocol's name where metrics were chosen by name
 NATIVE = (np.float16, np.float32, np.float64)  # Types that torch reads as they are

@@ -36,8 +36,8 @@ from facediff.models.base import AnimationModel
 from facediff.models.layers import frame_mask
 from facediff.speech.windows import LOW_LATENCY, QUIETEST
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.jobs import processors
 from facediff.utils.ranges import USUAL_VOICE_STEPS
+from facediff.utils.workers import processors
 
 OTHER_VOICES = (
     "voice:share=0.8,semitones=6,formants=0.22",

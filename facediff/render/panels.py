@@ -17,7 +17,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.render.rasteriser import Renderer, opencv
 from facediff.utils.files import atomic
-from facediff.utils.jobs import processors
+from facediff.utils.workers import processors
 
 Frame = npt.NDArray[np.uint8]
 Motion = npt.NDArray[np.floating]

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
-from facediff.utils.files import atomic_folder, cache_dir, sha256
+from facediff.utils.checksums import sha256
+from facediff.utils.files import atomic_folder, cache_dir
 from facediff.utils.limits import brief
 
 VERSION = "1.22.0"

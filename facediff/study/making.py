@@ -28,7 +28,8 @@ from facediff.study.page import write_page
 from facediff.study.texts import Questionnaire, check_languages
 from facediff.utils import ranges
 from facediff.utils.batch import RECORDS, FileTask, Recipe, run_batch
-from facediff.utils.files import check_folder_writable, locked, remove_partial, sha256
+from facediff.utils.checksums import sha256
+from facediff.utils.files import check_folder_writable, locked, remove_partial
 from facediff.utils.progress import progress_bar
 from facediff.utils.ranges import Range
 from facediff.version import __version__

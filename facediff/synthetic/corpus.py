@@ -20,9 +20,11 @@ from facediff.synthetic.rig import Rig, build_rig, eyelid_pairs, lip_pairs
 from facediff.synthetic.speakers import MOST_DRAWN, SPEAKERS, drawn_names, speaker_of
 from facediff.synthetic.speech import SENTENCES, Phoneme, speak
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.files import atomic_folder, describe_files, same_sizes
-from facediff.utils.jobs import WorkerDied, is_cluster, run_tasks
+from facediff.utils.checksums import describe_files, same_sizes
+from facediff.utils.files import atomic_folder
+from facediff.utils.jobs import is_cluster, run_tasks
 from facediff.utils.plain_files import read_json, write_json, write_table
+from facediff.utils.workers import WorkerDied
 
 FORMAT = 1
 GENERATOR = "1.1"

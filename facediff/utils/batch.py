@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.files import sha256, short_name
-from facediff.utils.jobs import SetupError, WorkerDied, run_tasks
+from facediff.utils.checksums import sha256
+from facediff.utils.files import short_name
+from facediff.utils.jobs import SetupError, run_tasks
 from facediff.utils.plain_files import read_json, write_json
+from facediff.utils.workers import WorkerDied
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -37,8 +37,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError, choices
-from facediff.utils import jobs
-from facediff.utils.jobs import GRACE, SLURM, WorkerDied
+from facediff.utils import workers as local_workers
+from facediff.utils.files import scratch_folder
+from facediff.utils.workers import GRACE, SLURM, WorkerDied
 from facediff.version import __version__
 
 Task = TypeVar("Task")
@@ -141,8 +142,6 @@ def run_on_cluster(
 @contextmanager
 def token(folder: Path) -> Iterator[dict[str, object]]:
     """A file in a folder that workers must see, for as long as the block runs."""
-    from facediff.utils.files import scratch_folder
-
     with scratch_folder(folder / "cluster") as scratch:
         file = scratch / "token"
         # Its length says which one it is: two folders on two machines may have the same name.
@@ -611,7 +610,7 @@ class Host:
     def end(self, future: Future[bytes]) -> None:
         """End the process; what it has begun to write is removed."""
         if self.pool is not None:
-            jobs.end_soon(self.pool, [future], grace=0.0)
+            local_workers.end_soon(self.pool, [future], grace=0.0)
             self.close()
 
     def close(self) -> None:
@@ -623,7 +622,7 @@ class Host:
 
 def start_process() -> ProcessPoolExecutor:
     """A process for tasks, such as those of a single machine."""
-    return jobs.process_pool(None, 1)
+    return local_workers.process_pool(None, 1)
 
 
 _starting = threading.Lock()  # the environment, which is changed meanwhile, is one for all workers of this process
@@ -635,7 +634,7 @@ def start(pool: ProcessPoolExecutor, function: Callable[..., bytes], *arguments:
     # Dask's nanny marks its workers as daemons, which may not start processes: Python would leave their children alone
     # when a worker is killed. Ours end by themselves when their parent does.
     before = getattr(me, "_config", {}).get("daemon", False)
-    with _starting, jobs.starting_processes():
+    with _starting, local_workers.starting_processes():
         try:
             getattr(me, "_config", {})["daemon"] = False
             return pool.submit(function, *arguments)

@@ -1,10 +1,9 @@
-"""Files and folders that appear whole or not at all, locks, checksums, and the folders that facediff itself uses."""
+"""Files and folders that appear whole or not at all, locks, and the folders that facediff itself uses."""
 
 from __future__ import annotations
 
 import errno
 import glob
-import hashlib
 import os
 import re
 import secrets
@@ -14,15 +13,14 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from facediff.errors import FaceDiffError
 from facediff.utils.destinations import destination, refuse_protected
-from facediff.utils.jobs import run_tasks
 
 ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
 
@@ -520,43 +518,3 @@ def _locked_folder(folder: Path) -> Iterator[bool | None]:
         yield _lock(descriptor)
     finally:
         os.close(descriptor)
-
-
-# Checksums, as manifests record them.
-
-
-def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal.
-
-    Raises:
-        FaceDiffError: if the file cannot be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); check who may read it") from error
-
-
-def describe_files(
-    folder: Path, names: Iterable[str] | None = None, *, workers: int = 1, progress: str = ""
-) -> dict[str, dict[str, int | str]]:
-    """Size and SHA-256 of files as manifests record them, ``{"bytes": …, "sha256": …}`` by name, sorted.
-
-    ``names`` are paths relative to the folder; None stands for all files in it and its subfolders.
-    """
-    if names is None:
-        names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-    ordered = sorted(names)
-    digests = dict(
-        run_tasks(lambda name: sha256(folder / name), ordered, workers=workers, mode="threads", progress=progress)
-    )
-    return {name: {"bytes": (folder / name).stat().st_size, "sha256": digests[name]} for name in ordered}
-
-
-def same_sizes(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether all files that a manifest describes are there with their sizes; their content is not read."""
-    try:
-        return all((folder / name).stat().st_size == facts["bytes"] for name, facts in files.items())
-    except (OSError, KeyError, TypeError):
-        return False

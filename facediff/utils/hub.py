@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.files import sha256
+from facediff.utils.checksums import sha256
 from facediff.utils.limits import LIMITS, brief
 
 CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"

@@ -16,9 +16,10 @@ from typing import Any
 import pytest
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils import cluster, jobs
+from facediff.utils import cluster, jobs, workers
 from facediff.utils.batch import run_batch
-from facediff.utils.jobs import PerWorker, SetupError, WorkerDied, check_scheduler, run_tasks
+from facediff.utils.jobs import PerWorker, SetupError, check_scheduler, run_tasks
+from facediff.utils.workers import WorkerDied
 from tests.fakes.tasks import counting, deadly, failing_oddly, failing_setup, place, raising, write_slowly
 
 distributed = pytest.importorskip("distributed")
@@ -101,7 +102,7 @@ def test_a_stop_ends_tasks_and_removes_what_is_half_written(
 
 @pytest.mark.parametrize("mode", ["threads"])
 def test_a_stop_ends_threads_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
-    monkeypatch.setattr(jobs.end_soon, "__defaults__", (0.1,))
+    monkeypatch.setattr(workers.end_soon, "__defaults__", (0.1,))
 
     def work(task: int) -> int:
         if task:

@@ -18,18 +18,8 @@ import trimesh
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
 from facediff.speech.audio import read_speech
-from facediff.utils.files import (
-    atomic,
-    atomic_folder,
-    check_writable,
-    describe_files,
-    discard,
-    locked,
-    put_in_place,
-    same_sizes,
-    scratch_folder,
-    sha256,
-)
+from facediff.utils.checksums import describe_files, same_sizes, sha256
+from facediff.utils.files import atomic, atomic_folder, check_writable, discard, locked, put_in_place, scratch_folder
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_json, write_json, write_rows
 from facediff.utils.tables import format_table

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.jobs import Mode, PerWorker, SetupError, WorkerDied, run_tasks
+from facediff.utils.jobs import PerWorker, SetupError, run_tasks
+from facediff.utils.workers import Mode, WorkerDied
 from tests.fakes.tasks import deadly, fail_after, failing_setup, raising, square
 
 ROOT = Path(__file__).parents[2]

@@ -190,7 +190,7 @@ def main() -> None:
         print(json.dumps(measure(ways(args)[args.way])))
         return
     if args.workers is None:
-        from facediff.utils.jobs import processors
+        from facediff.utils.workers import processors
 
         args.workers = processors()
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:

@@ -38,7 +38,8 @@ from facediff.data.check.shared import (
 )
 from facediff.data.packed.stores import is_packed
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.utils.jobs import WorkerDied, is_cluster, processors, run_tasks
+from facediff.utils.jobs import is_cluster, run_tasks
+from facediff.utils.workers import WorkerDied, processors
 
 if TYPE_CHECKING:
     from facediff.data.corpus import Clip, Corpus

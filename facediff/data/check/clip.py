@@ -18,7 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.speech.audio import open_sound
 from facediff.speech.cut_short import CUT, cut_short
 from facediff.utils.arrays import open_array, vertices_of
-from facediff.utils.files import sha256
+from facediff.utils.checksums import sha256
 from facediff.utils.limits import LIMITS
 
 CHUNK = 16  # frames that are read at a time

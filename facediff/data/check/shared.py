@@ -15,7 +15,7 @@ from facediff.data.check.layouts import MANIFEST, STATE, View
 from facediff.data.check.report import Findings, counted, few, number, relative
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import surface_area
-from facediff.utils.files import sha256
+from facediff.utils.checksums import sha256
 from facediff.utils.pickles import load_pickle
 
 if TYPE_CHECKING:

@@ -45,10 +45,11 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.speech.audio import open_sound
 from facediff.utils.arrays import open_vertices
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
-from facediff.utils.jobs import WorkerDied, run_tasks
+from facediff.utils.jobs import run_tasks
 from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.units import metres_per_unit
+from facediff.utils.workers import WorkerDied
 
 if TYPE_CHECKING:
     from facediff.data.check.layouts import View

@@ -34,7 +34,7 @@ from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import atomic_folder, cache_dir
-from facediff.utils.jobs import processors
+from facediff.utils.workers import processors
 
 Floats = npt.NDArray[np.float32]
 

@@ -15,9 +15,11 @@ from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import EXACT
 from facediff.data.packed.reader import PackedCorpus
 from facediff.errors import FaceDiffError
-from facediff.utils.files import atomic_folder, describe_files
-from facediff.utils.jobs import PerWorker, WorkerDied, processors, run_tasks
+from facediff.utils.checksums import describe_files
+from facediff.utils.files import atomic_folder
+from facediff.utils.jobs import PerWorker, run_tasks
 from facediff.utils.plain_files import write_json
+from facediff.utils.workers import WorkerDied, processors
 
 
 def unpack(

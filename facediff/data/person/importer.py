@@ -37,7 +37,8 @@ from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
 from facediff.utils import ranges
-from facediff.utils.files import check_writable, describe_files, put_in_place, scratch_folder
+from facediff.utils.checksums import describe_files
+from facediff.utils.files import check_writable, put_in_place, scratch_folder
 from facediff.utils.plain_files import write_json, write_rows
 
 MIN_SECONDS = 2.0

@@ -35,7 +35,7 @@ from facediff.data.prepare.runner import (
 )
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import SHAPES, Flame
-from facediff.utils.files import sha256
+from facediff.utils.checksums import sha256
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import write_rows
 from facediff.utils.progress import track

@@ -21,10 +21,12 @@ from facediff.data.manifest import FORMAT, load_manifest
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
-from facediff.utils.files import atomic, check_writable, describe_files, locked, remove_partial, same_sizes
-from facediff.utils.jobs import is_cluster, processors
+from facediff.utils.checksums import describe_files, same_sizes
+from facediff.utils.files import atomic, check_writable, locked, remove_partial
+from facediff.utils.jobs import is_cluster
 from facediff.utils.plain_files import parse_json, write_json
 from facediff.utils.progress import progress_bar
+from facediff.utils.workers import processors
 
 Precision = Literal["float32", "float64"]
 """How motion is stored; float32 takes half the disk."""

@@ -20,7 +20,7 @@ from facediff.data.packed.stores import ChunkCache
 from facediff.data.packed.unpacking import unpack
 from facediff.data.packed.web import WebServer
 from facediff.errors import FaceDiffError
-from facediff.utils.files import describe_files
+from facediff.utils.checksums import describe_files
 from tests.fakes.tiny import Tiny, write_tiny
 
 TINY = "tests.fakes.tiny.Tiny"

@@ -23,7 +23,7 @@ from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.unpacking import unpack
 from facediff.data.prepare.runner import write_templates
 from facediff.errors import FaceDiffError
-from facediff.utils.files import describe_files
+from facediff.utils.checksums import describe_files
 from facediff.utils.plain_files import write_json
 from tests.fakes.tiny import VERTICES, Tiny, write_tiny
 

@@ -1,0 +1,48 @@
+"""Checksums and sizes of files, as manifests record them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from facediff.errors import FaceDiffError
+from facediff.utils.jobs import run_tasks
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        FaceDiffError: if the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); check who may read it") from error
+
+
+def describe_files(
+    folder: Path, names: Iterable[str] | None = None, *, workers: int = 1, progress: str = ""
+) -> dict[str, dict[str, int | str]]:
+    """Size and SHA-256 of files as manifests record them, ``{"bytes": …, "sha256": …}`` by name, sorted.
+
+    ``names`` are paths relative to the folder; None stands for all files in it and its subfolders.
+    """
+    if names is None:
+        names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    ordered = sorted(names)
+    digests = dict(
+        run_tasks(lambda name: sha256(folder / name), ordered, workers=workers, mode="threads", progress=progress)
+    )
+    return {name: {"bytes": (folder / name).stat().st_size, "sha256": digests[name]} for name in ordered}
+
+
+def same_sizes(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether all files that a manifest describes are there with their sizes; their content is not read."""
+    try:
+        return all((folder / name).stat().st_size == facts["bytes"] for name, facts in files.items())
+    except (OSError, KeyError, TypeError):
+        return False
