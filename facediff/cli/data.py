@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
-from facediff.cli.parsing import Group, Option, Parameter, Parameters, parameters_of, parse
+from facediff.cli.parsing import OptionGroup, Option, Parameter, Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.utils import ranges
@@ -128,7 +128,7 @@ def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], Plan], dict
     return partial(module.plan, **own), values
 
 
-def plan_options(plan: Callable[..., Plan]) -> dict[str, Parameter | Group]:
+def plan_options(plan: Callable[..., Plan]) -> dict[str, Parameter | OptionGroup]:
     """Keyword parameters of a corpus's plan: each is an option of the command, in addition to the common ones."""
     return {name: entry for name, entry in parameters_of(plan).items() if name not in ("raw", "quiet")}
 

@@ -5,8 +5,8 @@ A command is a typed function. Its parameters are its options: the name, the typ
 positional argument of the command, too. A parameter whose type is a dataclass is a group of options that several
 commands share: the dataclass's fields are the options, and the function receives an instance.
 
-Type conversion is jsonargparse's; this module adds what that library leaves open: flags with dashes, options that may
-stand without a value, ranges of numbers, and errors of one or two sentences.
+It is the standard library's argparse that splits the words; this module adds the conversion to the declared types,
+ranges of numbers, groups, checks of paths, and errors of one or two sentences.
 """
 
 from __future__ import annotations
@@ -149,6 +149,11 @@ class Parameter:
                 raise FaceDiffError(f"{error}{bare}") from error
         if not word.strip():
             raise FaceDiffError(f"{self.flag} {shown(word)}: is empty; expected {self.expected()}")
+        if get_origin(self.value_type) is Literal:
+            values = {str(value): value for value in get_args(self.value_type)}
+            if word not in values:
+                raise FaceDiffError(f"{self.shown} {shown(word)}: not valid; expected {self.expected()}")
+            return values[word]
         if self.has_commas:
             words = word.split(",")
             names = [name.strip() for name in words]
@@ -173,12 +178,12 @@ class Parameter:
         return f"{self.length} times {one}" if self.length else one
 
 
-Parameters = Mapping[str, "Parameter | Group"]
+Parameters = Mapping[str, "Parameter | OptionGroup"]
 """A command's parameters by name."""
 
 
 @dataclass(frozen=True)
-class Group:
+class OptionGroup:
     """A dataclass parameter: options that several commands share."""
 
     made: type
@@ -195,14 +200,14 @@ def without_none(hint: Any) -> Any:  # noqa: ANN401
     return hint
 
 
-def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | Group]:
+def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | OptionGroup]:
     """The parameters of a command function, or the fields of a dataclass."""
     import docstring_parser
 
     parsed = docstring_parser.parse(inspect.getdoc(function) or "", docstring_parser.DocstringStyle.GOOGLE)
     helps = {entry.arg_name: plain_text(entry.description or "") for entry in parsed.params}
     hints, annotations = typing.get_type_hints(function), typing.get_type_hints(function, include_extras=True)
-    found: dict[str, Parameter | Group] = {}
+    found: dict[str, Parameter | OptionGroup] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             continue
@@ -210,7 +215,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | Group]:
         if dataclasses.is_dataclass(hint):
             made = typing.cast(type, hint)
             fields = [field for field in parameters_of(made).values() if isinstance(field, Parameter)]
-            found[name] = Group(made, *summary_of(made), fields)
+            found[name] = OptionGroup(made, *summary_of(made), fields)
             continue
         option = next((extra for extra in extras_of(annotated) if isinstance(extra, Option)), Option())
         # The fields of a dataclass may be given by position in Python, but are options of the command line.
@@ -265,17 +270,16 @@ def make_parser(
 
     ``details`` is the text at the end of the help; a function is called when the help is printed.
     """
-    import jsonargparse
 
-    class Parser(jsonargparse.ArgumentParser):
-        def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-            raise FaceDiffError(readable(message, flat(parameters), program)) from ex
+    class CommandParser(argparse.ArgumentParser):
+        def error(self, message: str) -> NoReturn:
+            raise FaceDiffError(readable(message, flat(parameters), program))
 
-        def format_help(self, *arguments: Any) -> str:  # noqa: ANN401 - passed on
+        def format_help(self) -> str:
             self.epilog = details() if callable(details) else details
-            return super().format_help(*arguments)
+            return super().format_help()
 
-    parser = Parser(prog=program, description=summary, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser = CommandParser(prog=program, description=summary, formatter_class=HelpFormatter, allow_abbrev=False)
     for entry in parameters.values():
         if isinstance(entry, Parameter):
             add(parser, entry)
@@ -290,36 +294,34 @@ def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's
     """Add one parameter to a parser or to a group of it."""
     option, flags = parameter.option, parameter.flags
     text = parameter.help if parameter.range is None else f"{parameter.help}; {parameter.range}"
-    words: dict[str, Any] = {"help": text.replace("%", "%%")}
+    keywords: dict[str, Any] = {"help": text.replace("%", "%%")}
     if parameter.is_switch:
         parser.add_argument(
-            *flags, dest=parameter.name, action="store_false" if parameter.default else "store_true", **words
+            *flags, dest=parameter.name, action="store_false" if parameter.default else "store_true", **keywords
         )
         return
-    # jsonargparse converts literals; what it knows of numbers and paths is looser than what is declared here. It calls
-    # the function with defaults, too.
-    literal = get_origin(parameter.value_type) is Literal
-    words["type"] = (
-        parameter.value_type if literal else lambda word: parameter.read(word) if isinstance(word, str) else word
-    )
+    # argparse calls the function with defaults that are texts, too; those of type hints are values already.
+    keywords["type"] = lambda word: word if word == parameter.default else parameter.read(word)
     if option.metavar:
-        words["metavar"] = option.metavar
+        keywords["metavar"] = option.metavar
+    elif get_origin(parameter.value_type) is Literal:
+        keywords["metavar"] = "{" + ",".join(str(value) for value in get_args(parameter.value_type)) + "}"
     if parameter.length:
-        words["nargs"] = parameter.length
+        keywords["nargs"] = parameter.length
     elif parameter.is_list and not parameter.has_commas:
-        words |= {"nargs": "+"} if option.many or parameter.positional else {"action": "append"}
+        keywords |= {"nargs": "+"} if option.many or parameter.positional else {"action": "append"}
     if option.bare is not None:
-        words |= {"nargs": "?", "const": option.bare}
+        keywords |= {"nargs": "?", "const": option.bare}
     if parameter.positional:
         if parameter.default is not MISSING:
-            words |= {"nargs": "*" if parameter.is_list else "?", "default": parameter.default}
-        parser.add_argument(parameter.name, **words)
+            keywords |= {"nargs": "*" if parameter.is_list else "?", "default": parameter.default}
+        parser.add_argument(parameter.name, **keywords)
         return
     if parameter.default is MISSING:
-        words["required"] = True
+        keywords["required"] = True
     else:
-        words["default"] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
-    parser.add_argument(*flags, dest=parameter.name, **words)
+        keywords["default"] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+    parser.add_argument(*flags, dest=parameter.name, **keywords)
 
 
 def parse(
@@ -407,16 +409,9 @@ def with_more_help(text: Callable[[], str]) -> Callable[[Function], Function]:
 
 
 def readable(message: str, parameters: Collection[Parameter], program: str) -> str:
-    """At most two sentences for what argparse and jsonargparse say in several lines."""
+    """One sentence for what argparse reports, naming the option and what to do."""
     see = f"see `{program} --help`"
     flags = {parameter.name: parameter.flag for parameter in parameters}
-    key = re.search(r'Parser key "(\w+)"', message)
-    parameter = next((p for p in parameters if key is not None and p.name == key.group(1)), None)
-    if parameter is not None:
-        given = re.search(r"(?:Got|Given) value: (.*)", message)
-        value = given.group(1).strip("'\"") if given is not None else ""
-        bare = f"; {parameter.flag} without a value goes to the end" if parameter.option.bare is not None else ""
-        return f"{parameter.flag} {value}: not valid; expected {parameter.expected()}{bare} ({see})"
     unknown = re.search(r"[Uu]nrecognized arguments?: (\S+)", message)
     if unknown is not None:
         word = unknown.group(1).partition("=")[0]

@@ -15,7 +15,7 @@ from facediff.cli.app import COMMANDS, find, load
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.parsing import (
     RENAMED,
-    Group,
+    OptionGroup,
     Option,
     Parameters,
     arguments_of,
@@ -249,7 +249,7 @@ def test_every_option_of_every_command_is_explained(name: str) -> None:
     for parameter in flat(parameters):
         assert parameter.help, f"{name}: {parameter.flag} has no help"
         assert parameter.positional or parameter.flag in text
-    assert all(entry.title for entry in parameters.values() if isinstance(entry, Group))
+    assert all(entry.title for entry in parameters.values() if isinstance(entry, OptionGroup))
     assert COMMANDS[name].help
 
 
