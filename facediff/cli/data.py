@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
-from facediff.cli.parsing import OptionGroup, Option, Parameter, Parameters, parameters_of, parse
+from facediff.cli.parsing import Option, OptionGroup, Parameter, Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.utils import ranges

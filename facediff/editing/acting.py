@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, acting, checks_arguments
-from facediff.speech.prosody import ProsodicEvent, Prosody
+from facediff.speech.prosody import ProsodicEvent, ProsodyTracker
 from facediff.speech.voice_activity import HOP, Wave
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
@@ -184,7 +184,7 @@ class _ProsodyPerformer(Performer):
 
     def __init__(self, options: ProsodyActing, frame_rate: float, seed: int) -> None:
         self.options, self.frame_rate, self.seed = options, frame_rate, seed
-        self._prosody = Prosody()
+        self._prosody = ProsodyTracker()
         self._frames = 0  # given out
         self._seen = 0  # events that have been turned into gestures
         # Gestures by what they move: (seconds of the peak's beginning, size).

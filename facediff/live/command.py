@@ -10,10 +10,10 @@ from pathlib import Path
 
 from facediff.errors import FaceDiffError, printable
 from facediff.live.frames import OPTION, Performance, Receiver, open_receivers
-from facediff.live.loop import Loop, Solver, Summary
+from facediff.live.loop import LiveSummary, Loop, Solver
 from facediff.live.model import LiveModel, runtime_model, usual_gate
 from facediff.live.sound import SoundOut
-from facediff.live.sources import USUAL, Microphone, Pcm, Played, Source
+from facediff.live.sources import USUAL, Microphone, Pcm, Played, SpeechSource
 from facediff.registry import receiver
 from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
 from facediff.utils import ranges
@@ -77,7 +77,7 @@ class LiveOptions:
         usual = RECEIVERS if self.speech not in (None, "-") else OFF
         return usual if self.sound is None else self.sound
 
-    def source(self) -> Source:
+    def source(self) -> SpeechSource:
         """Where the speech comes from."""
         if self.microphone is not None:
             return Microphone(self.microphone)
@@ -121,7 +121,7 @@ def exported_model(options: LiveOptions) -> LiveModel:
     )
 
 
-def perform(options: LiveOptions, open_model: Callable[[LiveOptions], LiveModel], report: Report) -> Summary:
+def perform(options: LiveOptions, open_model: Callable[[LiveOptions], LiveModel], report: Report) -> LiveSummary:
     """Perform from the first check to the report at the end.
 
     Args:

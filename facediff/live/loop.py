@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from facediff.live.frames import LiveFrame, Receiver
 from facediff.live.model import LiveModel
-from facediff.live.sources import Source, Speech
+from facediff.live.sources import Speech, SpeechSource
 from facediff.live.timing import Lags, Pacer, SpokenClock
 from facediff.speech.audio import samples_for
 from facediff.utils import SAMPLE_RATE
@@ -40,7 +40,7 @@ RECENT = 3.0
 
 
 @dataclass
-class Summary:
+class LiveSummary:
     """What a performance was like.
 
     Attributes:
@@ -170,7 +170,7 @@ class Loop:
     def __init__(
         self,
         model: LiveModel,
-        source: Source,
+        source: SpeechSource,
         receivers: Sequence[Receiver],
         *,
         hearing: Sequence[Receiver] = (),
@@ -180,7 +180,7 @@ class Loop:
         every: float | None = 5.0,
     ) -> None:
         self.model, self.source, self.receivers, self.hearing = model, source, receivers, hearing
-        self.summary = Summary()
+        self.summary = LiveSummary()
         self.clock = SpokenClock()
         self.pacer = Pacer(model.hop)
         self._solve, self._seconds, self._report, self._every = solve, seconds, report, every
@@ -197,7 +197,7 @@ class Loop:
         self._slow_told = False
         self._failing: set[str] = set()  # names of receivers that have raised
 
-    def run(self) -> Summary:
+    def run(self) -> LiveSummary:
         """Perform until the speech ends, ``seconds`` have been heard, or Ctrl-C.
 
         Raises:

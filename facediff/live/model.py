@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float32]
 
 
-class Hearing(Protocol):
+class VertexStream(Protocol):
     """A stream: speech in pieces, to vertices."""
 
     @property
@@ -48,7 +48,7 @@ class LiveModel:
         metadata: model, corpus, licences, identity, style, seed.
     """
 
-    start: Callable[[], Hearing]
+    start: Callable[[], VertexStream]
     frame_rate: float
     neutral: Array
     faces: npt.NDArray[np.int32]

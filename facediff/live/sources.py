@@ -44,7 +44,7 @@ SILENT = 5.0
 """Seconds without a sample after which a microphone is gone."""
 
 
-class Source(ABC):
+class SpeechSource(ABC):
     """Speech that arrives.
 
     Attributes:
@@ -62,7 +62,7 @@ class Source(ABC):
         """
 
 
-class Played(Source):
+class Played(SpeechSource):
     """A recording in real time, as if it were spoken now.
 
     Args:
@@ -89,7 +89,7 @@ class Played(Source):
             deliver(piece, time.monotonic())
 
 
-class Pcm(Source):
+class Pcm(SpeechSource):
     """Samples of 16 bits, mono, little endian, on standard input.
 
     Args:
@@ -126,7 +126,7 @@ class Pcm(Source):
         deliver(self._convert(np.zeros(0, np.float32), True), time.monotonic())
 
 
-class Microphone(Source):
+class Microphone(SpeechSource):
     """A sound device of this machine, through PortAudio.
 
     Args:

@@ -25,7 +25,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.speech.audio import samples_for
 from facediff.speech.frame_clock import FrameClock
-from facediff.speech.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, MotionWindow, SpeechWindows, WindowPlan
 
 if TYPE_CHECKING:
     from facediff.models.graphs import Graphs
@@ -465,7 +465,7 @@ class Inference(ABC):
         return self.generate_clips(clip, seed=seeds[0], progress=progress).expand(len(seeds), -1, -1, -1)
 
     def generate_window(
-        self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
+        self, clip: Batch, window: MotionWindow, seeds: Sequence[int], before: list[Tensor] | None
     ) -> tuple[Motion, list[Tensor]]:
         """Motion of one window of long speech but for its past, which continues the window before it.
 
@@ -567,7 +567,7 @@ class SpeechStream(SpeechWindows[Motion]):
 
     @torch.inference_mode()
     def generate(
-        self, window: Window, speech: npt.NDArray[np.float32], frames: int, mean: float, deviation: float
+        self, window: MotionWindow, speech: npt.NDArray[np.float32], frames: int, mean: float, deviation: float
     ) -> Motion:
         """By the model, at the level of all speech so far."""
         clip = with_speech(self.clip, torch.from_numpy(speech).to(self.clip.audio), frames)
@@ -639,7 +639,7 @@ class WindowNoise:
         device: where the noise is drawn.
     """
 
-    def __init__(self, name: str, window: Window, seeds: Sequence[int], device: torch.device) -> None:
+    def __init__(self, name: str, window: MotionWindow, seeds: Sequence[int], device: torch.device) -> None:
         self.window = window
         # Each window has a stream of its own for the frames that are new in it, so that later windows can draw the same
         # numbers again without keeping them.

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from facediff.models.styles import StyleLike
     from facediff.pipelines.directing import DirectedStream
     from facediff.pipelines.rest import MouthAtRest
-    from facediff.speech.phonemes import Phoneme
+    from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.voice_activity import VoiceGate
 
 MIN_SECONDS = 0.2
@@ -206,7 +206,7 @@ class AnimationPipeline:
 
             self.rest = MouthAtRest(gate, facts["template"], facts["regions"], self.model.frame_rate)
         self._correspondence: Correspondence | None = None
-        self._phonemes: list[Phoneme] | None = None  # of the recording, once they are known
+        self._phonemes: list[TimedPhoneme] | None = None  # of the recording, once they are known
         self.style: Reference | Style | None = None
         wanted = style if style is not None else options.style or None
         if wanted is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.speech.phonemes import Phoneme, spoken_by_machine
+from facediff.speech.phonemes import TimedPhoneme, spoken_by_machine
 from facediff.speech.voice_activity import EnergyGate, openness
 from facediff.utils import SAMPLE_RATE
 
@@ -17,7 +17,7 @@ LONGEST = 2000
 """Characters of a transcript; a longer recording is better aligned by a program made for it."""
 
 
-def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[Phoneme]:
+def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPhoneme]:
     """Phonemes in time of a recording (S,) at 16 kHz in which an English text is spoken.
 
     The text is spoken by espeak-ng, which knows its times, and both are aligned by dynamic time warping of cepstra
@@ -54,5 +54,5 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[Phoneme
         place = np.interp((seconds - begin) * RATE, np.arange(len(path)) + 0.5, path + 0.5)
         return float(first + place) / RATE
 
-    found = [Phoneme(time(each.start), time(each.end), each.ipa) for each in voiced]
+    found = [TimedPhoneme(time(each.start), time(each.end), each.ipa) for each in voiced]
     return [each for each in found if each.end > each.start]

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError, MissingExtraError, choices
 from facediff.runtime.folder import Arrays, Description, read_folder
-from facediff.runtime.sampling import NAME, Conditions, Heard, clip_motion, window_motion
+from facediff.runtime.sampling import NAME, RuntimeConditions, WindowSpeech, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, read_style
 from facediff.speech.audio import samples_for
 from facediff.speech.voice_activity import EnergyGate, Openness, VoiceGate, openness, toward_rest
-from facediff.speech.windows import LOW_LATENCY, SpeechWindows, Window, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, MotionWindow, SpeechWindows, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Expressivity, Seed, mismatch
 from facediff.version import __version__
@@ -149,7 +149,7 @@ class RuntimeModel:
             # In the precision of the model, which standardises in float32.
             mean = speech.mean(dtype=np.float32)
             deviation = np.sqrt(np.square(speech - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
-            offsets = clip_motion(self, Heard(speech, frames, float(mean), float(deviation)), conditions)
+            offsets = clip_motion(self, WindowSpeech(speech, frames, float(mean), float(deviation)), conditions)
         else:
             stream = RuntimeStream(self, face, conditions, self.windows)
             offsets = np.concatenate(list(stream.parts(audio, frames=frames)), 1)
@@ -193,7 +193,7 @@ class RuntimeModel:
         face: int,
         audio: Array | None,
         name: str,
-        conditions: Conditions,
+        conditions: RuntimeConditions,
         gate: VoiceGate | None,
     ) -> Animation:
         """Vertices (T, V, 3) of a face with everything that exporters need."""
@@ -238,7 +238,7 @@ class RuntimeModel:
         style: str | RuntimeStyle | None,
         seed: int,
         expressivity: float,
-    ) -> tuple[int, Conditions]:
+    ) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and what motion is conditioned on."""
         about = self.description
         chosen = identity if identity is not None else (about.identities or about.faces)[0]
@@ -271,7 +271,7 @@ class RuntimeModel:
         face = about.faces.index(chosen)
         index = about.identities.index(who) if who in about.identities else -1
         template = self.arrays["templates"][face].astype(np.float32)
-        return face, Conditions(index, found.vector, found.name, template, seed, expressivity)
+        return face, RuntimeConditions(index, found.vector, found.name, template, seed, expressivity)
 
     def encode_style(self, motion: Array, *, name: str = "reference") -> RuntimeStyle:
         """The style of a reference motion.
@@ -310,7 +310,7 @@ class RuntimeModel:
         wanted = {each.name for each in session.get_inputs()}
         return cast(list[Array], session.run(None, {name: value for name, value in inputs.items() if name in wanted}))
 
-    def own_frames(self, heard: Heard) -> int:
+    def own_frames(self, heard: WindowSpeech) -> int:
         """How many frames the model gives for speech, at least 1; its own number where it counts by itself."""
         frames = heard.frames if self.clock.rule == "rounded" else max(1, self.clock.frames(len(heard.speech)))
         longest = self.description.longest
@@ -321,7 +321,7 @@ class RuntimeModel:
             )
         return frames
 
-    def features(self, heard: Heard, frames: int) -> Array:
+    def features(self, heard: WindowSpeech, frames: int) -> Array:
         """Speech to features (1, frames, …)."""
         return self.run(
             "speech",
@@ -355,7 +355,7 @@ class RuntimeStream(SpeechWindows[Array]):
         self,
         model: RuntimeModel,
         face: int,
-        conditions: Conditions,
+        conditions: RuntimeConditions,
         plan: WindowPlan,
         gate: VoiceGate | None = None,
     ) -> None:
@@ -375,9 +375,9 @@ class RuntimeStream(SpeechWindows[Array]):
         """The gate's openness of this speech, which has not begun yet; None without a gate."""
         return None if self.gate is None else Openness(self.gate, self.model.frame_rate)
 
-    def generate(self, window: Window, speech: Array, frames: int, mean: float, deviation: float) -> Array:
+    def generate(self, window: MotionWindow, speech: Array, frames: int, mean: float, deviation: float) -> Array:
         """Motion of a window, which continues the window before it."""
-        heard = Heard(speech, frames, mean, deviation)
+        heard = WindowSpeech(speech, frames, mean, deviation)
         motion, self._tail = window_motion(self.model, heard, window, self.conditions, self._tail)
         return motion
 

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from facediff.speech.windows import Window
+from facediff.speech.windows import MotionWindow
 
 Noise = npt.NDArray[np.float32]
 
@@ -70,7 +70,7 @@ def stream_of(name: str, seed: int) -> NormalStream:
     return NormalStream(zlib.crc32(name.encode()) + seed)
 
 
-class ClipNoise:
+class NumpyClipNoise:
     """Unit noise of a whole clip for several seeds, as :class:`facediff.models.inference.ClipNoise` draws it.
 
     Args:
@@ -101,7 +101,7 @@ class SeedNoise:
         return self.stream.draw((frames, width))[None]
 
 
-class WindowNoise:
+class NumpyWindowNoise:
     """Unit noise of a window of long speech, as :class:`facediff.models.inference.WindowNoise` draws it.
 
     Args:
@@ -110,7 +110,7 @@ class WindowNoise:
         seeds: one for each sample.
     """
 
-    def __init__(self, name: str, window: Window, seeds: Sequence[int]) -> None:
+    def __init__(self, name: str, window: MotionWindow, seeds: Sequence[int]) -> None:
         self.window = window
         self.names = [(f"{name}/{index}", index, new) for index, new in window.origins]
         self.seeds = list(seeds)

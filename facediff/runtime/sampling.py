@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.runtime.noise import ClipNoise, SeedNoise, WindowNoise
-from facediff.speech.windows import Window
+from facediff.runtime.noise import NumpyClipNoise, NumpyWindowNoise, SeedNoise
+from facediff.speech.windows import MotionWindow
 
 if TYPE_CHECKING:
     from facediff.runtime.model import RuntimeModel
@@ -25,7 +25,7 @@ Draw = Callable[[int, int], Array]
 
 
 @dataclass(frozen=True)
-class Conditions:
+class RuntimeConditions:
     """What motion is conditioned on besides speech."""
 
     identity: int
@@ -37,7 +37,7 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Heard:
+class WindowSpeech:
     """Speech as a clip or a window hears it.
 
     Attributes:
@@ -53,7 +53,7 @@ class Heard:
     deviation: float
 
 
-def clip_motion(model: RuntimeModel, heard: Heard, conditions: Conditions) -> Array:
+def clip_motion(model: RuntimeModel, heard: WindowSpeech, conditions: RuntimeConditions) -> Array:
     """Offsets from the template (1, frames, vertices, 3) of a whole clip."""
     about = model.description
     features = model.features(heard, model.own_frames(heard))
@@ -61,10 +61,10 @@ def clip_motion(model: RuntimeModel, heard: Heard, conditions: Conditions) -> Ar
         made = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
     elif about.noise_of == "seed":
         noise = SeedNoise(conditions.seed)  # such a model predicts no mean, so there is no other noise
-        made = Sampling(model, conditions, None, 0).run(features, noise, noise)
+        made = SamplerRun(model, conditions, None, 0).run(features, noise, noise)
     else:
-        noises = ClipNoise(NAME, [conditions.seed]), ClipNoise(f"{NAME}/mean", [0])
-        made = Sampling(model, conditions, None, 0).run(features, *noises)
+        noises = NumpyClipNoise(NAME, [conditions.seed]), NumpyClipNoise(f"{NAME}/mean", [0])
+        made = SamplerRun(model, conditions, None, 0).run(features, *noises)
     if made.shape[1] == heard.frames:
         return made
     # A model that counts its frames by itself may give fewer than the speech lasts: its last one is held.
@@ -72,7 +72,11 @@ def clip_motion(model: RuntimeModel, heard: Heard, conditions: Conditions) -> Ar
 
 
 def window_motion(
-    model: RuntimeModel, heard: Heard, window: Window, conditions: Conditions, before: Sequence[Array] | None
+    model: RuntimeModel,
+    heard: WindowSpeech,
+    window: MotionWindow,
+    conditions: RuntimeConditions,
+    before: Sequence[Array] | None,
 ) -> tuple[Array, list[Array]]:
     """Offsets of a window of long speech, which continues another.
 
@@ -95,13 +99,13 @@ def window_motion(
             motion = np.concatenate([blended, motion[:, shared:]], 1)
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
     features = np.ascontiguousarray(model.features(heard, heard.frames)[:, wanted])
-    sampling = Sampling(model, conditions, before, window.shared, window.fixed)
-    noise = WindowNoise(NAME, window, [conditions.seed])
-    motion = sampling.run(features, noise, WindowNoise(f"{NAME}/mean", window, [0]))
+    sampling = SamplerRun(model, conditions, before, window.shared, window.fixed)
+    noise = NumpyWindowNoise(NAME, window, [conditions.seed])
+    motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
     return motion, [kept[:, -window.kept :] for kept in sampling.kept]
 
 
-def conditioned(features: Array, conditions: Conditions) -> dict[str, npt.NDArray[Any]]:
+def conditioned(features: Array, conditions: RuntimeConditions) -> dict[str, npt.NDArray[Any]]:
     """What every graph after the first is given; each takes what it has a use for."""
     return {
         "mask": np.ones((1, features.shape[1]), bool),
@@ -118,7 +122,7 @@ def crossfade(shared: int, fixed: int) -> Array:
     return np.asarray(place * place * (3 - 2 * place), np.float32)
 
 
-class Sampling:
+class SamplerRun:
     """One run of the sampler, of a clip or of a window that continues another.
 
     Args:
@@ -135,7 +139,7 @@ class Sampling:
     def __init__(
         self,
         model: RuntimeModel,
-        conditions: Conditions,
+        conditions: RuntimeConditions,
         before: Sequence[Array] | None,
         shared: int,
         fixed: int = 0,

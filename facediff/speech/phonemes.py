@@ -23,7 +23,7 @@ BILABIALS = ("p", "b", "m")
 
 
 @dataclass(frozen=True)
-class Phoneme:
+class TimedPhoneme:
     """A phoneme in time.
 
     Attributes:
@@ -57,7 +57,7 @@ def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-def read_phonemes(path: Path) -> list[Phoneme]:
+def read_phonemes(path: Path) -> list[TimedPhoneme]:
     """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``.
 
     Raises:
@@ -66,7 +66,7 @@ def read_phonemes(path: Path) -> list[Phoneme]:
     expected = "expected a table with the columns start, end (seconds), ipa"
     try:
         found = [
-            Phoneme(
+            TimedPhoneme(
                 float(row["start"]),
                 float(row["end"]),
                 row["ipa"],
@@ -82,7 +82,7 @@ def read_phonemes(path: Path) -> list[Phoneme]:
     return found
 
 
-def closed_times(phonemes: Iterable[Phoneme]) -> list[tuple[float, float]]:
+def closed_times(phonemes: Iterable[TimedPhoneme]) -> list[tuple[float, float]]:
     """Start and end, in seconds, of each p, b and m, in order."""
     return [
         (phoneme.start, phoneme.end)
@@ -91,7 +91,7 @@ def closed_times(phonemes: Iterable[Phoneme]) -> list[tuple[float, float]]:
     ]
 
 
-def closures(phonemes: Iterable[Phoneme], frame_rate: float) -> list[tuple[int, int]]:
+def closures(phonemes: Iterable[TimedPhoneme], frame_rate: float) -> list[tuple[int, int]]:
     """The frames in which the lips close for p, b and m, as `facediff.metrics.BilabialClosureRate` takes them.
 
     Args:
@@ -117,7 +117,7 @@ def closures(phonemes: Iterable[Phoneme], frame_rate: float) -> list[tuple[int, 
     return found
 
 
-def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[Phoneme]]:
+def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPhoneme]]:
     """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses.
 
     Raises:
@@ -126,7 +126,7 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[Phoneme]
     from facediff.synthetic.speech import Voice, speak
 
     said = speak(" ".join(text.split()), Voice("en-us", rate=165, pitch=50, pitch_range=50))
-    return said.samples, [Phoneme(each.start, each.end, each.ipa) for each in said.phonemes if each.ipa]
+    return said.samples, [TimedPhoneme(each.start, each.end, each.ipa) for each in said.phonemes if each.ipa]
 
 
 # Alignments from elsewhere: Praat's TextGrid, which the usual aligners write.
@@ -138,7 +138,7 @@ TIERS = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment")
 """Names of the tier that has the phonemes, in order of preference."""
 
 
-def read_alignment(path: Path) -> list[Phoneme]:
+def read_alignment(path: Path) -> list[TimedPhoneme]:
     """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
 
     Labels may be IPA, also with marks, or ARPAbet with or without digits of stress.
@@ -159,7 +159,7 @@ def _plain_label(label: str) -> str:
     return bare.lower() if bare.lower() in BILABIALS else label
 
 
-def _read_textgrid(path: Path) -> list[Phoneme]:
+def _read_textgrid(path: Path) -> list[TimedPhoneme]:
     expected = "expected a TextGrid with an interval tier named phones, as Praat or an aligner writes it"
     try:
         LIMITS.check("bytes", 40 * path.stat().st_size, path)
@@ -190,7 +190,7 @@ def _read_textgrid(path: Path) -> list[Phoneme]:
     )
 
 
-def _tiers(tokens: list[str]) -> list[tuple[str, list[Phoneme]]]:
+def _tiers(tokens: list[str]) -> list[tuple[str, list[TimedPhoneme]]]:
     """The interval tiers of a TextGrid, from its values behind its times."""
     rest = iter(tokens)
     found = []
@@ -206,7 +206,7 @@ def _tiers(tokens: list[str]) -> list[tuple[str, list[Phoneme]]]:
             end, label = float(next(rest, "")), next(rest, "")
             if not (0 <= start <= end < math.inf) or not label.startswith('"'):
                 raise ValueError(f"an interval from {start:g} to {end:g} s")
-            intervals.append(Phoneme(start, end, label[1:]))
+            intervals.append(TimedPhoneme(start, end, label[1:]))
         found.append((name.removeprefix('"'), intervals))
     return found
 

@@ -109,7 +109,7 @@ class ProsodicEvent:
     strength: float
 
 
-class Prosody:
+class ProsodyTracker:
     """Hears one recording in pieces, and says what happens in it.
 
     An accent is where pitch, and to a lesser part loudness, rises above what is usual for the speaker so far; a

@@ -160,13 +160,13 @@ class FramePlan:
         """Frames from the start of a window to that of the next, and how many are given out at a time."""
         return self.frames - self.overlap
 
-    def window(self, index: int) -> Window:
+    def window(self, index: int) -> MotionWindow:
         """A full window."""
-        return Window(self, index, min(self.past, index * self.hop) + self.frames)
+        return MotionWindow(self, index, min(self.past, index * self.hop) + self.frames)
 
 
 @dataclass(frozen=True)
-class Window:
+class MotionWindow:
     """One window of long speech.
 
     Attributes:
@@ -225,7 +225,7 @@ class Window:
         return found
 
 
-class Hearing(Protocol[M_co]):
+class MotionStream(Protocol[M_co]):
     """What hears speech in pieces, and gives motion; it counts the frames that it has given."""
 
     frames: int
@@ -238,7 +238,7 @@ class Hearing(Protocol[M_co]):
 
 
 def in_parts(
-    stream: Hearing[M_co],
+    stream: MotionStream[M_co],
     speech: Any,  # noqa: ANN401 - an array or a tensor
     *,
     frames: int | None = None,
@@ -284,13 +284,13 @@ class SpeechWindows(ABC, Generic[M]):
         self.frames = 0
         self._speech: Speech = np.zeros(0, np.float32)
         self._dropped = 0  # samples before these, which no window will hear again
-        self._level = Level()
+        self._level = SpeechLevel()
         self._window = plan.window(0)  # the next one to generate, if the speech lasts
         self._held: Any = None  # the latest window's frames that the next one shares
         self._finished = False
 
     @abstractmethod
-    def generate(self, window: Window, speech: Speech, frames: int, mean: float, deviation: float) -> M:
+    def generate(self, window: MotionWindow, speech: Speech, frames: int, mean: float, deviation: float) -> M:
         """Motion of a window but for its past, which continues the window before it.
 
         Args:
@@ -384,7 +384,7 @@ class SpeechWindows(ABC, Generic[M]):
         self._dropped += drop
         return motion[:, : self.plan.hop]
 
-    def _generate(self, window: Window, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
+    def _generate(self, window: MotionWindow, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
         """Motion of a window, with speech up to frame ``heard``."""
         # Places in the whole recording; the kept speech starts at sample ``_dropped`` of it. Windows overlap, so the
         # level counts only what it has not counted yet.
@@ -407,7 +407,7 @@ class SpeechWindows(ABC, Generic[M]):
             raise FaceDiffError("the stream is finished; start another one for more speech")
 
 
-class Level:
+class SpeechLevel:
     """Mean and standard deviation of all samples so far; both are 0 before there is a sample."""
 
     def __init__(self) -> None:

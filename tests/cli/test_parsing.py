@@ -15,8 +15,8 @@ from facediff.cli.app import COMMANDS, find, load
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.parsing import (
     RENAMED,
-    OptionGroup,
     Option,
+    OptionGroup,
     Parameters,
     arguments_of,
     flat,

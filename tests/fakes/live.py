@@ -12,7 +12,7 @@ import numpy as np
 
 from facediff.live.frames import Address, LiveFrame, Performance, Receiver
 from facediff.live.model import LiveModel
-from facediff.live.sources import Deliver, Source
+from facediff.live.sources import Deliver, SpeechSource
 from facediff.speech.audio import samples_for
 
 VERTICES = 4
@@ -61,7 +61,7 @@ def fake_model(start: Callable[[], Any] = FakeStream) -> LiveModel:
     )
 
 
-class Spoken(Source):
+class Spoken(SpeechSource):
     """Samples in pieces of 10 ms in real time, by a clock of its own; afterwards an error, if there is one.
 
     Args:

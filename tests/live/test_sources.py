@@ -23,12 +23,12 @@ import soundfile
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.live.frames import Performance
 from facediff.live.sound import SoundOut
-from facediff.live.sources import Microphone, Pcm, Played, Source
+from facediff.live.sources import Microphone, Pcm, Played, SpeechSource
 from facediff.live.timing import Pacer, SpokenClock
 from tests.fakes.live import FakeSound, PortAudioError, device
 
 
-def heard(source: Source, stopped: threading.Event | None = None) -> tuple[np.ndarray, np.ndarray, list[float]]:
+def heard(source: SpeechSource, stopped: threading.Event | None = None) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """All samples of a source, how many each piece has, and when each piece came, from the start."""
     pieces: list[np.ndarray] = []
     times: list[float] = []

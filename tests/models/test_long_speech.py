@@ -17,7 +17,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion, StyleContentDisentanglement
 from facediff.models.inference import SpeechStream, WindowOverlap, crossfaded
 from facediff.speech.audio import samples_for
-from facediff.speech.windows import FramePlan, Level, WindowPlan
+from facediff.speech.windows import FramePlan, SpeechLevel, WindowPlan
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
@@ -227,7 +227,7 @@ def test_samples_are_what_their_seeds_give_and_the_speech_is_encoded_once(ready:
 
 
 def test_level_is_that_of_all_that_was_heard() -> None:
-    level, whole = Level(), speech(2).double() + 0.1
+    level, whole = SpeechLevel(), speech(2).double() + 0.1
     for piece in pieces(whole, 5):
         level.hear(piece)
     assert level.count == len(whole)
@@ -249,7 +249,7 @@ def test_level_needs_no_float64_where_the_speech_is() -> None:
                 raise TypeError("float64 is not known here")
             return super().__torch_function__(func, types, args, kwargs or {})  # type: ignore[arg-type]
 
-    level = Level()
+    level = SpeechLevel()
     level.hear(torch.tensor([1.0, 3.0]).as_subclass(Narrow))
     assert (level.mean, level.deviation) == (2.0, 1.0)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from facediff.data import Batch, Sample, collate
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.inference import ClipNoise, Inference, SpeechStream, WindowNoise, with_speech
-from facediff.speech.windows import FramePlan, Window, WindowPlan
+from facediff.speech.windows import FramePlan, MotionWindow, WindowPlan
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
 HOP, FRAMES, SHARED, BEFORE, AFTER = 20, 30, 10, 12, 5
@@ -148,14 +148,14 @@ def test_windows_lie_a_hop_apart() -> None:
     plan = PLAN.in_frames(25.0)
     assert plan == FramePlan(FRAMES, SHARED, BEFORE, AFTER)
     assert plan.hop == HOP
-    windows = [Window(plan, index, FRAMES) for index in range(4)]
+    windows = [MotionWindow(plan, index, FRAMES) for index in range(4)]
     assert [(w.start, w.end, w.context, w.shared, w.kept) for w in windows] == [
         (0, 30, 0, 0, 10),
         (20, 50, 12, 10, 10),
         (40, 70, 12, 10, 10),
         (60, 90, 12, 10, 10),
     ]
-    assert Window(plan, 1, 7).end == 27
+    assert MotionWindow(plan, 1, 7).end == 27
     assert [PLAN.in_one_pass(frames, 25.0) for frames in (50, 51)] == [True, False]
     assert PLAN.look_ahead == pytest.approx(1.4)
 
@@ -180,7 +180,7 @@ def test_window_noise_continues_that_of_the_window_before() -> None:
     plan, like = PLAN.in_frames(25.0), torch.empty(2, FRAMES, 400)
     made = []
     for index in range(4):
-        noise = WindowNoise("a", Window(plan, index, FRAMES), [5, 6], CPU)
+        noise = WindowNoise("a", MotionWindow(plan, index, FRAMES), [5, 6], CPU)
         made.append([noise(like) for _ in range(3)])
     for old, new in zip(made, made[1:], strict=False):
         for step in range(3):
@@ -193,6 +193,6 @@ def test_window_noise_continues_that_of_the_window_before() -> None:
         assert float((flat @ flat.T / 400 - torch.eye(len(flat))).abs().max()) < 6.5 * (2 / 400) ** 0.5
     # Where the speech ends does not matter to what comes before.
     for index in (0, 2):
-        short = WindowNoise("a", Window(plan, index, 17), [5, 6], CPU)(torch.empty(2, 17, 400))
+        short = WindowNoise("a", MotionWindow(plan, index, 17), [5, 6], CPU)(torch.empty(2, 17, 400))
         assert torch.equal(short, made[index][0][:, :17])
-    assert not torch.equal(WindowNoise("b", Window(plan, 0, FRAMES), [5, 6], CPU)(like), made[0][0])
+    assert not torch.equal(WindowNoise("b", MotionWindow(plan, 0, FRAMES), [5, 6], CPU)(like), made[0][0])

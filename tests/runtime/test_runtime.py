@@ -29,10 +29,10 @@ from facediff.pipelines.export_model import Precision, export_model, store_weigh
 from facediff.runtime import RuntimeModel
 from facediff.runtime.app import main
 from facediff.runtime.gated import GatedStream
-from facediff.runtime.noise import ClipNoise, NormalStream, WindowNoise
+from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
 from facediff.runtime.styles import read_style
 from facediff.speech.voice_activity import QUICK_GATE, EnergyGate, read_gate
-from facediff.speech.windows import Window, WindowPlan
+from facediff.speech.windows import MotionWindow, WindowPlan
 from tests.fakes.tiny import Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
@@ -53,12 +53,12 @@ def test_noise_is_that_of_pytorch(count: int) -> None:
 def test_noise_of_clips_and_windows_is_that_of_the_model() -> None:
     like = torch.empty(2, 20, 8)
     wanted = ModelNoise(["speech"] * 2, [20] * 2, [3, 4], CPU)(like).numpy()
-    np.testing.assert_allclose(ClipNoise("speech", [3, 4])(20, 8), wanted, atol=2e-6)
+    np.testing.assert_allclose(NumpyClipNoise("speech", [3, 4])(20, 8), wanted, atol=2e-6)
     for index in (0, 1, 2):
-        window = Window(PLAN.in_frames(25.0), index, 30 if index < 2 else 17)
+        window = MotionWindow(PLAN.in_frames(25.0), index, 30 if index < 2 else 17)
         shown = torch.empty(1, window.frames, 8)
         wanted = ModelWindowNoise("speech", window, [3], CPU)(shown).numpy()
-        np.testing.assert_allclose(WindowNoise("speech", window, [3])(window.frames, 8), wanted, atol=2e-6)
+        np.testing.assert_allclose(NumpyWindowNoise("speech", window, [3])(window.frames, 8), wanted, atol=2e-6)
 
 
 @pytest.mark.parametrize(

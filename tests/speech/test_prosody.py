@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.speech.prosody import SPAN, Prosody, pitch_of
+from facediff.speech.prosody import SPAN, ProsodyTracker, pitch_of
 
 RATE = 16_000
 
@@ -17,15 +17,15 @@ def voice(pitch: np.ndarray, *, syllables: float = 4.0, loudness: np.ndarray | f
     return loudness * wave * (0.55 - 0.45 * np.cos(2 * np.pi * syllables * np.arange(len(pitch)) / RATE))
 
 
-def heard(speech: np.ndarray, pieces: int = 1) -> Prosody:
-    prosody = Prosody()
+def heard(speech: np.ndarray, pieces: int = 1) -> ProsodyTracker:
+    prosody = ProsodyTracker()
     for piece in np.array_split(speech, pieces):
         prosody.feed(piece)
     prosody.finish()
     return prosody
 
 
-def times(prosody: Prosody, kind: str) -> list[float]:
+def times(prosody: ProsodyTracker, kind: str) -> list[float]:
     return [event.time for event in prosody.events if event.kind == kind]
 
 

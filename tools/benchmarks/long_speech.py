@@ -34,7 +34,7 @@ from facediff.models import AnimationModel, load_model
 from facediff.models.checkpoint import corpus_class
 from facediff.models.inference import SpeechStream
 from facediff.speech.audio import SAMPLE_RATE, samples_for
-from facediff.speech.windows import Window, WindowPlan
+from facediff.speech.windows import MotionWindow, WindowPlan
 
 Array = npt.NDArray[np.float64]
 
@@ -108,7 +108,7 @@ def by_windows(model: AnimationModel, clip: Batch, plan: WindowPlan) -> torch.Te
 
 
 @dataclass(frozen=True)
-class Alone(Window):
+class Alone(MotionWindow):
     """A window that shares neither frames nor noise with its neighbours.
 
     Attributes:
@@ -119,7 +119,7 @@ class Alone(Window):
     shared: int = 0
 
 
-def alone(window: Window) -> Window:
+def alone(window: MotionWindow) -> MotionWindow:
     """A window like another one, but alone."""
     return Alone(replace(window.plan, overlap=0), window.index * 1000, window.frames, window.context)
 

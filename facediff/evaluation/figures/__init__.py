@@ -25,7 +25,7 @@ from facediff.evaluation.figures.training import (
     smooth,
 )
 from facediff.evaluation.files import read_pairs
-from facediff.speech.phonemes import Phoneme, read_phonemes
+from facediff.speech.phonemes import TimedPhoneme, read_phonemes
 
 __all__ = [
     "COLUMN",

@@ -13,12 +13,12 @@ import numpy as np
 from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, Material, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
-from facediff.speech.phonemes import LENGTH, STRESS, Phoneme
+from facediff.speech.phonemes import LENGTH, STRESS, TimedPhoneme
 
 HIGHEST = 50.0  # Largest height of a picture in mm
 
 
-def find_phoneme(wanted: str, phonemes: Sequence[Phoneme], clip: str) -> Phoneme:
+def find_phoneme(wanted: str, phonemes: Sequence[TimedPhoneme], clip: str) -> TimedPhoneme:
     """A phoneme by name: ``m`` is the first of the clip, ``m:2`` the second.
 
     An exact match takes precedence; else stress marks are ignored, then length marks and diacritics; else the name is
@@ -55,7 +55,7 @@ class Moment:
     """A moment of a clip."""
 
     time: float  # in seconds
-    phoneme: Phoneme | None = None  # what is spoken then; None if it was chosen by its time alone
+    phoneme: TimedPhoneme | None = None  # what is spoken then; None if it was chosen by its time alone
 
     @property
     def heading(self) -> Heading:

@@ -21,7 +21,7 @@ from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, coun
 from facediff.mesh.files import SUFFIXES, read_mesh
 from facediff.mesh.mesh import Mesh
 from facediff.speech.audio import read_speech
-from facediff.speech.phonemes import Phoneme, phonemes_file, read_phonemes
+from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
 from facediff.utils import ranges
 
 Module = type[SpeechMotionDataModule]
@@ -107,7 +107,7 @@ def sound_of(material: Material, clip: str, file: Path | None = None) -> npt.NDA
     return None if file is None else read_speech(file)
 
 
-def phonemes_of(material: Material, clip: str, file: Path | None = None) -> list[Phoneme]:
+def phonemes_of(material: Material, clip: str, file: Path | None = None) -> list[TimedPhoneme]:
     """Phonemes of a clip: from the table given, else the corpus's; none if there is no table.
 
     Raises:

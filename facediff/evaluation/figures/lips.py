@@ -31,7 +31,7 @@ from facediff.evaluation.figures.page import (
 )
 from facediff.metrics import LipPairs
 from facediff.metrics.mouth import opening
-from facediff.speech.phonemes import BILABIALS, Phoneme
+from facediff.speech.phonemes import BILABIALS, TimedPhoneme
 from facediff.utils import SAMPLE_RATE, ranges
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Sound:
     # Speech (S,); empty if there is none.
     samples: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     sample_rate: int = SAMPLE_RATE
-    phonemes: Sequence[Phoneme] = ()  # phonemes in time; empty if they are not known
+    phonemes: Sequence[TimedPhoneme] = ()  # phonemes in time; empty if they are not known
 
 
 def opening_curves(material: Material, clip: str, pairs: LipPairs) -> tuple[Curves, str | None]:
@@ -164,7 +164,7 @@ def _span(curves: Curves, span: tuple[float, float] | None) -> tuple[float, floa
     return span[0], min(span[1], end)
 
 
-def _draw_phonemes(axes: Axes, phonemes: Sequence[Phoneme], span: tuple[float, float], paper: Paper) -> None:
+def _draw_phonemes(axes: Axes, phonemes: Sequence[TimedPhoneme], span: tuple[float, float], paper: Paper) -> None:
     """Phonemes at their places on two levels in turn; one that would overlap its neighbour is left out."""
     axes.set_axis_off()
     axes.set_ylim(0, 1)

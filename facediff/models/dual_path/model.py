@@ -50,7 +50,7 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
-from facediff.speech.windows import LOW_LATENCY_STEPS, Window
+from facediff.speech.windows import LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
 
@@ -503,7 +503,7 @@ class DualPathDiffusion(AnimationModel):
 
     @torch.no_grad()
     def generate_window(
-        self, clip: Batch, window: Window, seeds: Sequence[int], before: list[Tensor] | None
+        self, clip: Batch, window: MotionWindow, seeds: Sequence[int], before: list[Tensor] | None
     ) -> tuple[Float[Tensor, "samples frames vertices 3"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.

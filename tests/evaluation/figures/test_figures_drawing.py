@@ -21,8 +21,8 @@ from facediff.evaluation.figures import (
     Material,
     Moment,
     Paper,
-    Phoneme,
     Sound,
+    TimedPhoneme,
     draw_error,
     draw_frames,
     draw_heatmap,
@@ -40,7 +40,12 @@ SMALL = Paper(width=85, dpi=100)
 TIMES = (np.arange(50) + 0.5) / 25
 LIPS = Curves(TIMES, {"truth": np.sin(TIMES) ** 2, "ours": np.cos(TIMES) ** 2, "th$irs": np.abs(np.sin(3 * TIMES))})
 SPEECH = np.sin(np.arange(32_000) / 20).astype("f4")
-PHONEMES = [Phoneme(0, 0.2, ""), Phoneme(0.2, 0.5, "m", "PP"), Phoneme(0.5, 1.0, "ˈɑː", "AA"), Phoneme(1, 1.1, "ʃ")]
+PHONEMES = [
+    TimedPhoneme(0, 0.2, ""),
+    TimedPhoneme(0.2, 0.5, "m", "PP"),
+    TimedPhoneme(0.5, 1.0, "ˈɑː", "AA"),
+    TimedPhoneme(1, 1.1, "ʃ"),
+]
 RUNS = {
     "long": {"val/lve": Curve(np.arange(40.0), np.exp(-np.arange(40) / 9.0))},
     "short": {"val/lve": Curve(np.arange(3.0), np.array([1.0, np.nan, 0.2]))},
