@@ -35,7 +35,7 @@ __all__ = [
     "Material",
     "Moment",
     "Paper",
-    "Phoneme",
+    "TimedPhoneme",
     "Sound",
     "VertexMap",
     "choose_scalars",
