@@ -21,7 +21,18 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay, MotionScale
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.graphs import Graphs, Spoken
+from facediff.models.graphs import (
+    BATCH,
+    FRAMES,
+    Graph,
+    Graphs,
+    SamplingLoop,
+    Speech,
+    Spoken,
+    StyleSource,
+    results_of,
+    speech_graph,
+)
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.registry import component_class
@@ -251,9 +262,63 @@ class DirectModel(PublishedModel):
 
     def graphs(self) -> Graphs:
         """Speech to features, features to motion."""
-        from facediff.models.published.graphs import direct_graphs
-
         return direct_graphs(self)
+
+
+# The methods as graphs, without PyTorch; see facediff.models.graphs.
+
+
+def whole_model(model: PublishedModel, parts: list[Graph], sampling: SamplingLoop | None = None) -> Graphs:
+    """What is said of a published method besides its graphs."""
+    style: StyleSource = "identity" if model.own_styles() else "none"
+    longest = None if model.long_speech == "extend" else model.table_frames
+    return Graphs(
+        parts=parts,
+        equal_lengths=True,
+        blending="motion",
+        clock=model.clock,
+        style=style,
+        epsilon=float(getattr(model.audio_encoder, "epsilon", 1e-7)),
+        longest=longest or 0,
+        sampling=sampling,
+    )
+
+
+class DirectMotion(nn.Module):
+    """Features of speech to offsets from the template."""
+
+    def __init__(self, model: DirectModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self, features: Float[Tensor, "batch frames *width"], identity: Int[Tensor, " batch"]
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """In the unit of the corpus; the identity is an index, or −1."""
+        model = self.model
+        made = model.decode(features, model.weights_of(identity), None)
+        return made.view(*made.shape[:2], model.n_vertices, 3) / model.scale
+
+
+def direct_graphs(model: DirectModel) -> Graphs:
+    """A method that makes all frames at once."""
+
+    def hear(heard: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
+        return model.hear(heard, frames)
+
+    speech = speech_graph(model, hear, lambda frames: model.heard_steps * frames)
+    features = results_of(speech)
+    inputs: dict[str, Any] = {"features": features, "identity": zeros(len(features))}
+    motion = Graph("motion", DirectMotion(model), inputs, {"features": FRAMES, "identity": BATCH}, ("offsets",))
+    return whole_model(model, [speech, motion])
+
+
+def zeros(batch: int) -> Int[Tensor, " batch"]:
+    """Indices."""
+    return torch.zeros(batch, dtype=torch.long)
+
+
+# Parts of their networks and losses.
 
 
 class SpeakerTable(nn.Module):

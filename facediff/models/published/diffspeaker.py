@@ -22,7 +22,7 @@ from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
 from facediff.models.folding import WeightCache
-from facediff.models.graphs import Graphs, Spoken
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
 from facediff.models.published.autoregressive import (
@@ -33,8 +33,17 @@ from facediff.models.published.autoregressive import (
     periodic_positions,
     read_period,
 )
-from facediff.models.published.base import LongSpeech, SpeakerTable, masked_mean
-from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, NoiseSource, SamplingSpace, VertexSpace
+from facediff.models.published.base import LongSpeech, SpeakerTable, masked_mean, whole_model, zeros
+from facediff.models.published.diffusion import (
+    CONDITIONS,
+    DiffusionModel,
+    FoldedSpace,
+    NoiseSource,
+    SamplingSpace,
+    VertexSpace,
+    conditions_of,
+    features_graph,
+)
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.speech_networks import Wav2Vec2Encoder
@@ -228,8 +237,6 @@ class DiffSpeaker(DiffusionModel):
 
     def graphs(self) -> Graphs:
         """Speech, one step of the reverse process, the last map with the smoothing."""
-        from facediff.models.published.graphs import diffspeaker_graphs
-
         return diffspeaker_graphs(self)
 
     def sample(
@@ -464,6 +471,123 @@ def mutual_bias(
     distance = torch.where(distance < 0, -distance - 1, distance)
     slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
     return -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
+
+
+# The method as graphs, without PyTorch; see facediff.models.graphs.
+
+
+class SpeakerStep(nn.Module):
+    """Noisy motion to clean motion at one step.
+
+    In the folded space, the result is a sum of maps of what the network gave, of a bias and of the first noise, each
+    with a factor that the sampler makes. So a frame of the state is: noisy motion as the network sees it, the sum of
+    the network's features, the bias's factor, the first noise's factor.
+    """
+
+    def __init__(self, model: DiffSpeaker) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames dim"],
+        identity: Int[Tensor, " batch"],
+        state: Float[Tensor, "batch frames state"],
+        step: Int[Tensor, " batch"],
+    ) -> tuple[Tensor, Tensor]:
+        """The prediction, and the features that it is made of."""
+        model, network, space = self.model, self.model.network, self.model.space()
+        conditions = network.conditions(features, model.weights_of(identity), None)
+        made = network(space.mapped(state[..., : space.width]), step, conditions)
+        if model.sampling_space == "vertices":
+            return space.clean(made), made
+        ones = torch.ones_like(made[..., :1])
+        return torch.cat([space.clean(made), made, ones, torch.zeros_like(ones)], -1), made
+
+
+class SpeakerStart(nn.Module):
+    """Unit noise on the vertices to the folded state that sampling starts from."""
+
+    def __init__(self, model: DiffSpeaker) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
+        """Noise alone: of features and bias there is nothing yet."""
+        state = self.model.space().of(noise)
+        ones = torch.ones_like(state[..., :1])
+        return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
+
+
+class SpeakerMotion(nn.Module):
+    """The end of sampling to offsets from the template, smoothed where the model does so."""
+
+    def __init__(self, model: DiffSpeaker) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self,
+        sample: Float[Tensor, "batch frames state"],
+        noise: Float[Tensor, "batch frames coordinates"] | None = None,
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """In the unit of the corpus; ``noise`` is what sampling started from, if anything is left of it."""
+        model, last = self.model, self.model.network.motion_out
+        made = sample
+        if model.sampling_space == "folded":
+            features = sample[..., model.dim : -2]
+            made = nn.functional.linear(features, last.weight) + sample[..., -2:-1] * last.bias
+            made = made if noise is None else made + sample[..., -1:] * noise
+        motion = made.view(*made.shape[:2], model.n_vertices, 3) / model.scale
+        return smoothed_whole(motion) if model.smooth else motion
+
+
+def smoothed_whole(motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames vertices 3"]:
+    """As :func:`smoothed`, of clips without padding and of any length."""
+    places, last = torch.arange(motion.shape[1]), motion.shape[1] - 1
+    before, after = motion[:, (places - 1).clamp_min(0)], motion[:, (places + 1).clamp_max(last)]
+    inner = ((places > 0) & (places < last))[:, None, None]
+    return torch.where(inner, (before + motion + after) / 3, motion)
+
+
+def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
+    """DiffSpeaker with its present scheduler; its noise is drawn once, on the vertices."""
+    speech = features_graph(model, model.network, 1)
+    features = results_of(speech)
+    batch, frames, dim = features.shape
+    folded, coordinates = model.sampling_space == "folded", 3 * model.n_vertices
+    width = 2 * dim + 2 if folded else coordinates
+    given = conditions_of(features, model)
+    del given["template"]
+    state, noise = torch.zeros(batch, frames, width), torch.zeros(batch, frames, coordinates)
+    step = Graph(
+        "step",
+        SpeakerStep(model),
+        {**given, "state": state, "step": zeros(batch)},
+        {**{name: CONDITIONS[name] for name in given}, "state": FRAMES, "step": BATCH},
+        ("prediction", "kept"),
+    )
+    steps = step_shares(model.signal, model.sampling_steps, model.scheduler)
+    last = {"sample": state}
+    if folded and all(of_noisy for _, _, of_noisy in steps):
+        last["noise"] = noise
+    parts = [speech, step, Graph("motion", SpeakerMotion(model), last, dict.fromkeys(last, FRAMES), ("offsets",))]
+    if folded:
+        parts.append(Graph("start", SpeakerStart(model), {"noise": noise}, {"noise": FRAMES}, ("state",)))
+    results_of(step)  # what follows from the weights alone is computed here, not in the graph
+    loop = SamplingLoop(
+        state=width,
+        drawn=coordinates,
+        kept=dim,
+        sampler=f"{model.scheduler} DDIM" if model.scheduler == "published" else "ddim",
+        steps=[number for number, _, _ in steps],
+        table=[[of_noisy, of_clean, 0.0, 0.0, 0.0] for _, of_clean, of_noisy in steps],
+        last_step=-1,
+        decoded="sample",
+        noise=None,
+        noise_of="seed",
+    )
+    return whole_model(model, parts, loop)
 
 
 # The authors' checkpoints.

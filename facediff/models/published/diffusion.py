@@ -18,8 +18,9 @@ from torch import Tensor, nn
 from facediff.data import Batch
 from facediff.errors import FaceDiffError
 from facediff.models.folding import WeightCache, fold_maps, fold_noise
+from facediff.models.graphs import BATCH, FRAMES, Axes, Graph, Speech, Spoken, speech_graph
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.published.base import PublishedModel
+from facediff.models.published.base import PublishedModel, zeros
 
 SamplingSpace = Literal["vertices", "folded"]
 """Where the reverse process runs."""
@@ -61,6 +62,10 @@ class DiffusionModel(PublishedModel):
         return self.sample(batch, frames, SeededNoise(frames.tolist(), seeds, self.device), progress)
 
     @abstractmethod
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Speech features of each frame."""
+
+    @abstractmethod
     def sample(
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
@@ -72,6 +77,36 @@ class DiffusionModel(PublishedModel):
             noise: its random numbers, in the order in which the published code draws them.
             progress: wraps the iteration over steps.
         """
+
+
+# The methods as graphs, without PyTorch; see facediff.models.graphs.
+
+CONDITIONS: dict[str, Axes] = {"features": FRAMES, "identity": BATCH, "template": BATCH}
+
+
+def conditions_of(features: Tensor, model: PublishedModel) -> dict[str, Tensor]:
+    """Example values of what every step is given."""
+    batch = features.shape[0]
+    return {"features": features, "identity": zeros(batch), "template": torch.zeros(batch, model.n_vertices, 3)}
+
+
+def features_graph(model: DiffusionModel, network: Maps, steps: int) -> Graph:
+    """Speech to features in the network's width.
+
+    Args:
+        model: hears speech by its audio encoder.
+        network: the model's.
+        steps: of the audio encoder for each frame.
+    """
+
+    def hear(heard: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
+        features: Tensor = network.audio_map(model.hear(heard, frames))
+        return features
+
+    return speech_graph(model, hear, lambda frames: steps * frames)
+
+
+# Noise, and where the reverse process runs.
 
 
 class SeededNoise:
@@ -101,11 +136,13 @@ class Maps(Protocol):
     """A network between two linear maps.
 
     Attributes:
+        audio_map: from features of speech to the network's width.
         motion_in: E x + e, from noisy motion x (3V) to the network's width.
         motion_out: U h + b, from features h to clean motion.
         of_weights: what was computed of both.
     """
 
+    audio_map: nn.Linear
     motion_in: nn.Linear
     motion_out: nn.Linear
     of_weights: WeightCache[tuple[Tensor, ...]]

@@ -21,11 +21,20 @@ from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import WeightCache
-from facediff.models.graphs import Graphs, Spoken
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states
-from facediff.models.published.base import SpeakerTable, masked_mean
-from facediff.models.published.diffusion import DiffusionModel, FoldedSpace, NoiseSource, SamplingSpace, VertexSpace
+from facediff.models.published.base import SpeakerTable, masked_mean, whole_model, zeros
+from facediff.models.published.diffusion import (
+    CONDITIONS,
+    DiffusionModel,
+    FoldedSpace,
+    NoiseSource,
+    SamplingSpace,
+    VertexSpace,
+    conditions_of,
+    features_graph,
+)
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.samplers import cosine_betas
 from facediff.models.speech_networks import Wav2Vec2Encoder
@@ -171,8 +180,6 @@ class FaceDiffuser(DiffusionModel):
 
     def graphs(self) -> Graphs:
         """Speech, one step of the reverse process, the last map."""
-        from facediff.models.published.graphs import facediffuser_graphs
-
         return facediffuser_graphs(self)
 
     def sample(
@@ -289,6 +296,100 @@ class FaceDiffuserNetwork(nn.Module):
         embedded = F.mish(self.step.weight.T[step] + self.step.bias)[:, None].expand(-1, frames, -1)
         joined = self.norm(torch.cat([audio, motion, embedded.to(motion.dtype)], -1))
         return all_states(self.gru, joined) * style[:, None]
+
+
+# The method as graphs, without PyTorch; see facediff.models.graphs.
+
+
+class DiffuserStep(nn.Module):
+    """Noisy motion to clean motion at one step, and the features that the last map makes motion of."""
+
+    def __init__(self, model: FaceDiffuser) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames dim"],
+        identity: Int[Tensor, " batch"],
+        template: Float[Tensor, "batch vertices 3"],
+        state: Float[Tensor, "batch frames state"],
+        step: Int[Tensor, " batch"],
+    ) -> tuple[Tensor, Tensor]:
+        """Where vertices are noised with the face, the template is a part of what is predicted."""
+        model, network = self.model, self.model.network
+        space = model.space(model.rest(template))
+        made = network(space.mapped(state), step, features, network.style(model.weights_of(identity)))
+        return space.clean(made), made
+
+
+class DiffuserStart(nn.Module):
+    """Unit noise to the motion that sampling starts from where its first steps are skipped."""
+
+    def __init__(self, model: FaceDiffuser, step: int) -> None:
+        super().__init__()
+        self.model = model
+        self.share = model.posterior.noise_share(step)
+
+    def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
+        """Noised zeros."""
+        space = self.model.space(torch.zeros(1, 1, 3 * self.model.n_vertices))
+        return space.noise(lambda like: like, noise) * self.share
+
+
+class LastMap(nn.Module):
+    """The network's last features to offsets from the template."""
+
+    def __init__(self, model: FaceDiffuser) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames vertices 3"]:
+        """In the unit of the corpus."""
+        made = self.model.network.motion_out(sample)
+        return made.view(*made.shape[:2], self.model.n_vertices, 3) / self.model.scale
+
+
+def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
+    """FaceDiffuser over all of its steps, with fresh noise in each but the last."""
+    speech = features_graph(model, model.network, 2)
+    features, space = results_of(speech), model.space(torch.zeros(1, 1, 3 * model.n_vertices))
+    batch, frames, dim = features.shape
+    step = Graph(
+        "step",
+        DiffuserStep(model),
+        {**conditions_of(features, model), "state": torch.zeros(batch, frames, space.width), "step": zeros(batch)},
+        {**CONDITIONS, "state": FRAMES, "step": BATCH},
+        ("prediction", "kept"),
+    )
+    last = Graph("motion", LastMap(model), {"sample": features}, {"sample": FRAMES}, ("offsets",))
+    visited = list(range(model.steps - model.skip_steps - 1, -1, -1))
+    table = []
+    for each in visited:
+        of_clean, of_noisy, of_noise = model.posterior.shares(each) if each else (1.0, 0.0, 0.0)
+        table.append([of_noisy, of_clean, 0.0, 0.0, of_noise])
+    parts = [speech, step, last]
+    if model.skip_steps:
+        noise = {"noise": torch.zeros(batch, frames, space.width)}
+        parts.append(Graph("start", DiffuserStart(model, visited[0]), noise, {"noise": FRAMES}, ("state",)))
+    results_of(step)  # what follows from the weights alone is computed here, not in the graph
+    root = None
+    if model.sampling_space == "folded":
+        with torch.no_grad():
+            root = space.noise(lambda like: like, torch.eye(space.width))
+    loop = SamplingLoop(
+        state=space.width,
+        drawn=space.width,
+        kept=dim,
+        sampler="ddpm",
+        steps=visited,
+        table=table,
+        last_step=-1,
+        decoded="kept",
+        noise=root,
+        noise_of="seed",
+    )
+    return whole_model(model, parts, loop)
 
 
 # The authors' checkpoints.
