@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -20,8 +19,8 @@ from torch import Tensor, nn
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
+from facediff.speech.cepstra import mel_filters
 from facediff.speech.frame_clock import CONVOLUTIONS, convolved
-from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import quoted
 from facediff.utils.ranges import Range
 
@@ -204,7 +203,9 @@ class MelEncoder(AudioEncoder):
         dropout: Share = 0.1,
     ) -> None:
         super().__init__()
-        self.register_buffer("filters", mel_filters(n_mels, self.n_fft, 60.0, 7600.0), persistent=False)
+        self.register_buffer(
+            "filters", torch.from_numpy(mel_filters(n_mels, self.n_fft, 60.0, 7600.0)), persistent=False
+        )
         self.register_buffer("window", torch.hann_window(400), persistent=False)
         self.stem = nn.Conv1d(n_mels, hidden_dim, kernel_size=4, stride=2, padding=1)
         self.blocks = nn.ModuleList(ConvBlock(hidden_dim, 2 ** (i % 3), dropout) for i in range(num_layers))
@@ -278,24 +279,6 @@ class ConvBlock(nn.Module):
         hidden = self.norm(x) * mask
         hidden = nn.functional.gelu(self.conv(hidden.transpose(1, 2)).transpose(1, 2))
         return (x + self.dropout(self.mix(hidden))) * mask
-
-
-def mel_filters(n_mels: int, n_fft: int, low: float, high: float) -> Float[Tensor, "mels bins"]:
-    """Triangular filters equally spaced on the mel scale 2595·log10(1 + f/700) (O'Shaughnessy 1987).
-
-    Each filter is scaled to unit area in Hz, so that a flat spectrum gives a flat result.
-    """
-
-    def to_mel(hertz: float) -> float:
-        return 2595.0 * math.log10(1.0 + hertz / 700.0)
-
-    mels = torch.linspace(to_mel(low), to_mel(high), n_mels + 2, dtype=torch.float64)
-    edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
-    bins = torch.arange(n_fft // 2 + 1, dtype=torch.float64) * (SAMPLE_RATE / n_fft)
-    rise = (bins[None] - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
-    fall = (edges[2:, None] - bins[None]) / (edges[2:] - edges[1:-1])[:, None]
-    triangles = torch.minimum(rise, fall).clamp_min(0.0)
-    return (triangles * (2.0 / (edges[2:] - edges[:-2]))[:, None]).float()
 
 
 # With 40 zeros at either end the convolutions (receptive field 400, stride 320) give one step for every 320

@@ -404,7 +404,7 @@ class AnimationPipeline:
             if alignment is not None:
                 self._phonemes = read_alignment(alignment)
             elif transcript is not None and speech is not None:
-                from facediff.pipelines.transcripts import align_transcript
+                from facediff.editing.transcripts import align_transcript
 
                 self._phonemes = align_transcript(transcript, speech)
             else:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facediff.models.audio_encoders import MelEncoder, mel_filters, standardise
+from facediff.models.audio_encoders import MelEncoder, standardise
 
 RATE = 16_000
 
@@ -25,34 +25,6 @@ def burst(frame: int, frames: int, hertz: float = 1000.0) -> Tensor:
     time = torch.arange(frames * 640) / RATE
     gate = (torch.arange(frames * 640) // 640 == frame).float()
     return (gate * torch.sin(2 * math.pi * hertz * time))[None]
-
-
-def test_mel_filters_are_triangles_on_the_mel_scale() -> None:
-    filters = mel_filters(40, 4096, 60.0, 7600.0)
-    hertz = torch.arange(2049) * RATE / 4096
-    assert filters.shape == (40, 2049)
-    assert (filters >= 0).all()
-    peaks = hertz[filters.argmax(1)]
-    assert (peaks.diff() > 0).all()
-    assert not filters[:, (hertz < 60) | (hertz > 7600)].any()
-    mels = 2595 * torch.log10(1 + peaks / 700)
-    torch.testing.assert_close(mels.diff(), mels.diff().mean().expand(39), rtol=0.15, atol=0)
-    # Unit area: a flat spectrum gives a flat result.
-    torch.testing.assert_close(filters.sum(1) * RATE / 4096, torch.ones(40), rtol=0.02, atol=0)
-    rising = [row[: row.argmax() + 1].diff().min() >= 0 and row[row.argmax() :].diff().max() <= 0 for row in filters]
-    assert all(rising)
-
-
-@pytest.mark.parametrize(("bands", "size", "low", "high"), [(64, 512, 60.0, 7600.0), (7, 256, 0.0, 4000.0)])
-def test_mel_filters_are_their_formula(bands: int, size: int, low: float, high: float) -> None:
-    """Triangles between neighbours of evenly spaced mels 2595 log₁₀(1 + f/700), of unit area."""
-    mels = [2595 * math.log10(1 + hertz / 700) for hertz in (low, high)]
-    edges = 700 * (10 ** (np.linspace(*mels, bands + 2) / 2595) - 1)
-    hertz = np.arange(size // 2 + 1) * 16_000 / size
-    expected = [
-        np.interp(hertz, edges[band : band + 3], [0, 2 / (edges[band + 2] - edges[band]), 0]) for band in range(bands)
-    ]
-    np.testing.assert_allclose(mel_filters(bands, size, low, high).numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
 def test_mel_filters_are_not_empty(encoder: MelEncoder) -> None:

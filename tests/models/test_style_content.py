@@ -21,8 +21,6 @@ from facediff.models.losses import style_contrast
 from facediff.models.style_content.losses import (
     Alignments,
     MotionDistance,
-    align,
-    cepstra,
     dynamics_distance,
     pair_up,
     relative_distance,
@@ -131,56 +129,6 @@ class TestSpeech:
         heard = (part(features) - part(changed)).abs().amax((0, 2)) > 0
         # Frame t hears t − 2 … t + 1.
         assert heard.nonzero().flatten().tolist() == [5, 6, 7, 8]
-
-
-class TestReadings:
-    def test_a_warped_copy_is_aligned(self) -> None:
-        """A copy read at another pace: the alignment follows the warp."""
-        rng = np.random.default_rng(0)
-        first = np.cumsum(rng.normal(size=(60, 6)), 0)
-        pace = np.sort(np.concatenate([np.arange(60), rng.integers(0, 60, 20)]))
-        second = first[pace]
-        found = align(first, second)
-        assert (np.diff(found) >= 0).all()
-        np.testing.assert_array_equal(pace[found], np.arange(60))
-
-    def test_equal_readings_are_aligned_one_to_one(self) -> None:
-        features = np.random.default_rng(1).normal(size=(40, 5))
-        np.testing.assert_array_equal(align(features, features), np.arange(40))
-
-    @pytest.mark.parametrize(
-        ("frames", "others", "later", "earlier"), [(40, 40, 10, 10), (40, 60, 55, 36), (60, 40, 35, 55)]
-    )
-    def test_readings_may_be_apart_by_a_quarter_of_the_longer_one(
-        self, frames: int, others: int, later: int, earlier: int
-    ) -> None:
-        """One sound in silence is found up to a quarter away, and further where one reading is slower as a whole."""
-        for place, other, found in (
-            (2, 2 + later, True),
-            (2, 3 + later, False),
-            (2 + earlier, 2, True),
-            (3 + earlier, 2, False),
-        ):
-            first, second = np.zeros((frames, 1)), np.zeros((others, 1))
-            first[place], second[other] = 1.0, 1.0
-            assert (align(first, second)[place] == other) == found, (place, other)
-
-    def test_slowed_speech_is_aligned(self) -> None:
-        """Speech made of changing tones, and the same at two thirds of the pace."""
-
-        def speech(pace: float) -> Tensor:
-            time = torch.arange(int(16_000 * 2 / pace), dtype=torch.float64) / 16_000 * pace
-            pitch = 300 + 1500 * (time * 1.7 % 1) + 400 * torch.sin(9 * time)
-            return torch.sin(2 * torch.pi * torch.cumsum(pitch, 0) / 16_000).float()
-
-        fast, slow = (cepstra(speech(pace), round(50 / pace), 25.0) for pace in (1.0, 2 / 3))
-        found = align(fast, slow)
-        error = np.abs(found - (np.arange(50) + 0.5) * 1.5)
-        assert error.mean() < 1.5, "frames of the slow reading"
-
-    def test_features_say_little_of_loudness(self) -> None:
-        audio = torch.randn(16_000)
-        np.testing.assert_allclose(cepstra(audio, 25, 25.0), cepstra(audio * 3, 25, 25.0), atol=1e-3)
 
 
 class TestObjectives:

@@ -19,7 +19,7 @@ SENTENCE = SENTENCES[27]
 
 def test_times_of_a_transcript_are_those_of_the_corpus(puppet_corpus: Path) -> None:
     pytest.importorskip("dtaidistance")
-    from facediff.pipelines.transcripts import align_transcript
+    from facediff.editing.transcripts import align_transcript
 
     said = read_speech(puppet_corpus / "wav" / "F1_e28.wav")
     speech = np.concatenate([np.zeros(9600, np.float32), said, np.zeros(16_000, np.float32)])
@@ -38,7 +38,7 @@ def test_animation_closes_its_lips_by_alignment_and_by_transcript(
     model: facediff.Animator, puppet_corpus: Path
 ) -> None:
     pytest.importorskip("dtaidistance")
-    from facediff.pipelines.transcripts import align_transcript
+    from facediff.editing.transcripts import align_transcript
 
     speech, alignment = (puppet_corpus / folder for folder in ("wav/F1_e28.wav", "phonemes/F1_e28.csv"))
     free = model.animate(speech, identity="F1", voice_gate="off")

@@ -1,7 +1,7 @@
 """Distances of motions, contents and styles, and which recording goes with which, on padded batches with a mask.
 
 First the distances that the objectives of style-content disentanglement are made of, then the pairs of clips that they
-compare, and at last how two recordings of one sentence are aligned in time.
+compare.
 """
 
 from __future__ import annotations
@@ -9,28 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from facediff.data import Batch
-from facediff.errors import MissingExtraError
-from facediff.models.audio_encoders import mel_filters
 from facediff.models.losses import masked_std
-from facediff.speech.audio import SAMPLE_RATE
+from facediff.speech.cepstra import align_features, cepstra
 
 Motion = Float[Tensor, "batch frames vertices 3"]
 Mask = Bool[Tensor, "batch frames"]
 EPSILON = 1e-6
 """Added to denominators and under roots, so that gradients are finite."""
-
-N_MELS = 40
-N_FFT = 512
-N_CEPSTRA = 13
-BAND = 0.25
-"""How far two recordings may be apart in time, as a share of the longer one, after both are stretched to one length."""
 
 
 class MotionDistance:
@@ -257,7 +247,10 @@ class Alignments:
             other_frames: motion frames of the other.
         """
         return torch.from_numpy(
-            align(cepstra(speech, frames, self.frame_rate), cepstra(other, other_frames, self.frame_rate))
+            align_features(
+                cepstra(speech.numpy(), frames, self.frame_rate),
+                cepstra(other.numpy(), other_frames, self.frame_rate),
+            )
         )
 
     def frames(self, batch: Batch, clip: int, other: int) -> Tensor:
@@ -270,52 +263,3 @@ class Alignments:
     def _recording(self, batch: Batch, clip: int) -> tuple[Tensor, int]:
         audio = batch.audio[clip, : int(batch.audio_lengths[clip])].float().cpu()
         return audio, int(batch.frame_lengths[clip])
-
-
-def align(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """For each frame of ``first`` the frame of ``second`` that goes with it, by dynamic time warping.
-
-    Args:
-        first: features (T, C).
-        second: features (U, C).
-
-    Returns:
-        indices (T,) into ``second``, never falling; where several frames go with one, the middle one.
-
-    Raises:
-        MissingExtraError: if dtaidistance is not installed.
-    """
-    try:
-        from dtaidistance import dtw_ndim
-        from dtaidistance.dtw import best_path
-    except ImportError as error:
-        raise MissingExtraError("dtaidistance", "mesh", "aligning two recordings of one sentence") from error
-    # The path may leave the diagonal by a quarter of the sentence. Without a band, a pause of one recording could be
-    # aligned with half a sentence of the other.
-    window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1
-    _, costs = dtw_ndim.warping_paths_fast(np.ascontiguousarray(first), np.ascontiguousarray(second), window=window)
-    partners: list[list[int]] = [[] for _ in first]
-    for here, there in best_path(costs):
-        partners[here].append(there)
-    return np.array([there[len(there) // 2] for there in partners], np.int64)
-
-
-def cepstra(audio: Float[Tensor, " samples"], frames: int, frame_rate: float) -> npt.NDArray[np.float64]:
-    """Speech features (frames, 2 · 13) that depend little on the voice: standardised cepstra and their slopes.
-
-    The mean and the variance over the sentence, which depend on voice and microphone more than on sounds, are removed.
-    """
-    # One window of speech per motion frame, centred on the frame, so that an alignment of features is one of frames.
-    hop = SAMPLE_RATE / frame_rate
-    padded = torch.nn.functional.pad(audio.double(), (N_FFT // 2, N_FFT // 2 + int(hop)))
-    starts = [round(hop * (frame + 0.5)) for frame in range(frames)]
-    stretch = torch.stack([padded[start : start + N_FFT] for start in starts])
-    power = torch.fft.rfft(stretch * torch.hann_window(N_FFT, dtype=torch.float64)).abs().square()
-    energy = torch.log(power @ mel_filters(N_MELS, N_FFT, 60.0, 7600.0).double().T + 1e-6)
-    # The cosine transform of the log energies: its first coefficients describe the shape of the vocal tract, its later
-    # ones the pitch, which differs between speakers.
-    place = (torch.arange(N_MELS, dtype=torch.float64) + 0.5) * torch.pi / N_MELS
-    features = energy @ torch.cos(place[:, None] * torch.arange(N_CEPSTRA, dtype=torch.float64))
-    features = torch.cat([features, torch.gradient(features, dim=0)[0]], 1) if frames > 1 else features.repeat(1, 2)
-    spread = features.std(0, correction=0).clamp_min(1e-6)
-    return ((features - features.mean(0)) / spread).numpy()
