@@ -1,15 +1,15 @@
 """Tables that anyone can regenerate: plans of methods, corpora and seeds, their cells, and what the results say."""
 
 from facediff.benchmark.cells import Cell, cells_of, rows_of
-from facediff.benchmark.plan import Plan, find_plan, read_plan
+from facediff.benchmark.plan import BenchmarkPlan, find_plan, read_plan
 from facediff.benchmark.results import Result, read_result
-from facediff.benchmark.tables import BenchmarkReport, Outline, report_of
+from facediff.benchmark.tables import BenchmarkReport, ReportOutline, report_of
 
 __all__ = [
     "BenchmarkReport",
     "Cell",
-    "Outline",
-    "Plan",
+    "ReportOutline",
+    "BenchmarkPlan",
     "Result",
     "cells_of",
     "find_plan",

@@ -15,7 +15,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from facediff.benchmark.plan import MOST_CELLS, Before, CorpusEntry, MethodEntry, Options, Plan, Variant, find_config
+from facediff.benchmark.plan import (
+    MOST_CELLS,
+    Before,
+    BenchmarkPlan,
+    CorpusEntry,
+    MethodEntry,
+    Options,
+    Variant,
+    find_config,
+)
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.checksums import describe_files, sha256
 from facediff.utils.files import short_name
@@ -92,8 +101,8 @@ class Cell:
 
     @property
     def _stem(self) -> str:
-        words = [self.row, self.corpus, *([] if self.seed is None else [f"seed{self.seed}"])]
-        return short_name("-".join(re.sub(r"[^\w.+]+", "_", word) for word in words), 100)
+        parts = [self.row, self.corpus, *([] if self.seed is None else [f"seed{self.seed}"])]
+        return short_name("-".join(re.sub(r"[^\w.+]+", "_", word) for word in parts), 100)
 
 
 def hash_of(content: object) -> str:
@@ -116,25 +125,25 @@ class Row:
         return self.variant.published if self.variant is not None and self.variant.published else self.method.published
 
 
-def rows_of(plan: Plan) -> list[Row]:
+def rows_of(plan: BenchmarkPlan) -> list[Row]:
     """The rows of a plan, in its order; where there are variants, each method once for each of them.
 
     Raises:
         FaceDiffError: if the baseline is none of them.
     """
-    found: list[Row] = []
+    rows: list[Row] = []
     # Where one method alone is trained, its variants are the rows, and their names say enough.
     alone = sum(method.config is not None for method in plan.methods.values()) == 1
     for method in plan.methods.values():
         names = list(plan.variants) if method.variants is None else list(method.variants)
         if method.config is None or not names:  # what is trained already has no variants
-            found.append(Row(method.name, method.label, method))
+            rows.append(Row(method.name, method.label, method))
             continue
         for name in names:
             variant = plan.variants[name]
             label = variant.label if alone else f"{method.label}, {variant.label}"
-            found.append(Row(name if alone else f"{method.name}/{name}", label, method, variant))
-    names = [row.name for row in found]
+            rows.append(Row(name if alone else f"{method.name}/{name}", label, method, variant))
+    names = [row.name for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise FaceDiffError(f"{plan.file}: two rows are called {twice!r}; give the method or the variant another name")
@@ -142,26 +151,26 @@ def rows_of(plan: Plan) -> list[Row]:
         raise FaceDiffError(
             f"{plan.file}: baseline: there is no row {plan.baseline!r}: {choices(plan.baseline, names)}"
         )
-    return found
+    return rows
 
 
-def cells_of(plan: Plan) -> list[Cell]:
+def cells_of(plan: BenchmarkPlan) -> list[Cell]:
     """All cells, seed by seed, so that a plan that is stopped early has whole columns of few seeds.
 
     Raises:
         FaceDiffError: if a file or a folder is missing.
     """
-    found = [
+    cells = [
         cell
         for row in rows_of(plan)
         for name, corpus in plan.corpora.items()
         if row.method.corpora is None or name in row.method.corpora
         for cell in _cells(plan, row, corpus)
     ]
-    if not found:
+    if not cells:
         raise FaceDiffError(f"{plan.file}: has no cell; expected one method at least that is run on one corpus")
-    if len(found) > MOST_CELLS:
-        raise FaceDiffError(f"{plan.file}: has {len(found)} cells; expected {MOST_CELLS} at most")
+    if len(cells) > MOST_CELLS:
+        raise FaceDiffError(f"{plan.file}: has {len(cells)} cells; expected {MOST_CELLS} at most")
     places: dict[tuple[str, str], int] = {}
 
     def turn(cell: Cell) -> int:
@@ -169,10 +178,10 @@ def cells_of(plan: Plan) -> list[Cell]:
         places[cell.row, cell.corpus] = place + 1
         return place
 
-    return sorted(found, key=turn)
+    return sorted(cells, key=turn)
 
 
-def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
+def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
     method = row.method
     seeds = method.seeds or plan.seeds
     scoring = {
@@ -189,8 +198,12 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
                 "seed": seed,
                 "threads": plan.threads,
                 "trainings": [
-                    {"name": each.name, "config": config_content(each.config), "options": dict(each.options)}
-                    for each in trainings
+                    {
+                        "name": training.name,
+                        "config": config_content(training.config),
+                        "options": dict(training.options),
+                    }
+                    for training in trainings
                 ],
             }
             recipe = {"kind": "fit", "trained": trained, "weights": plan.weights, "test": scoring}
@@ -205,9 +218,9 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
         return
     kind: Kind = "checkpoint" if method.checkpoint is not None else "predictions"
     text = method.checkpoint or method.predictions or ""
-    wanted: list[int | None] = [*seeds] if "{seed}" in text else [None]
-    for given in wanted:
-        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(given)))
+    source_seeds: list[int | None] = [*seeds] if "{seed}" in text else [None]
+    for source_seed in source_seeds:
+        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(source_seed)))
         if kind == "predictions" and corpus.data is None:
             raise FaceDiffError(
                 f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
@@ -221,7 +234,7 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
             "options": dict(method.options),
         }
         yield Cell(
-            *(row.name, corpus.name, given, kind),
+            *(row.name, corpus.name, source_seed, kind),
             source=source,
             options=method.options,
             test_options=scoring["options"],  # type: ignore[arg-type]
@@ -232,7 +245,7 @@ def _cells(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
         )
 
 
-def _trainings(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Training]:
+def _trainings(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Training]:
     method = row.method
     place = f"{plan.file}: methods: {method.name}: config"
     variant = {} if row.variant is None else row.variant.options
@@ -243,7 +256,7 @@ def _trainings(plan: Plan, row: Row, corpus: CorpusEntry) -> Iterator[Training]:
         yield Training(step.name, config, options)
 
 
-def _source(plan: Plan, kind: Kind, text: str) -> Path:
+def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:
     path = Path(text).expanduser()
     path = path if path.is_absolute() or path.exists() else plan.file.parent / path
     if kind == "predictions":
@@ -292,9 +305,9 @@ def _expanded(path: Path, outer: tuple[Path, ...]) -> object:
 
     def expand(value: object) -> object:
         if isinstance(value, dict):
-            return {str(key): expand(each) for key, each in value.items()}
+            return {str(key): expand(entry) for key, entry in value.items()}
         if isinstance(value, list):
-            return [expand(each) for each in value]
+            return [expand(entry) for entry in value]
         if isinstance(value, str) and value.endswith((".yaml", ".yml")) and (path.parent / value).is_file():
             return _expanded((path.parent / value).resolve(), (*outer, path))
         return value

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from facediff.benchmark.cells import Cell, rows_of
-from facediff.benchmark.plan import Plan
+from facediff.benchmark.plan import BenchmarkPlan
 from facediff.benchmark.results import CELLS, Result, read_result
-from facediff.benchmark.tables import Outline
+from facediff.benchmark.tables import ReportOutline
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import load_json, write_json
@@ -19,9 +19,9 @@ FILE = "plan.json"
 FORMAT = 1
 
 
-def outline_of(plan: Plan, cells: Sequence[Cell], command: str) -> Outline:
+def outline_of(plan: BenchmarkPlan, cells: Sequence[Cell], command: str) -> ReportOutline:
     """What a report needs of a plan."""
-    return Outline(
+    return ReportOutline(
         name=plan.name,
         title=plan.title,
         description=plan.description,
@@ -37,12 +37,12 @@ def outline_of(plan: Plan, cells: Sequence[Cell], command: str) -> Outline:
     )
 
 
-def write_outline(folder: Path, outline: Outline) -> None:
+def write_outline(folder: Path, outline: ReportOutline) -> None:
     """Write it into a benchmark's folder, whole or not at all."""
     write_json(folder / FILE, {"format": FORMAT, **asdict(outline)})
 
 
-def read_outline(folder: Path) -> Outline:
+def read_outline(folder: Path) -> ReportOutline:
     """The outline of a benchmark's folder.
 
     Raises:
@@ -55,26 +55,26 @@ def read_outline(folder: Path) -> Outline:
     if not isinstance(content, dict):
         raise FaceDiffError(f"{path}: holds no JSON object; {remedy}")
     check_format(path, content.get("format"), FORMAT)
-    given: dict[str, Any] = {}
-    for key, field in Outline.__dataclass_fields__.items():
+    fields: dict[str, Any] = {}
+    for key, field in ReportOutline.__dataclass_fields__.items():
         value = content.get(key)
         listed = str(field.type).startswith("tuple")
         fits = isinstance(value, list) if listed else isinstance(value, dict if "Mapping" in str(field.type) else str)
-        if not fits or (listed and not all(isinstance(each, str) for each in value or ())):
+        if not fits or (listed and not all(isinstance(entry, str) for entry in value or ())):
             raise FaceDiffError(f"{path}: {key} is {quoted(value)}; {remedy}")
-        given[key] = tuple(value) if isinstance(value, list) else value
-    rows = given["rows"]
+        fields[key] = tuple(value) if isinstance(value, list) else value
+    rows = fields["rows"]
     for name, row in rows.items():
         if not isinstance(row, list) or len(row) != 2 or not all(isinstance(text, str) for text in row):
             raise FaceDiffError(f"{path}: rows: {name} is {quoted(row)}; {remedy}")
-    if not all(isinstance(label, str) for label in given["corpora"].values()):
-        raise FaceDiffError(f"{path}: corpora is {quoted(given['corpora'])}; {remedy}")
-    if any("/" in name or "\\" in name or name in ("", ".", "..") for name in (*given["cells"], given["name"])):
+    if not all(isinstance(label, str) for label in fields["corpora"].values()):
+        raise FaceDiffError(f"{path}: corpora is {quoted(fields['corpora'])}; {remedy}")
+    if any("/" in name or "\\" in name or name in ("", ".", "..") for name in (*fields["cells"], fields["name"])):
         raise FaceDiffError(f"{path}: names a file elsewhere; {remedy}")
-    return Outline(**{**given, "rows": {name: (row[0], row[1]) for name, row in rows.items()}})
+    return ReportOutline(**{**fields, "rows": {name: (row[0], row[1]) for name, row in rows.items()}})
 
 
-def read_results(folder: Path, outline: Outline) -> tuple[list[Result], list[str]]:
+def read_results(folder: Path, outline: ReportOutline) -> tuple[list[Result], list[str]]:
     """The results of a benchmark's cells, and the names of those that have none yet.
 
     Raises:

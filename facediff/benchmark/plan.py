@@ -114,7 +114,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchmarkPlan:
     """A benchmark.
 
     Attributes:
@@ -186,21 +186,21 @@ class Section:
         """A list of texts; empty if it is missing."""
         value = self.content.get(key) or []
         value = [value] if isinstance(value, str) else value
-        if not isinstance(value, list) or not all(isinstance(each, str) and each.strip() for each in value):
+        if not isinstance(value, list) or not all(isinstance(entry, str) and entry.strip() for entry in value):
             raise FaceDiffError(f"{self.place}: {key} is {quoted(value)}; expected a list of texts")
         if len({*value}) < len(value):
             raise FaceDiffError(f"{self.place}: {key} names something twice; name each once")
         return tuple(value)
 
-    def names(self, key: str, known: Sequence[str], what: str) -> tuple[str, ...] | None:
+    def names(self, key: str, allowed: Sequence[str], what: str) -> tuple[str, ...] | None:
         """A list of names that are known; None if it is missing."""
         if self.content.get(key) is None:
             return None
-        found = self.texts(key)
-        for name in found:
-            if name not in known:
-                raise FaceDiffError(f"{self.place}: {key}: there is no {what} {quoted(name)}: {choices(name, known)}")
-        return found
+        names = self.texts(key)
+        for name in names:
+            if name not in allowed:
+                raise FaceDiffError(f"{self.place}: {key}: there is no {what} {quoted(name)}: {choices(name, allowed)}")
+        return names
 
     def number(self, key: str, default: int | None, most: int) -> int | None:
         """A whole number from 1."""
@@ -215,7 +215,7 @@ class Section:
         if value is None:
             return None
         fits = isinstance(value, list) and all(
-            isinstance(each, int) and not isinstance(each, bool) and 0 <= each <= LARGEST_SEED for each in value
+            isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed <= LARGEST_SEED for seed in value
         )
         if not fits or not value or len({*value}) < len(value):
             raise FaceDiffError(
@@ -239,12 +239,12 @@ class Section:
     def sections(self, key: str, keys: Sequence[str]) -> dict[str, Section]:
         """Named mappings, in the order of the file."""
         content = self.content.get(key) or {}
-        found = {}
+        sections = {}
         for name, value in Section(content, f"{self.place}: {key}", None).content.items():
             if not NAME.fullmatch(name):
                 raise FaceDiffError(f"{self.place}: {key}: {quoted(name)}; expected a short name of letters and digits")
-            found[name] = Section({} if value is None else value, f"{self.place}: {key}: {name}", keys)
-        return found
+            sections[name] = Section({} if value is None else value, f"{self.place}: {key}: {name}", keys)
+        return sections
 
 
 def find_plan(path: Path) -> Path:
@@ -258,11 +258,11 @@ def find_plan(path: Path) -> Path:
     bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / path
     if bundled.is_file():
         return bundled
-    known = [f"configs/benchmark/{each.name}" for each in sorted((config_dir() / "benchmark").glob("*.yaml"))]
-    raise FaceDiffError(f"{path}: no such plan; {choices(str(path), known)}")
+    bundled_plans = [f"configs/benchmark/{file.name}" for file in sorted((config_dir() / "benchmark").glob("*.yaml"))]
+    raise FaceDiffError(f"{path}: no such plan; {choices(str(path), bundled_plans)}")
 
 
-def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> Plan:
+def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkPlan:
     """Read a plan and check all that can be checked without running anything.
 
     Args:
@@ -275,22 +275,26 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> Plan:
     return plan_of(load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path, roots or {})
 
 
-def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> Plan:
+def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> BenchmarkPlan:
     """The plan in plain data; see :func:`read_plan`."""
     top = Section(content, str(path), KEYS)
-    corpora = {name: _corpus(name, each, roots, path) for name, each in top.sections("corpora", CORPUS_KEYS).items()}
+    corpora = {
+        name: _corpus(name, section, roots, path) for name, section in top.sections("corpora", CORPUS_KEYS).items()
+    }
     if not corpora:
         raise FaceDiffError(f"{path}: names no corpus; expected `corpora:` with one at least, such as puppet: {{}}")
     for name in roots:
         if name not in corpora:
             raise FaceDiffError(f"--root {name}: the plan has no such corpus: {choices(name, corpora)}")
     variants = {
-        name: Variant(name, each.text("label", name), each.options("options"), each.optional("published") or "")
-        for name, each in top.sections("variants", VARIANT_KEYS).items()
+        name: Variant(
+            name, section.text("label", name), section.options("options"), section.optional("published") or ""
+        )
+        for name, section in top.sections("variants", VARIANT_KEYS).items()
     }
     methods = {
-        name: _method(name, each, corpora, variants, path)
-        for name, each in top.sections("methods", METHOD_KEYS).items()
+        name: _method(name, section, corpora, variants, path)
+        for name, section in top.sections("methods", METHOD_KEYS).items()
     }
     if not methods:
         raise FaceDiffError(f"{path}: names no method; expected `methods:` with one at least")
@@ -305,7 +309,7 @@ def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> Plan:
     if weights not in ("last", "best"):
         raise FaceDiffError(f"{path}: weights is {quoted(weights)}; expected last or best")
     references = top.names("references", REFERENCES, "reference")
-    return Plan(
+    return BenchmarkPlan(
         name=path.stem,
         file=path,
         title=top.text("title", path.stem),
@@ -344,22 +348,22 @@ def _method(
     variants: Mapping[str, Variant],
     path: Path,
 ) -> MethodEntry:
-    given = [source for source in SOURCES if section.content.get(source) is not None]
-    if len(given) != 1:
+    sources = [source for source in SOURCES if section.content.get(source) is not None]
+    if len(sources) != 1:
         raise FaceDiffError(
-            f"{section.place}: has {' and '.join(given) or 'no source'}; expected one of config, checkpoint and "
+            f"{section.place}: has {' and '.join(sources) or 'no source'}; expected one of config, checkpoint and "
             f"predictions"
         )
     chosen = section.names("corpora", list(corpora), "corpus")
     before = tuple(
-        Before(step, each.text("config"), each.options("options"))
-        for step, each in section.sections("before", BEFORE_KEYS).items()
+        Before(step, options.text("config"), options.options("options"))
+        for step, options in section.sections("before", BEFORE_KEYS).items()
     )
     for config in [section.optional("config"), *(step.config for step in before)]:
         for corpus in chosen or corpora if config else ():
             find_config(str(config).replace("{corpus}", corpus), f"{section.place}: config", path)
-    form = OPTION if given[0] == "config" else re.compile(r"[a-z][\w-]*")
-    if given[0] == "checkpoint" and section.content.get("options"):
+    form = OPTION if sources[0] == "config" else re.compile(r"[a-z][\w-]*")
+    if sources[0] == "checkpoint" and section.content.get("options"):
         raise FaceDiffError(f"{section.place}: options are of training, and a checkpoint is trained; use test_options")
     return MethodEntry(
         name=name,
@@ -387,7 +391,7 @@ def _beside(plan: Path, text: str) -> Path:
     return (
         path
         if path.is_absolute() or path.exists()
-        else next((found for found in [plan.parent / path] if found.exists()), path)
+        else next((candidate for candidate in [plan.parent / path] if candidate.exists()), path)
     )
 
 
@@ -398,14 +402,14 @@ def find_config(text: str, place: str, plan: Path) -> Path:
         FaceDiffError: if there is none.
     """
     bundled = config_dir() / text.removeprefix("configs/")
-    found = _beside(plan, text)
-    if found.is_file():
-        return found
+    own = _beside(plan, text)
+    if own.is_file():
+        return own
     if text.startswith("configs/") and bundled.is_file():
         return bundled
     folder = Path(text).parent.name
-    known = [f"configs/{folder}/{each.name}" for each in sorted((config_dir() / folder).glob("*.yaml"))]
-    near = difflib.get_close_matches(text, known, n=3, cutoff=0.3)
+    configs = [f"configs/{folder}/{file.name}" for file in sorted((config_dir() / folder).glob("*.yaml"))]
+    near = difflib.get_close_matches(text, configs, n=3, cutoff=0.3)
     hint = (
         f"the nearest are {', '.join(near)}" if near else "expected a YAML file such as configs/experiment/puppet.yaml"
     )

@@ -130,8 +130,8 @@ def ticks(low: float, high: float, *, log: bool = False) -> list[float]:
     """Round numbers between two ends."""
     if log:
         powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        found = [base * 10.0**power for power in powers for base in (1, 2, 5)]
-        return [value for value in found if low <= value <= high]
+        ticks_of_decades = [base * 10.0**power for power in powers for base in (1, 2, 5)]
+        return [value for value in ticks_of_decades if low <= value <= high]
     step = 10.0 ** math.floor(math.log10((high - low) / 4))
     step *= next(factor for factor in (1, 2, 5, 10) if (high - low) / (factor * step) <= 6)
     first = math.ceil(low / step)
@@ -166,9 +166,9 @@ def curves_plot(table: Table, report: BenchmarkReport, over: str) -> Panel | Non
         points = []
         for place in range(length):
             values = [(curve[over][place], curve["val/lve"][place]) for curve in runs]
-            known = [(x, y) for x, y in values if x is not None and y is not None]
-            if known:
-                points.append((float(np.mean([x for x, _ in known])), float(np.mean([y for _, y in known]))))
+            finite = [(x, y) for x, y in values if x is not None and y is not None]
+            if finite:
+                points.append((float(np.mean([x for x, _ in finite])), float(np.mean([y for _, y in finite]))))
         if points:
             lines.append((row.label, points))
     every = [point for _, points in lines for point in points]

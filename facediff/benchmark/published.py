@@ -66,11 +66,11 @@ class Shown:
 def published() -> dict[str, Published]:
     """All tables of papers that are known, by name."""
     content: dict[str, dict[str, Any]] = load_yaml(FILE, "it is part of the package; install it again")
-    found = {}
+    tables = {}
     for name, table in content.items():
         rows = {row: {key: float(value) for key, value in scores.items()} for row, scores in table["rows"].items()}
-        found[name] = Published(name, **{**table, "rows": rows})
-    return found
+        tables[name] = Published(name, **{**table, "rows": rows})
+    return tables
 
 
 def find_published(names: Sequence[str]) -> list[Published]:
@@ -136,8 +136,8 @@ def _disagreement(
 ) -> str:
     """Why a paper's figures cannot stand next to ours; empty if they can."""
     if table.corpus != corpus:
-        made = ", which a program made" if synthetic else ""
-        return f"its corpus is {table.corpus}, and this is {corpus}{made}"
+        origin = ", which a program made" if synthetic else ""
+        return f"its corpus is {table.corpus}, and this is {corpus}{origin}"
     if table.split != split:
         return f"it scores {table.split}, and this is {split}"
     if table.doubt:

@@ -83,21 +83,21 @@ class Result:
     def total_seconds(self) -> float | None:
         """Seconds of all steps; None if one is not known."""
         seconds = [step.get("seconds") for step in self.measured.values()]
-        known = [value for value in seconds if value is not None]
-        return sum(known) if known and len(known) == len(seconds) else None
+        measured = [value for value in seconds if value is not None]
+        return sum(measured) if measured and len(measured) == len(seconds) else None
 
     @property
     def training_seconds(self) -> float | None:
         """Seconds of all trainings; None if nothing was trained."""
         steps = [step for name, step in self.measured.items() if not name.startswith(("test", "evaluate"))]
-        known = [step["seconds"] for step in steps if step.get("seconds") is not None]
-        return sum(value for value in known if value is not None) if known else None
+        measured = [step["seconds"] for step in steps if step.get("seconds") is not None]
+        return sum(value for value in measured if value is not None) if measured else None
 
     @property
     def memory(self) -> float | None:
         """The most bytes that any step had in memory."""
-        found = [value for step in self.measured.values() if (value := step.get("memory")) is not None]
-        return max(found, default=None)
+        peaks = [value for step in self.measured.values() if (value := step.get("memory")) is not None]
+        return max(peaks, default=None)
 
     @property
     def parameters(self) -> int | None:
@@ -139,35 +139,35 @@ def read_result(path: Path) -> Result | None:
     if not isinstance(content, dict):
         raise FaceDiffError(f"{path}: holds no JSON object; {REMEDY}")
     check_format(path, content.get("format"), FORMAT)
-    given = {key: content[key] for key in Result.__dataclass_fields__ if key in content}
+    fields = {key: content[key] for key in Result.__dataclass_fields__ if key in content}
     for key, kind in _KINDS.items():
-        if not isinstance(given.get(key), kind) or isinstance(given.get(key), bool) != (kind is bool):
-            raise FaceDiffError(f"{path}: {key} is {quoted(given.get(key))}; {REMEDY}")
+        if not isinstance(fields.get(key), kind) or isinstance(fields.get(key), bool) != (kind is bool):
+            raise FaceDiffError(f"{path}: {key} is {quoted(fields.get(key))}; {REMEDY}")
     for key in ("scores", "sequences"):
-        for row in given[key]:
+        for row in fields[key]:
             if not isinstance(row, dict) or not {"split", "method", "frames"} <= row.keys():
                 raise FaceDiffError(f"{path}: a row of {key} is {quoted(row)}; {REMEDY}")
             if not _is_number(row["frames"]) or not isinstance(row["split"], str) or not isinstance(row["method"], str):
                 raise FaceDiffError(f"{path}: a row of {key} is {quoted(row)}; {REMEDY}")
-            for column in given["columns"]:
+            for column in fields["columns"]:
                 if row.get(column) is not None and not _is_number(row[column]):
                     raise FaceDiffError(f"{path}: {column} in {key} is {quoted(row[column])}; {REMEDY}")
-        if key == "sequences" and any(not isinstance(row.get("clip"), str) for row in given[key]):
+        if key == "sequences" and any(not isinstance(row.get("clip"), str) for row in fields[key]):
             raise FaceDiffError(f"{path}: a row of {key} names no clip; {REMEDY}")
-    for name, columns in (("columns", given["columns"]), ("measured", given["measured"])):
-        if not all(isinstance(each, dict) for each in columns.values()):
+    for name, columns in (("columns", fields["columns"]), ("measured", fields["measured"])):
+        if not all(isinstance(entry, dict) for entry in columns.values()):
             raise FaceDiffError(f"{path}: {name} is {quoted(columns)}; {REMEDY}")
-    for step in given["measured"].values():
+    for step in fields["measured"].values():
         if not all(value is None or _is_number(value) for value in step.values()):
             raise FaceDiffError(f"{path}: measured is {quoted(step)}; {REMEDY}")
-    for values in given["curve"].values():
+    for values in fields["curve"].values():
         if not isinstance(values, list) or not all(value is None or _is_number(value) for value in values):
             raise FaceDiffError(f"{path}: curve is {quoted(values)}; {REMEDY}")
-    if given["provenance"]:
-        provenance_of(given["provenance"], path)
-    if given.get("seed") is not None and not isinstance(given["seed"], int):
-        raise FaceDiffError(f"{path}: seed is {quoted(given['seed'])}; {REMEDY}")
-    return Result(**given)
+    if fields["provenance"]:
+        provenance_of(fields["provenance"], path)
+    if fields.get("seed") is not None and not isinstance(fields["seed"], int):
+        raise FaceDiffError(f"{path}: seed is {quoted(fields['seed'])}; {REMEDY}")
+    return Result(**fields)
 
 
 _KINDS: dict[str, type] = {
@@ -214,7 +214,7 @@ def model_result(
         definition=str(report["definition"]),
         machine=machine,
         measured=measured,
-        columns={name: each for name, each in report["columns"].items() if name != "real_time_factor"},
+        columns={name: facts for name, facts in report["columns"].items() if name != "real_time_factor"},
         scores=report["scores"],
         sequences=report["sequences"],
         curve={**curve, **seconds},
@@ -239,12 +239,12 @@ def predictions_result(
     facts = {score["metric"]: score for score in method["scores"]}
     columns = {name: {"pooling": score["pooling"], "better": score["better"]} for name, score in facts.items()}
     sequences = []
-    for each in method["sequences"]:
-        split = splits.get(each["clip"])
+    for scored in method["sequences"]:
+        split = splits.get(scored["clip"])
         if split is not None:
-            values = {name.partition("/")[2]: value for name, value in each["scores"].items()}
-            who = {"split": split, "method": "model", "clip": each["clip"], "identity": ""}
-            sequences.append({**who, "frames": each["frames"], **values})
+            values = {name.partition("/")[2]: value for name, value in scored["scores"].items()}
+            who = {"split": split, "method": "model", "clip": scored["clip"], "identity": ""}
+            sequences.append({**who, "frames": scored["frames"], **values})
     if not sequences:
         raise FaceDiffError(
             f"{cell.source}: holds no prediction of a test split's clips; expected such as {[*splits][:1]}"
@@ -253,16 +253,16 @@ def predictions_result(
     for split in dict.fromkeys(splits.values()):
         rows = [row for row in sequences if row["split"] == split]
         if rows:
-            pooled = {name: pool(rows, name, each["pooling"]) for name, each in columns.items()}
+            pooled = {name: pool(rows, name, facts["pooling"]) for name, facts in columns.items()}
             counts = {"frames": sum(row["frames"] for row in rows), "sequences": len(rows)}
             regions = {"regions": report["regions"], "unseen_identity": report["identity"]}
             scores.append({"split": split, "method": "model", **pooled, **counts, **regions})
-    known: Provenance | None = None if cell.source is None else read_provenance(cell.source)
+    provenance: Provenance | None = None if cell.source is None else read_provenance(cell.source)
     return Result(
         **_of(cell),
         code=code_of(),
         source=shown,
-        provenance={} if known is None else known.as_dict(),
+        provenance={} if provenance is None else provenance.as_dict(),
         protocol=method["scores"][0]["protocol"],
         definition="\n".join(report["protocols"].values()),
         machine=machine,
@@ -276,7 +276,7 @@ def predictions_result(
 def code_of() -> dict[str, str]:
     """Version of the package, and the commit if it is run from a checkout."""
     folder = Path(__file__).parents[2]
-    found = {"version": __version__}
+    code = {"version": __version__}
     git = shutil.which("git")
     if git is not None and (folder / ".git").exists():
         with suppress(OSError, subprocess.SubprocessError):
@@ -287,8 +287,8 @@ def code_of() -> dict[str, str]:
                 timeout=10,
                 check=True,
             )
-            found["commit"] = answer.stdout.strip()
-    return found
+            code["commit"] = answer.stdout.strip()
+    return code
 
 
 def pool(rows: Sequence[Mapping[str, Any]], column: str, pooling: str | None) -> float | None:
@@ -302,12 +302,12 @@ def curve_of(path: Path) -> dict[str, list[float | None]]:
     """The scores of validation over the steps of a training, as ``metrics.csv`` of its run has them."""
     if not path.is_file():
         return {}
-    found: dict[float, dict[str, float]] = {}
+    by_step: dict[float, dict[str, float]] = {}
     for row in read_rows(path, remedy="expected what CSVLogger writes during training"):
         values = {name: float(row[name]) for name in CURVES if row.get(name)}
         if values and row.get("step"):
-            found.setdefault(float(row["step"]) + 1, {}).update(values)
-    steps = sorted(found)
-    names = [name for name in CURVES if any(name in each for each in found.values())]
-    curve: dict[str, list[float | None]] = {name: [found[step].get(name) for step in steps] for name in names}
+            by_step.setdefault(float(row["step"]) + 1, {}).update(values)
+    steps = sorted(by_step)
+    names = [name for name in CURVES if any(name in values for values in by_step.values())]
+    curve: dict[str, list[float | None]] = {name: [by_step[step].get(name) for step in steps] for name in names}
     return {"step": [*steps], **curve} if steps else {}

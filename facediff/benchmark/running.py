@@ -71,12 +71,12 @@ class Setting:
 
 def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[Cell]:
     """The cells that have no result yet; those that failed are tried again only if asked."""
-    found = []
+    left = []
     for cell in cells:
         result = read_result(cell_file(folder, cell))
         if result is None or (result.problem and retry_failed):
-            found.append(cell)
-    return found
+            left.append(cell)
+    return left
 
 
 def run_cells(
@@ -143,12 +143,12 @@ def run_cell(setting: Setting, cell: Cell) -> Result:
 
 def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, Any]) -> Result:
     runner = Runner(setting, folder, cell)
-    made: dict[str, Path] = {}
+    checkpoints: dict[str, Path] = {}
     for training in cell.trainings:
-        made[training.name] = runner.fit(training, made, cell)
-    checkpoint = cell.source if cell.source is not None else made[cell.trainings[-1].name]
+        checkpoints[training.name] = runner.fit(training, checkpoints, cell)
+    checkpoint = cell.source if cell.source is not None else checkpoints[cell.trainings[-1].name]
     place = folder / f"test-{cell.key[:12]}"
-    words = ["test", "--ckpt_path", str(checkpoint), *logger_words(place), *progress_words()]
+    arguments = ["test", "--ckpt_path", str(checkpoint), *logger_words(place), *progress_words()]
     metrics = list(dict.fromkeys([*setting.metrics, "real_time_factor"]))
     root = cell.root or (setting.roots.get(cell.corpus) if cell.kind == "checkpoint" else None)
     options = {
@@ -158,7 +158,7 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
         **({} if root is None else {"data.root": str(root)}),
         **cell.test_options,
     }
-    runner.run(place.name, [*words, *option_words(options)])
+    runner.run(place.name, [*arguments, *option_words(options)])
     report = load_json(place / REPORT)
     curves = {} if not cell.trainings else curve_of(folder / cell.trainings[-1].name / "version_0" / "metrics.csv")
     return model_result(cell, report, machine=machine, measured=runner.measured, curve=curves, shown=str(checkpoint))
@@ -167,10 +167,10 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
 def _score_predictions(setting: Setting, cell: Cell, folder: Path, machine: dict[str, Any]) -> Result:
     runner = Runner(setting, folder, cell)
     report = folder / f"evaluate-{cell.key[:12]}.json"
-    words = ["evaluate", str(cell.source), *setting.truths[cell.corpus], "--protocol", setting.protocol]
-    words += [word for metric in setting.metrics for word in ("--metric", metric)]
-    words += option_words(cell.options)
-    runner.run("evaluate", [*words, "--bootstrap", "0", "--quiet", "--json", str(report)])
+    arguments = ["evaluate", str(cell.source), *setting.truths[cell.corpus], "--protocol", setting.protocol]
+    arguments += [word for metric in setting.metrics for word in ("--metric", metric)]
+    arguments += option_words(cell.options)
+    runner.run("evaluate", [*arguments, "--bootstrap", "0", "--quiet", "--json", str(report)])
     content = load_json(report)
     return predictions_result(
         cell, content, setting.clips[cell.corpus], machine=machine, measured=runner.measured, shown=str(cell.source)
@@ -188,7 +188,7 @@ class Runner:
         self.setting, self.folder, self.cell = setting, folder, cell
         self.measured: dict[str, dict[str, float | None]] = {}
 
-    def fit(self, training: Training, made: Mapping[str, Path], cell: Cell) -> Path:
+    def fit(self, training: Training, checkpoints: Mapping[str, Path], cell: Cell) -> Path:
         """Train, or continue a training that was stopped; the checkpoint.
 
         Raises:
@@ -199,30 +199,30 @@ class Runner:
         last = place / LAST
         if not state.get("done"):
             refuse_changed(training, cell)
-            words = ["fit", "--config", str(training.config)]
-            options = fit_options(training, made, cell)
+            arguments = ["fit", "--config", str(training.config)]
+            options = fit_options(training, checkpoints, cell)
             # A training that was killed continues with the time that its last saved state had taken.
             before = float(state.get("seconds", 0.0))
             if last.is_file() and "started" in state:
                 before += max(0.0, last.stat().st_mtime - float(state["started"]))
-                words += ["--ckpt_path", str(last)]
+                arguments += ["--ckpt_path", str(last)]
             elif place.is_dir():
                 discard(place)
             place.mkdir(parents=True, exist_ok=True)
             write_json(place / STATE, {"seconds": before, "started": time.time()})
-            self.run(training.name, [*words, *logger_words(place), *option_words(options), *progress_words()])
+            self.run(training.name, [*arguments, *logger_words(place), *option_words(options), *progress_words()])
             took = self.measured[training.name]
             took["seconds"] = before + (took["seconds"] or 0.0)
             write_json(place / STATE, {"done": True, **took})
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
         best = place / BEST
-        found = best if self.setting.weights == "best" and best.is_file() else last
-        if not found.is_file():
-            raise FaceDiffError(f"{found}: was not written; expected a checkpoint, look at the log {self._log}")
-        return found
+        checkpoint = best if self.setting.weights == "best" and best.is_file() else last
+        if not checkpoint.is_file():
+            raise FaceDiffError(f"{checkpoint}: was not written; expected a checkpoint, look at the log {self._log}")
+        return checkpoint
 
-    def run(self, step: str, words: Sequence[str]) -> None:
+    def run(self, step: str, arguments: Sequence[str]) -> None:
         """Run a facediff command to its end.
 
         Raises:
@@ -233,22 +233,22 @@ class Runner:
         environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(self.setting.threads))}
         started = time.monotonic()
         with log.open("ab") as stream:
-            stream.write(f"\n$ facediff {' '.join(words)}\n".encode(errors="surrogateescape"))
+            stream.write(f"\n$ facediff {' '.join(arguments)}\n".encode(errors="surrogateescape"))
             stream.flush()
             place = stream.tell()
             program, *module = self.setting.launcher
             program = program if shutil.which(program) else sys.executable  # a cluster's may lie somewhere else
-            status, memory = run_process([program, *module, *words], environment, stream)
+            status, memory = run_process([program, *module, *arguments], environment, stream)
         self.measured[step] = {"seconds": time.monotonic() - started, "memory": memory}
         if status:
-            raise FaceDiffError(f"{self.cell}: {words[0]} {reason_of(log, place, status)}")
+            raise FaceDiffError(f"{self.cell}: {arguments[0]} {reason_of(log, place, status)}")
 
     @property
     def _log(self) -> Path:
         return self.setting.folder / LOGS / f"{self.cell.file_name}.log"
 
 
-def fit_options(training: Training, made: Mapping[str, Path], cell: Cell) -> dict[str, Any]:
+def fit_options(training: Training, checkpoints: Mapping[str, Path], cell: Cell) -> dict[str, Any]:
     """The options of a training: seed, corpus, and the checkpoints of those before it in the place of their names."""
     options: dict[str, Any] = {"seed_everything": cell.seed}
     if cell.data is not None:
@@ -256,7 +256,7 @@ def fit_options(training: Training, made: Mapping[str, Path], cell: Cell) -> dic
     if cell.root is not None:
         options["data.root"] = str(cell.root)
     for name, value in training.options.items():
-        for step, checkpoint in made.items():
+        for step, checkpoint in checkpoints.items():
             value = str(checkpoint) if value == f"{{{step}}}" else value  # noqa: PLW2901
         options[name] = value
     return options
@@ -268,8 +268,8 @@ def refuse_changed(training: Training, cell: Cell) -> None:
     Raises:
         FaceDiffError: naming the config.
     """
-    (known,) = (each["config"] for each in cell.trained["trainings"] if each["name"] == training.name)
-    if hash_of(config_content(training.config)) != hash_of(known):
+    (hashed,) = (entry["config"] for entry in cell.trained["trainings"] if entry["name"] == training.name)
+    if hash_of(config_content(training.config)) != hash_of(hashed):
         raise FaceDiffError(
             f"{cell}: {training.config} was changed while the benchmark ran; run the benchmark again, which takes it "
             f"as it is now"
@@ -278,11 +278,11 @@ def refuse_changed(training: Training, cell: Cell) -> None:
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
     """Options as words of a command line; lists and mappings as JSON."""
-    words = []
+    arguments = []
     for name, value in options.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        words += [f"--{name}"] if value is True and "." not in name else [f"--{name}={text}"]
-    return words
+        arguments += [f"--{name}"] if value is True and "." not in name else [f"--{name}={text}"]
+    return arguments
 
 
 def logger_words(place: Path) -> list[str]:
@@ -300,10 +300,10 @@ def progress_words() -> list[str]:
     return ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 
 
-def run_process(words: Sequence[str], environment: Mapping[str, str], log: IO[bytes]) -> tuple[int, float | None]:
+def run_process(command: Sequence[str], environment: Mapping[str, str], log: IO[bytes]) -> tuple[int, float | None]:
     """Run a program that ends with this process; its exit status, and the most memory that it had, in bytes."""
     process = subprocess.Popen(  # noqa: S603 - a command of our own
-        words, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, env=dict(environment)
+        command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, env=dict(environment)
     )
     memory: float | None = None
     try:
@@ -363,22 +363,22 @@ def estimate(cells: Sequence[Cell], folder: Path) -> dict[Cell, float | None]:
 
     Timings of all benchmarks of this machine are remembered in the cache folder, by what is trained and for how long.
     """
-    known: dict[tuple[str, str], tuple[float, float]] = {}
+    latest: dict[tuple[str, str], tuple[float, float]] = {}
     for path in (folder / "cells").glob("*.json"):
         result = read_result(path)
         if result is not None and not result.problem and (seconds := result.total_seconds) is not None:
             key, when = (result.row, result.corpus), path.stat().st_mtime
-            if when > known.get(key, (0.0, 0.0))[0]:
-                known[key] = (when, seconds)
+            if when > latest.get(key, (0.0, 0.0))[0]:
+                latest[key] = (when, seconds)
     remembered = read_json(timings_file()) or {}
-    found: dict[Cell, float | None] = {}
+    estimates: dict[Cell, float | None] = {}
     for cell in cells:
-        if (cell.row, cell.corpus) in known:
-            found[cell] = known[cell.row, cell.corpus][1]
+        if (cell.row, cell.corpus) in latest:
+            estimates[cell] = latest[cell.row, cell.corpus][1]
         else:
             value = remembered.get(timing_key(cell))
-            found[cell] = float(value) if isinstance(value, int | float) else None
-    return found
+            estimates[cell] = float(value) if isinstance(value, int | float) else None
+    return estimates
 
 
 def timings_file() -> Path:
@@ -397,6 +397,6 @@ def timing_key(cell: Cell) -> str:
 def remember(cell: Cell, result: Result) -> None:
     """Keep how long a cell took, for the estimates of later runs; called by one process only."""
     if result.total_seconds is not None:
-        known = read_json(timings_file()) or {}
+        timings = read_json(timings_file()) or {}
         with suppress(FaceDiffError):  # a cache that cannot be written does not matter
-            write_json(timings_file(), {**known, timing_key(cell): round(result.total_seconds, 1)})
+            write_json(timings_file(), {**timings, timing_key(cell): round(result.total_seconds, 1)})

@@ -27,7 +27,7 @@ BLOCK = 2_000  # Random signs that are held at a time
 
 
 @dataclass(frozen=True)
-class Scores:
+class RowScores:
     """One score of one row.
 
     Attributes:
@@ -66,8 +66,8 @@ class Scores:
 
     def interval(self, bootstrap: Bootstrap) -> Interval | None:
         """Bootstrap interval over sentences of the mean over the runs."""
-        found = self._resampled(bootstrap, self.clips)
-        return None if found is None else bootstrap.intervals(found[:, None], 1)[0]
+        resampled = self._resampled(bootstrap, self.clips)
+        return None if resampled is None else bootstrap.intervals(resampled[:, None], 1)[0]
 
     def _resampled(self, bootstrap: Bootstrap, clips: Sequence[str]) -> Array | None:
         if self.values is None:
@@ -102,7 +102,7 @@ class Difference:
     common: int
 
 
-def difference(one: Scores, other: Scores, bootstrap: Bootstrap) -> Difference:
+def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Difference:
     """Compare two rows by one score.
 
     Args:
@@ -154,7 +154,7 @@ def sign_flip(differences: Array, *, seed: int = 0) -> float:
     return (extreme + 1) / (FLIPS + 1)
 
 
-def welch(one: Scores, other: Scores, level: float = 0.95) -> tuple[float | None, Interval | None]:
+def welch(one: RowScores, other: RowScores, level: float = 0.95) -> tuple[float | None, Interval | None]:
     """Welch's t-test between the training runs of two rows, and its interval of the difference.
 
     A row that was not trained has one value without chance. Where both are such, nothing is by chance of training.
@@ -183,16 +183,18 @@ def welch(one: Scores, other: Scores, level: float = 0.95) -> tuple[float | None
 
 
 def compared(
-    rows: Mapping[str, Scores], baseline: str, bootstrap: Bootstrap
+    rows: Mapping[str, RowScores], baseline: str, bootstrap: Bootstrap
 ) -> dict[str, tuple[Difference, float | None]]:
     """Every row against one, with p-values corrected for the number of rows: one family for each score and split."""
-    found = {name: difference(scores, rows[baseline], bootstrap) for name, scores in rows.items() if name != baseline}
-    known = {name: each.p for name, each in found.items() if each.p is not None}
-    adjusted = dict(zip(known, holm(list(known.values())), strict=True))
-    return {name: (each, adjusted.get(name)) for name, each in found.items()}
+    differences = {
+        name: difference(scores, rows[baseline], bootstrap) for name, scores in rows.items() if name != baseline
+    }
+    tested = {name: comparison.p for name, comparison in differences.items() if comparison.p is not None}
+    adjusted = dict(zip(tested, holm(list(tested.values())), strict=True))
+    return {name: (comparison, adjusted.get(name)) for name, comparison in differences.items()}
 
 
-def marked(rows: Mapping[str, Scores], better: str | None, bootstrap: Bootstrap) -> dict[str, str]:
+def marked(rows: Mapping[str, RowScores], better: str | None, bootstrap: Bootstrap) -> dict[str, str]:
     """Which rows are ``best`` and ``second``, each only where its difference from every row behind it is significant.
 
     Args:
@@ -211,8 +213,8 @@ def marked(rows: Mapping[str, Scores], better: str | None, bootstrap: Bootstrap)
             break
         leader = rows[order[place]]
         values = [difference(leader, rows[name], bootstrap).p for name in behind]
-        known = [value for value in values if value is not None]
-        if len(known) < len(values) or max(holm(known)) >= 1 - bootstrap.level:
+        tested = [value for value in values if value is not None]
+        if len(tested) < len(values) or max(holm(tested)) >= 1 - bootstrap.level:
             break
         marks[order[place]] = mark
     return marks

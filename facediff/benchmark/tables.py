@@ -10,7 +10,7 @@ import numpy as np
 
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
-from facediff.benchmark.statistics import Difference, Scores, compared, marked
+from facediff.benchmark.statistics import Difference, RowScores, compared, marked
 from facediff.evaluation.report import Bootstrap, Interval
 from facediff.utils import ranges
 
@@ -23,7 +23,7 @@ SPLIT_LABELS = {"test_a": "test A, seen speakers", "test_b": "test B, unseen spe
 
 
 @dataclass(frozen=True)
-class Outline:
+class ReportOutline:
     """What a report needs of the plan, as plain data in the benchmark's folder.
 
     Attributes:
@@ -86,7 +86,7 @@ class TableRow:
     label: str
     seeds: tuple[int | None, ...]
     reference: bool
-    scores: Mapping[str, Scores]
+    scores: Mapping[str, RowScores]
     intervals: Mapping[str, Interval | None]
     marks: Mapping[str, str] = field(default_factory=dict)
     differences: Mapping[str, tuple[Difference, float | None]] = field(default_factory=dict)
@@ -130,7 +130,7 @@ class Table:
 class BenchmarkReport:
     """All tables of a benchmark, with how sure they are, and of what."""
 
-    outline: Outline
+    outline: ReportOutline
     tables: list[Table]
     bootstrap: Bootstrap
     definition: str
@@ -141,7 +141,7 @@ class BenchmarkReport:
 
 
 def report_of(
-    outline: Outline,
+    outline: ReportOutline,
     results: Sequence[Result],
     missing: Sequence[str] = (),
     *,
@@ -175,19 +175,19 @@ def report_of(
 
 def _remarks(results: Sequence[Result]) -> list[str]:
     """What makes cells of one benchmark differ that should not."""
-    found = []
+    remarks = []
     for what, values in (
         ("versions of the code", {(" ".join(result.code.values())) for result in results}),
         ("machines", {str(result.machine.get("gpu") or result.machine.get("processor")) for result in results}),
         ("threads", {str(result.machine.get("threads")) for result in results}),
     ):
         if len(values) > 1:
-            found.append(f"the cells are of several {what}: {', '.join(sorted(values))}")
-    return found
+            remarks.append(f"the cells are of several {what}: {', '.join(sorted(values))}")
+    return remarks
 
 
 def _table(
-    outline: Outline,
+    outline: ReportOutline,
     results: Sequence[Result],
     corpus: str,
     split: str,
@@ -195,7 +195,7 @@ def _table(
     bootstrap: Bootstrap,
 ) -> Table:
     groups = {name: [result for result in results if result.row == name] for name in outline.rows}
-    groups = {name: group for name, group in groups.items() if any(_row_of(each, split, "model") for each in group)}
+    groups = {name: group for name, group in groups.items() if any(_row_of(result, split, "model") for result in group)}
     first = next(iter(groups.values()))[0]
     columns = _columns(outline, [result for group in groups.values() for result in group], split)
     chosen = next((name for name in (baseline, outline.baseline) if name in groups), next(iter(groups)))
@@ -210,7 +210,7 @@ def _table(
             if reference == "shuffled"
             else [result for result in results if _row_of(result, split, reference)][:1]
         )
-        if any(_row_of(each, split, reference) for each in group):
+        if any(_row_of(result, split, reference) for result in group):
             label = REFERENCE_LABELS[reference].format(row=outline.rows[chosen][0])
             rows.append(_row(reference, label, group, split, reference, columns, bootstrap))
     rows = _with_comparisons(rows, columns, chosen, bootstrap)
@@ -218,7 +218,7 @@ def _table(
     clips = {clip for row in rows for scores in row.scores.values() for clip in scores.clips}
     regions = dict(scored.get("regions") or {})
     frames = sum(_frames(group, split) for group in [groups[chosen]])
-    manifests = {str(each.provenance.get("manifest")) for each in results if each.provenance}
+    manifests = {str(result.provenance.get("manifest")) for result in results if result.provenance}
     published = shown_tables(
         outline.published,
         rows={name: outline.rows[name][1] for name in groups},
@@ -234,8 +234,8 @@ def _table(
         corpus=corpus,
         label=outline.corpora[corpus],
         split=split,
-        synthetic=any(each.synthetic for each in results),
-        columns={name: each.get("better") for name, each in columns.items()},
+        synthetic=any(result.synthetic for result in results),
+        columns={name: facts.get("better") for name, facts in columns.items()},
         rows=rows,
         baseline=chosen,
         frames=frames,
@@ -256,16 +256,16 @@ def _row_of(result: Result, split: str, method: str) -> Mapping[str, Any] | None
     return next((row for row in result.scores if (row["split"], row["method"]) == (split, method)), None)
 
 
-def _columns(outline: Outline, results: Sequence[Result], split: str) -> dict[str, Mapping[str, str | None]]:
+def _columns(outline: ReportOutline, results: Sequence[Result], split: str) -> dict[str, Mapping[str, str | None]]:
     """The scores that are shown, in order, and how each is pooled."""
-    known: dict[str, Mapping[str, str | None]] = {}
+    scored: dict[str, Mapping[str, str | None]] = {}
     for result in results:
-        for name, each in result.columns.items():
+        for name, facts in result.columns.items():
             row = _row_of(result, split, "model")
             if row is not None and row.get(name) is not None:
-                known.setdefault(name, each)
-    wanted = [name for name in outline.columns if name in known] or list(known)
-    return {name: known[name] for name in wanted}
+                scored.setdefault(name, facts)
+    shown = [name for name in outline.columns if name in scored] or list(scored)
+    return {name: scored[name] for name in shown}
 
 
 def _row(
@@ -278,36 +278,36 @@ def _row(
     bootstrap: Bootstrap,
 ) -> TableRow:
     fixed = method in ("still", "mean_face")
-    runs = [each for each in group if _row_of(each, split, method)]
+    runs = [result for result in group if _row_of(result, split, method)]
     scores = {}
     for column, facts in columns.items():
-        found = _scores(runs, split, method, column, facts.get("pooling"), fixed=fixed)
-        if found is not None:
-            scores[column] = found
-    intervals = {column: each.interval(bootstrap) for column, each in scores.items()}
+        column_scores = _scores(runs, split, method, column, facts.get("pooling"), fixed=fixed)
+        if column_scores is not None:
+            scores[column] = column_scores
+    intervals = {column: column_scores.interval(bootstrap) for column, column_scores in scores.items()}
     cost = Cost() if method != "model" else _cost(runs)
-    seeds = tuple(() if fixed else (each.seed for each in runs))
-    clips = max((len(each.clips) for each in scores.values()), default=0)
+    seeds = tuple(() if fixed else (result.seed for result in runs))
+    clips = max((len(column_scores.clips) for column_scores in scores.values()), default=0)
     return TableRow(name, label, seeds, method != "model", scores, intervals, cost=cost, clips=clips)
 
 
 def _scores(
     runs: Sequence[Result], split: str, method: str, column: str, pooling: str | None, *, fixed: bool
-) -> Scores | None:
-    totals = [(_row_of(each, split, method) or {}).get(column) for each in runs]
-    known = [value for value in totals if value is not None]
-    if not known or len(known) < len(totals):
+) -> RowScores | None:
+    totals = [(_row_of(result, split, method) or {}).get(column) for result in runs]
+    scored = [value for value in totals if value is not None]
+    if not scored or len(scored) < len(totals):
         return None
     of_runs: list[dict[str, list[tuple[float, float]]]] = []
-    for each in runs:
+    for result in runs:
         clips: dict[str, list[tuple[float, float]]] = {}
-        for row in each.sequences:
+        for row in result.sequences:
             if (row["split"], row["method"]) == (split, method) and row.get(column) is not None:
                 clips.setdefault(str(row["clip"]), []).append((float(row[column]), float(row["frames"])))
         of_runs.append(clips)
     names = tuple(sorted({clip for clips in of_runs for clip in clips}))
     if pooling is None or not names:
-        return Scores(np.array(known, np.float64), None, np.ones(0), (), fixed)
+        return RowScores(np.array(scored, np.float64), None, np.ones(0), (), fixed)
     # A clip that was scored under several identities is one sentence: the mean of them.
     values = np.array(
         [
@@ -317,20 +317,20 @@ def _scores(
     )
     frames = {name: clips[name][0][1] for clips in of_runs for name in clips}
     weights = np.array([frames[name] if pooling == "frames" else 1.0 for name in names])
-    return Scores(np.array(known, np.float64), values, weights, names, fixed)
+    return RowScores(np.array(scored, np.float64), values, weights, names, fixed)
 
 
 def _cost(runs: Sequence[Result]) -> Cost:
     def mean(values: Sequence[float | None]) -> float | None:
-        known = [value for value in values if value is not None]
-        return sum(known) / len(known) if known else None
+        measured = [value for value in values if value is not None]
+        return sum(measured) / len(measured) if measured else None
 
-    parameters = next((each.parameters for each in runs if each.parameters is not None), None)
+    parameters = next((result.parameters for result in runs if result.parameters is not None), None)
     return Cost(
         parameters,
-        mean([each.real_time_factor() for each in runs]),
-        mean([each.training_seconds for each in runs]),
-        max((each.memory for each in runs if each.memory is not None), default=None),
+        mean([result.real_time_factor() for result in runs]),
+        mean([result.training_seconds for result in runs]),
+        max((result.memory for result in runs if result.memory is not None), default=None),
     )
 
 
@@ -348,8 +348,8 @@ def _with_comparisons(
         for name, mark in marked(own, facts.get("better"), bootstrap).items():
             marks.setdefault(name, {})[column] = mark
         if baseline in all_rows:
-            for name, each in compared(all_rows, baseline, bootstrap).items():
-                differences.setdefault(name, {})[column] = each
+            for name, difference in compared(all_rows, baseline, bootstrap).items():
+                differences.setdefault(name, {})[column] = difference
     return [
         TableRow(
             **{
@@ -387,7 +387,7 @@ def _notes(
             continue
         for row in rows:
             if row.reference and column in row.scores:
-                best = min(sign * each.scores[column].mean for each in scored)
+                best = min(sign * method.scores[column].mean for method in scored)
                 if sign * row.scores[column].mean < best:
                     notes.append(f"by {column}, no method is better than this reference: {row.label}")
     if len(manifests) > 1:

@@ -65,10 +65,10 @@ class Scale:
     @classmethod
     def of(cls, values: Sequence[float]) -> Scale:
         """That of the smallest number; none for numbers that read well as they are."""
-        known = [abs(value) for value in values if value]
-        if not known or (min(known) >= 0.01 and max(known) < 1000):
+        magnitudes = [abs(value) for value in values if value]
+        if not magnitudes or (min(magnitudes) >= 0.01 and max(magnitudes) < 1000):
             return cls(0)
-        return cls(math.floor(math.log10(min(known))))
+        return cls(math.floor(math.log10(min(magnitudes))))
 
     def number(self, value: float | None, digits: int = 4, sign: str = "") -> str:
         """A number without its power of ten."""

@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.utils import ranges
 
 if TYPE_CHECKING:
-    from facediff.benchmark import BenchmarkReport, Cell, Plan
+    from facediff.benchmark import BenchmarkPlan, BenchmarkReport, Cell
     from facediff.benchmark.running import Setting
     from facediff.data import SpeechMotionDataModule
 
@@ -58,7 +58,7 @@ def benchmark(
     from facediff.utils.workers import processors
 
     check_scheduler(scheduler)
-    found = read_plan(find_plan(plan), corpus_folders(root or []))
+    read = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline
     from facediff.benchmark.published import find_published
@@ -68,28 +68,30 @@ def benchmark(
     from facediff.utils.files import locked
 
     try:
-        (protocol,) = find_protocols([found.protocol])
-        parse_all(found.metrics)
-        find_published(found.published)
+        (protocol,) = find_protocols([read.protocol])
+        parse_all(read.metrics)
+        find_published(read.published)
     except FaceDiffError as error:
-        raise FaceDiffError(f"{found.file}: {error}") from error
-    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *found.metrics]
-    for column in found.columns:
+        raise FaceDiffError(f"{read.file}: {error}") from error
+    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *read.metrics]
+    for column in read.columns:
         if column not in scores:
-            raise FaceDiffError(f"{found.file}: columns: there is no score {column!r}: {choices(column, scores)}")
-    cells = cells_of(found)
-    folder = output / found.name
+            raise FaceDiffError(f"{read.file}: columns: there is no score {column!r}: {choices(column, scores)}")
+    cells = cells_of(read)
+    folder = output / read.name
     left = pending(cells, folder, retry_failed=retry_failed)
-    count = workers or found.workers or (None if is_cluster(scheduler) else max(1, processors() // found.threads))
-    setting = check_cells(found, cells, left, folder, dry_run=dry_run)
+    count = workers or read.workers or (None if is_cluster(scheduler) else max(1, processors() // read.threads))
+    setting = check_cells(read, cells, left, folder, dry_run=dry_run)
     seconds = estimate(left, folder)
-    announce(found, cells, left, seconds, count)
+    announce(read, cells, left, seconds, count)
     if dry_run:
         return 0
-    command = shlex.join(["facediff", "benchmark", str(plan), *[w for each in root or [] for w in ("--root", each)]])
+    command = shlex.join(
+        ["facediff", "benchmark", str(plan), *[w for folder_option in root or [] for w in ("--root", folder_option)]]
+    )
     failed = 0
     with locked(folder / "benchmark.lock", "facediff benchmark"):
-        outline = outline_of(found, cells, command)
+        outline = outline_of(read, cells, command)
         write_outline(folder, outline)
         with closing(run_cells(left, setting, workers=count, scheduler=scheduler)) as outcomes:
             for number, (cell, outcome) in enumerate(outcomes, 1):
@@ -145,29 +147,33 @@ def report(
         if baseline is not None and baseline not in rows:
             raise FaceDiffError(f"--baseline {baseline}: {folder} has no such row: {choices(baseline, rows)}")
     for folder in folders:
-        found = write_and_tell(folder, baseline, bootstrap, level, seed, output)
+        written = write_and_tell(folder, baseline, bootstrap, level, seed, output)
         if page is not None:
             from facediff.benchmark.writing import replace_block
 
-            replace_block(page, found)
+            replace_block(page, written)
             tell(f"written: {page}")
 
 
-def corpus_folders(words: Sequence[str]) -> dict[str, Path]:
+def corpus_folders(arguments: Sequence[str]) -> dict[str, Path]:
     """Folders of corpora, from words CORPUS=FOLDER."""
-    found: dict[str, Path] = {}
-    for word in words:
+    folders: dict[str, Path] = {}
+    for word in arguments:
         name, equals, folder = word.partition("=")
         if not equals or not name or not folder:
             raise FaceDiffError(f"--root {word}: expected CORPUS=FOLDER, such as biwi=BIWI")
-        if name in found:
+        if name in folders:
             raise FaceDiffError(f"--root {word}: the corpus {name} has a folder already; give one")
-        found[name] = Path(folder)
-    return found
+        folders[name] = Path(folder)
+    return folders
 
 
 def announce(
-    plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], seconds: Mapping[Cell, float | None], workers: int | None
+    plan: BenchmarkPlan,
+    cells: Sequence[Cell],
+    left: Sequence[Cell],
+    seconds: Mapping[Cell, float | None],
+    workers: int | None,
 ) -> None:
     """Say what will run, and for how long."""
     from facediff.utils.tables import format_table
@@ -178,11 +184,11 @@ def announce(
         return
     rows = [[str(cell), cell.kind, None if seconds[cell] is None else f"{seconds[cell]:.0f} s"] for cell in left]
     tell(*format_table(["to run", "", "last time"], rows, left=2).split("\n"))
-    known = [value for value in seconds.values() if value is not None]
-    missing = len(left) - len(known)
-    if known:
+    timed = [value for value in seconds.values() if value is not None]
+    missing = len(left) - len(timed)
+    if timed:
         # With one worker the times add up; several share them, and the longest cell is the least that it takes.
-        total = max(sum(known) / (workers or 1), max(known))
+        total = max(sum(timed) / (workers or 1), max(timed))
         unknown = f", and {missing} cells that were never timed" if missing else ""
         one = "" if workers else " on one worker"
         tell(f"about {total / 60:.0f} minutes{one} by the last timings{unknown}")
@@ -200,16 +206,18 @@ def write_and_tell(
 
     outline = read_outline(folder)
     results, missing = read_results(folder, outline)
-    found = report_of(outline, results, missing, baseline=baseline, resamples=resamples, level=level, seed=seed)
-    files = write_report(found, output or folder / "report")
-    tell(*text(found).split("\n"), *(f"written: {path}" for path in files))
-    return found
+    report = report_of(outline, results, missing, baseline=baseline, resamples=resamples, level=level, seed=seed)
+    files = write_report(report, output or folder / "report")
+    tell(*text(report).split("\n"), *(f"written: {path}" for path in files))
+    return report
 
 
 # What can be found out before anything runs.
 
 
-def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder: Path, *, dry_run: bool) -> Setting:
+def check_cells(
+    plan: BenchmarkPlan, cells: Sequence[Cell], left: Sequence[Cell], folder: Path, *, dry_run: bool
+) -> Setting:
     """Parse every command that will be run, find every corpus, and make the built-in one; what all cells share.
 
     Raises:
@@ -229,17 +237,17 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
     kinds: dict[str, type[SpeechMotionDataModule]] = {}
     for cell in left:
         for training in cell.trainings:
-            made = {each.name: Path(f"{each.name}.ckpt") for each in cell.trainings}
+            checkpoints = {step.name: Path(f"{step.name}.ckpt") for step in cell.trainings}
             options = fit_options(training, {}, cell)
-            unknown = [step for step in made if f"{{{step}}}" in map(str, options.values())]
+            unknown = [step for step in checkpoints if f"{{{step}}}" in map(str, options.values())]
             options = {name: value for name, value in options.items() if value not in [f"{{{s}}}" for s in unknown]}
-            words = ["--config", str(training.config), *option_words({**options, "seed_everything": 0})]
-            mark = " ".join(words)
+            command_line = ["--config", str(training.config), *option_words({**options, "seed_everything": 0})]
+            mark = " ".join(command_line)
             if mark in seen:
                 continue
             seen.add(mark)
             try:
-                class_path, arguments = parse_fit(words)
+                class_path, arguments = parse_fit(command_line)
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
                 kinds[cell.corpus] = type(data_of(prepared, class_path, arguments, make=not dry_run))
@@ -275,14 +283,14 @@ def check_cells(plan: Plan, cells: Sequence[Cell], left: Sequence[Cell], folder:
     return replace(setting, clips=clips, truths=truths, classes=classes, roots=roots)
 
 
-def check_test_options(plan: Plan) -> None:
+def check_test_options(plan: BenchmarkPlan) -> None:
     """Refuse options of a test that would change the model: its weights fit no other."""
     from facediff.cli.lightning import FREE
 
     for options in [plan.test_options, *(method.test_options for method in plan.methods.values())]:
         for name in options:
             if name.startswith("model.") and name.split(".")[1] not in FREE:
-                free = [f"model.{each}" for each in FREE]
+                free = [f"model.{name}" for name in FREE]
                 raise FaceDiffError(f"{plan.file}: test_options: {name} is none of a test's: {choices(name, free)}")
 
 
@@ -314,11 +322,11 @@ def check_checkpoint(
             f"{path}: is of the corpus {module.corpus_name}, and the plan's is {kind.corpus_name}; name with the "
             f"method's key `corpora` those that it is of"
         )
-    given = options.get("root")
-    if given is None and module.__name__ != "Puppet":
+    corpus_root = options.get("root")
+    if corpus_root is None and module.__name__ != "Puppet":
         raise FaceDiffError(f"{path}: names no folder of its corpus; give it with --root {cell.corpus}=FOLDER")
-    if given is not None and module.__name__ != "Puppet" and not Path(str(given)).expanduser().is_dir():
-        raise FaceDiffError(f"{path}: its corpus {given} is not there; give it with --root {cell.corpus}=FOLDER")
+    if corpus_root is not None and module.__name__ != "Puppet" and not Path(str(corpus_root)).expanduser().is_dir():
+        raise FaceDiffError(f"{path}: its corpus {corpus_root} is not there; give it with --root {cell.corpus}=FOLDER")
 
 
 def read_data(path: Path) -> tuple[str, dict[str, Any]]:
@@ -344,7 +352,7 @@ def data_class(class_path: str) -> type[SpeechMotionDataModule]:
 
 
 def data_of(
-    known: dict[str, SpeechMotionDataModule], class_path: str, arguments: Mapping[str, Any], *, make: bool
+    modules: dict[str, SpeechMotionDataModule], class_path: str, arguments: Mapping[str, Any], *, make: bool
 ) -> SpeechMotionDataModule:
     """The data module of a config, each once; the built-in corpus is made, any other must be there.
 
@@ -352,8 +360,8 @@ def data_of(
         FaceDiffError: if the corpus is missing.
     """
     mark = f"{class_path} {sorted((key, str(value)) for key, value in arguments.items())}"
-    if mark in known:
-        return known[mark]
+    if mark in modules:
+        return modules[mark]
     module = data_class(class_path)
     if "root" not in arguments and module.__name__ != "Puppet":
         raise FaceDiffError(
@@ -366,7 +374,7 @@ def data_of(
         raise FaceDiffError(
             f"{data.root}: no such folder; expected the corpus {module.corpus_name}. {data.obtain}".strip()
         )
-    known[mark] = data
+    modules[mark] = data
     return data
 
 

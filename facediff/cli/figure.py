@@ -27,7 +27,7 @@ from facediff.utils.jobs import check_scheduler
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from facediff.evaluation.figures import Material, Paper
+    from facediff.evaluation.figures import FigureData, Paper
 
 NOTES = 3
 """Notes that are printed at most."""
@@ -71,7 +71,7 @@ class FileOptions:
     truth_stride: Annotated[ranges.Stride | None, Option(metavar="N")] = None
     unit: Annotated[str | None, Option(metavar="U")] = None
 
-    def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, Material]:
+    def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, FigureData]:
         """The page and what is drawn on it."""
         methods = named_folders([predictions, *(self.method or [])])
         check_folders(methods)
@@ -172,8 +172,8 @@ def frames(
             f"start, end (seconds) and ipa, or choose --times"
         )
     else:
-        found = [find_phoneme(name, spoken, chosen) for name in phonemes or []]
-        moments = [Moment(phoneme.middle, phoneme) for phoneme in found]
+        spoken_then = [find_phoneme(name, spoken, chosen) for name in phonemes or []]
+        moments = [Moment(phoneme.middle, phoneme) for phoneme in spoken_then]
     region = None
     if close_up:
         from facediff.evaluation import read_region
@@ -306,7 +306,7 @@ def lips(
         page: how it is printed.
     """
     paper, material = files.gather(predictions, truth, page)
-    from facediff.evaluation.figures import Sound, draw_lips, opening_curves, read_pairs
+    from facediff.evaluation.figures import SpeechTrack, draw_lips, opening_curves, read_pairs
     from facediff.evaluation.figures.gather import phonemes_of, sound_of
 
     chosen = material.choose([clip] if clip else None)[0]
@@ -316,7 +316,7 @@ def lips(
     if samples is None:
         notes.append(f"there is no sound of {chosen}; give --audio to have its waveform")
     phonemes = phonemes_of(material, chosen, phoneme_file)
-    sound = Sound(phonemes=phonemes) if samples is None else Sound(samples, phonemes=phonemes)
+    sound = SpeechTrack(phonemes=phonemes) if samples is None else SpeechTrack(samples, phonemes=phonemes)
     draw_lips(curves, sound, page.output, paper=paper, scale=material.scale, span=span, remark=material.remark)
     report(page.output, notes)
 

@@ -254,13 +254,13 @@ def report(
     if json == "-":
         tell(*json_report(reports).split("\n"))
     else:
-        for each in reports:
-            tell(*text(each).split("\n"), "")
+        for analysis in reports:
+            tell(*text(analysis).split("\n"), "")
     if output is not None:
         written = write_report(reports, output)
         if json != "-":
             tell(f"written: {', '.join(str(path) for path in written)}")
-    return int(any(note.startswith("set aside") for each in reports for note in each.notes))
+    return int(any(note.startswith("set aside") for analysis in reports for note in analysis.notes))
 
 
 def print_plan(
@@ -277,16 +277,16 @@ def print_plan(
     from facediff.study.report import design_of
 
     for name, folder in folders.items() or {"": None}.items():
-        known = (1, 1) if folder is None else design_of(read_study(folder))
-        each, pairs = per_rater or known[0], comparisons or known[1]
-        found = raters_needed(
-            difference, power=power, level=level, per_rater=each, correlation=correlation, comparisons=pairs
+        defaults = (1, 1) if folder is None else design_of(read_study(folder))
+        answers, pairs = per_rater or defaults[0], comparisons or defaults[1]
+        needed = raters_needed(
+            difference, power=power, level=level, per_rater=answers, correlation=correlation, comparisons=pairs
         )
         tell(
-            f"{name}{': ' if name else ''}{found.raters} raters notice a preference of {50 + 100 * difference:g} to "
+            f"{name}{': ' if name else ''}{needed.raters} raters notice a preference of {50 + 100 * difference:g} to "
             f"{50 - 100 * difference:g} with a chance of {power:.0%} at the level {level:g}",
-            f"({found.answers} independent answers to each of {pairs} comparison{'s' * (pairs != 1)}; {each} of a "
-            f"rater, correlated by {correlation:g}, count as {each / found.design_effect:.2f}; those that are not "
+            f"({needed.answers} independent answers to each of {pairs} comparison{'s' * (pairs != 1)}; {answers} of a "
+            f"rater, correlated by {correlation:g}, count as {answers / needed.design_effect:.2f}; those that are not "
             f"counted come on top)",
         )
     return 0

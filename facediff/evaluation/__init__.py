@@ -2,7 +2,7 @@
 
 from facediff.evaluation.evaluator import evaluate
 from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region
-from facediff.evaluation.report import Comparison, Interval, MethodResult, Report, Score, SequenceScores, text
+from facediff.evaluation.report import Comparison, EvaluationReport, Interval, MethodResult, Score, SequenceScores, text
 
 __all__ = [
     "DEFAULT_PATTERNS",
@@ -11,7 +11,7 @@ __all__ = [
     "Interval",
     "MethodResult",
     "Missing",
-    "Report",
+    "EvaluationReport",
     "Score",
     "SequenceScores",
     "evaluate",

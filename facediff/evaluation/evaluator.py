@@ -25,7 +25,7 @@ from facediff.evaluation.files import (
     read_pairs,
 )
 from facediff.evaluation.groups import attributes_of
-from facediff.evaluation.report import Bootstrap, MethodTable, Report, runs_of
+from facediff.evaluation.report import Bootstrap, EvaluationReport, MethodTable, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
@@ -61,7 +61,7 @@ def evaluate(
     workers: ranges.Workers | None = None,
     scheduler: str | None = "",
     progress: bool = False,
-) -> Report:
+) -> EvaluationReport:
     """Score the files of one or several methods against the truth.
 
     Files hold absolute vertices, (T, V, 3) or (T, 3V), of any floating-point type. They are memory-mapped, and of each
@@ -116,7 +116,7 @@ def evaluate(
         lip_pairs = read_pairs(None, corpus, n_vertices)
     if eyelid_pairs is None and "lid_pairs" in needed and corpus is not None and (corpus / EYELID_PAIRS).is_file():
         eyelid_pairs = read_pairs(None, corpus, n_vertices, EyelidPairs)
-    material = Material(corpus if requests else None, frame_rate, sorted({name.subject for name in names.values()}))
+    material = CorpusInputs(corpus if requests else None, frame_rate, sorted({name.subject for name in names.values()}))
     context = material.context(
         lips, upper_face, lip_pairs, eyelid_pairs, templated=bool(templates), every_condition=identity == ALL
     )
@@ -139,18 +139,18 @@ def evaluate(
         paired[method] = pairs, replace(missing, unnamed=unnamed)
     jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
     reads = [Path(truth), *map(Path, methods.values()), *([] if corpus is None else [corpus])]
-    found = score_all(scorer, jobs, workers, scheduler=scheduler, reads=reads, progress=progress)
+    scores_by_method = score_all(scorer, jobs, workers, scheduler=scheduler, reads=reads, progress=progress)
     tables = [
-        MethodTable(method, str(methods[method]), pairs, missing, found.get(method, {}), scorer.columns)
+        MethodTable(method, str(methods[method]), pairs, missing, scores_by_method.get(method, {}), scorer.columns)
         for method, (pairs, missing) in paired.items()
     ]
     attributes = attributes_of(corpus, names_of(paired), by) if by else {}
     definitions = {setting.name: setting.describe() for setting in settings}
     if chosen:
-        words = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
-        definitions[METRICS] = "\n".join(["further metrics", *words])
+        lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
+        definitions[METRICS] = "\n".join(["further metrics", *lines])
     results = [table.result(sampling, attributes) for table in tables]
-    return Report(
+    return EvaluationReport(
         truth=str(truth),
         lips=lips,
         upper_face=upper_face if needs_upper_face(settings, metrics) else None,
@@ -183,7 +183,7 @@ def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> b
 
 
 @dataclass(frozen=True)
-class Material:
+class CorpusInputs:
     """What metrics may read of a corpus in addition to motion."""
 
     corpus: Path | None
@@ -243,31 +243,31 @@ class Material:
         Raises:
             FaceDiffError: if a file of the clip is missing or damaged.
         """
-        found: dict[str, Any] = {}
+        inputs: dict[str, Any] = {}
         if "identities" in needed:
-            found["identities"] = [self.identities.index(pair.truth.name.subject)]
+            inputs["identities"] = [self.identities.index(pair.truth.name.subject)]
         clip = pair.truth.path.stem
         if "speech" in needed and self.corpus is not None:
-            found["waveform"] = torch.from_numpy(read_speech(self.corpus / "wav" / f"{clip}.wav"))
+            inputs["waveform"] = torch.from_numpy(read_speech(self.corpus / "wav" / f"{clip}.wav"))
         if "closures" in needed and self.frame_rate is not None:
             file = phonemes_file(self.corpus, clip)
-            found["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
-        return found
+            inputs["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
+        return inputs
 
 
-def find_protocols(wanted: Sequence[str | Protocol], topology: str | None = None) -> list[Protocol]:
+def find_protocols(protocols: Sequence[str | Protocol], topology: str | None = None) -> list[Protocol]:
     """Protocols by name, or one's own; each once.
 
     Raises:
         FaceDiffError: if there is no protocol or topology of that name, or two protocols share a name.
     """
-    found: dict[str, Protocol] = {}
-    for each in wanted:
+    settings: dict[str, Protocol] = {}
+    for name in protocols:
         try:
-            setting = protocol(each) if isinstance(each, str) else each
+            setting = protocol(name) if isinstance(name, str) else name
             setting = setting if topology is None else replace(setting, topology=topology)
         except ValueError as error:
             raise FaceDiffError(str(error)) from error
-        if found.setdefault(setting.name, setting) != setting:
+        if settings.setdefault(setting.name, setting) != setting:
             raise FaceDiffError(f"two different protocols are called {setting.name}; give one another name")
-    return list(found.values())
+    return list(settings.values())

@@ -62,8 +62,8 @@ class NamePattern:
                 f"{pattern}: a pattern of file names has {{subject}} and {{sentence}} once each, may have "
                 f"{{identity}} once, and has no other field"
             )
-        known = "|".join(re.escape(name) for name in sorted(subjects, key=len, reverse=True))
-        readings = [{"subject": known, "sentence": "[^/]+"}] if known else []
+        speakers = "|".join(re.escape(name) for name in sorted(subjects, key=len, reverse=True))
+        readings = [{"subject": speakers, "sentence": "[^/]+"}] if speakers else []
         if "identity" in fields and fields.index("subject") < fields.index("identity"):
             readings.append({"subject": "[^/]+", "sentence": "[^/]+", "identity": "(?P=subject)"})
         readings += [{"subject": "[^/]+", "sentence": "[^/_]+"}, {"subject": "[^/]+", "sentence": "[^/]+"}]
@@ -79,8 +79,8 @@ class NamePattern:
 
     def match(self, name: str) -> Name | None:
         """The fields of a name; None if it is not of this pattern."""
-        found = next((found for reading in self._readings if (found := reading.fullmatch(name))), None)
-        return Name(**found.groupdict()) if found else None
+        match = next((match for reading in self._readings if (match := reading.fullmatch(name))), None)
+        return Name(**match.groupdict()) if match else None
 
 
 def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path, Name], list[str]]:
@@ -97,7 +97,7 @@ def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path
     files = sorted(file for file in folder.glob("**/*.npy" if deep else "*.npy") if not file.name.startswith("."))
     if not files:
         raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
-    found: dict[Path, Name] = {}
+    names: dict[Path, Name] = {}
     unnamed = []
     for file in files:
         name = file.relative_to(folder).as_posix().removesuffix(".npy")
@@ -105,8 +105,8 @@ def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path
         if read is None:
             unnamed.append(f"{name}.npy")
         else:
-            found[file] = read
-    return found, unnamed
+            names[file] = read
+    return names, unnamed
 
 
 # Pairing: which prediction belongs to which truth, and what has no counterpart.
@@ -196,8 +196,8 @@ def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], ident
         if identity == ALL:  # "" stands for a name without a condition
             chosen = sorted(name for name in there if name) or list(there)
         else:
-            wanted = own.get(clip, "") if identity == OWN else identity
-            chosen = [wanted] if wanted in there else []
+            asked_for = own.get(clip, "") if identity == OWN else identity
+            chosen = [asked_for] if asked_for in there else []
         missing.unused.extend(sorted(path.name for name, path in there.items() if name not in chosen))
         if chosen:
             pairs.append(Pair(clip, truth, {name: there[name] for name in chosen}))
@@ -272,8 +272,8 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     if source is None and folder is None:
         raise FaceDiffError(f"nothing says which vertices are the {named}; {advice}")
     root = folder or Path()
-    files = {each: root / each.partition(">")[0].partition(":")[0] for each in ([source] if source else USUAL[part])}
-    chosen = next((each for each, path in files.items() if each == ALL or path.is_file()), None)
+    files = {name: root / name.partition(">")[0].partition(":")[0] for name in ([source] if source else USUAL[part])}
+    chosen = next((name for name, path in files.items() if name == ALL or path.is_file()), None)
     if chosen is None:
         raise FaceDiffError(f"{' and '.join(map(str, files.values()))}: not there; expected the {named}; {advice}")
     file, above, threshold = chosen.partition(">")

@@ -26,13 +26,17 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
         FaceDiffError: if no clip has one of them.
     """
     table = {} if corpus is None else read_clip_table(corpus)
-    found = {name: table[name] if name in table else said_by_name(name) for name in names}
-    known = sorted({attribute for attributes in found.values() for attribute in attributes})
+    by_clip = {name: table[name] if name in table else said_by_name(name) for name in names}
+    available = sorted({attribute for attributes in by_clip.values() for attribute in attributes})
     for attribute in by:
-        if attribute not in known:
-            offered = choices(attribute, known) if known else "list them in the columns of the corpus's clips.csv"
+        if attribute not in available:
+            offered = (
+                choices(attribute, available) if available else "list them in the columns of the corpus's clips.csv"
+            )
             raise FaceDiffError(f"--by {attribute}: no clip has it: {offered}")
-    return {name: {each: attributes.get(each, "") for each in by} for name, attributes in found.items()}
+    return {
+        name: {attribute: attributes.get(attribute, "") for attribute in by} for name, attributes in by_clip.items()
+    }
 
 
 def said_by_name(name: str) -> Mapping[str, str]:

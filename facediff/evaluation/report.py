@@ -121,7 +121,7 @@ class Runs:
 
 
 @dataclass(frozen=True)
-class Group:
+class GroupScores:
     """The scores of one method over clips whose attributes are equal."""
 
     method: str
@@ -131,7 +131,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Report:
+class EvaluationReport:
     """What an evaluation found."""
 
     truth: str  # the folder of truths
@@ -147,7 +147,7 @@ class Report:
     seed: int
     methods: list[MethodResult]  # the results, in the order asked for
     comparisons: list[Comparison]  # every further method against the first
-    groups: list[Group]  # scores by the attributes asked for, method by method
+    groups: list[GroupScores]  # scores by the attributes asked for, method by method
     unnamed_truths: list[str]  # files among the truths whose names do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
     runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
@@ -270,16 +270,16 @@ class MethodTable:
         folder: str,
         pairs: Sequence[Pair],
         missing: Missing,
-        found: Mapping[str, ClipScores | str],
+        clip_scores: Mapping[str, ClipScores | str],
         columns: Sequence[Column],
     ) -> None:
         self.name = name
         self.folder = folder
         self.columns = columns
-        unusable = {clip: reason for clip, reason in sorted(found.items()) if isinstance(reason, str)}
+        unusable = {clip: reason for clip, reason in sorted(clip_scores.items()) if isinstance(reason, str)}
         self.missing = replace(missing, unusable=unusable)
         self.provenance = read_provenance(Path(folder))
-        self.rows = [(pair, scores) for pair in pairs if isinstance(scores := found[pair.clip], ClipScores)]
+        self.rows = [(pair, scores) for pair in pairs if isinstance(scores := clip_scores[pair.clip], ClipScores)]
         if not self.rows:
             raise FaceDiffError(f"{folder}: {_why_nothing(self.missing)}")
         self.clips = [pair.clip for pair, _ in self.rows]
@@ -289,13 +289,13 @@ class MethodTable:
         self.weights: Array = np.where(np.isnan(values), 0.0, weights)
         self.values: Array = np.nan_to_num(values)
 
-    def groups(self, attributes: Mapping[str, dict[str, str]]) -> list[Group]:
+    def groups(self, attributes: Mapping[str, dict[str, str]]) -> list[GroupScores]:
         """The scores of clips with equal attributes, by the name of the truth's file; pooled as over all clips."""
         rows: dict[tuple[str, ...], list[int]] = {}
         for place, (pair, _) in enumerate(self.rows):
             if pair.truth.path.stem in attributes:
                 rows.setdefault(tuple(attributes[pair.truth.path.stem].values()), []).append(place)
-        found = []
+        groups = []
         for key in sorted(rows):
             chosen = rows[key]
             names = attributes[self.rows[chosen[0]][0].truth.path.stem]
@@ -306,8 +306,8 @@ class MethodTable:
                 )
                 if column.metric not in self.rows[0][1].states
             }
-            found.append(Group(self.name, dict(zip(names, key, strict=True)), len(chosen), scores))
-        return found
+            groups.append(GroupScores(self.name, dict(zip(names, key, strict=True)), len(chosen), scores))
+        return groups
 
     def result(self, bootstrap: Bootstrap, attributes: Mapping[str, dict[str, str]] | None = None) -> MethodResult:
         """The scores with their intervals, and the values of each clip."""
@@ -426,18 +426,18 @@ def runs_of(methods: Sequence[MethodResult]) -> list[Runs]:
             kinds.append([method])
         else:
             kind.append(method)
-    found = []
+    runs = []
     for kind in [kind for kind in kinds if len(kind) > 1]:
         names = tuple(method.name for method in kind)
         seeds = tuple(method.provenance.seed for method in kind if method.provenance is not None)
         for scores in zip(*(method.scores for method in kind), strict=True):
             values = np.array([score.value for score in scores])
-            found.append(
+            runs.append(
                 Runs(
                     names, seeds, scores[0].protocol, scores[0].metric, float(values.mean()), float(values.std(ddof=1))
                 )
             )
-    return found
+    return runs
 
 
 def _why_nothing(missing: Missing) -> str:
@@ -461,7 +461,7 @@ def _why_nothing(missing: Missing) -> str:
 SHOWN = 5  # Names that are listed before the rest is counted
 
 
-def text(report: Report) -> str:
+def text(report: EvaluationReport) -> str:
     """Scores by protocol, comparisons, and what was cut, skipped or missing."""
     lines = [
         f"truth {report.truth}" + (f", every {report.truth_stride}. frame" if report.truth_stride > 1 else ""),
@@ -493,13 +493,18 @@ def text(report: Report) -> str:
     return "\n".join(lines)
 
 
-def _scores(report: Report, protocol: str) -> list[str]:
+def _scores(report: EvaluationReport, protocol: str) -> list[str]:
     rows = []
     if protocol == METRICS:  # names of metrics with their options are long: one row for each
         for score in [score for score in report.methods[0].scores if score.protocol == METRICS]:
-            same = [each for method in report.methods for each in method.scores if each.name == score.name]
-            counts = "/".join(dict.fromkeys(str(each.sequences) for each in same))
-            rows.append([score.metric, *(_cell(each.value, each.interval) for each in same), counts])
+            same = [
+                score_of_method
+                for method in report.methods
+                for score_of_method in method.scores
+                if score_of_method.name == score.name
+            ]
+            counts = "/".join(dict.fromkeys(str(own.sequences) for own in same))
+            rows.append([score.metric, *(_cell(own.value, own.interval) for own in same), counts])
         return format_table(["", *(method.name for method in report.methods), "sequences"], rows).splitlines()
     for method in report.methods:
         scores = [score for score in method.scores if score.protocol == protocol]
@@ -509,7 +514,7 @@ def _scores(report: Report, protocol: str) -> list[str]:
     return format_table(["", *metrics, "frames", "sequences"], rows).splitlines()
 
 
-def _groups(report: Report, protocol: str) -> list[str]:
+def _groups(report: EvaluationReport, protocol: str) -> list[str]:
     """Scores by the attributes asked for; those of groups side by side, method by method."""
     by = list(report.groups[0].attributes) if report.groups else []
     names = [name for name in (report.groups[0].scores if by else ()) if name.partition("/")[0] == protocol]
@@ -528,33 +533,41 @@ def _groups(report: Report, protocol: str) -> list[str]:
     return [f"by {', '.join(by)}", *format_table(head, rows, left=len(by) + 1).splitlines()]
 
 
-def _comparisons(report: Report, protocol: str) -> list[str]:
+def _comparisons(report: EvaluationReport, protocol: str) -> list[str]:
     """Differences from the first method; a star where the interval does not contain zero."""
-    found = [each for each in report.comparisons if each.protocol == protocol]
-    if not found:
+    comparisons = [comparison for comparison in report.comparisons if comparison.protocol == protocol]
+    if not comparisons:
         return []
     rows: dict[str, list[str]] = {}
-    for each in found:
-        row = f"{each.method} − {each.baseline}" + (f": {each.metric}" if protocol == METRICS else "")
-        rows.setdefault(row, []).append(_cell(each.difference, each.interval, "+") + ("*" if each.starred else ""))
-    metrics = ["difference"] if protocol == METRICS else list(dict.fromkeys(each.metric for each in found))
-    counts = {each.method: str(each.sequences) for each in found}
+    for comparison in comparisons:
+        row = f"{comparison.method} − {comparison.baseline}" + (f": {comparison.metric}" if protocol == METRICS else "")
+        rows.setdefault(row, []).append(
+            _cell(comparison.difference, comparison.interval, "+") + ("*" if comparison.starred else "")
+        )
+    metrics = (
+        ["difference"] if protocol == METRICS else list(dict.fromkeys(comparison.metric for comparison in comparisons))
+    )
+    counts = {comparison.method: str(comparison.sequences) for comparison in comparisons}
     body = [[row, *cells, counts[row.partition(" − ")[0]]] for row, cells in rows.items()]
     head = "difference, over the sequences that both have (*: the interval over sentences does not contain 0)"
-    same = list(dict.fromkeys(f"{each.method} and {each.baseline}" for each in found if each.same_method))
+    same = list(
+        dict.fromkeys(
+            f"{comparison.method} and {comparison.baseline}" for comparison in comparisons if comparison.same_method
+        )
+    )
     notes = [f"{pair} are training runs of one method: their difference is chance, and has no star" for pair in same]
     return [head, *format_table(["", *metrics, "sequences"], body).splitlines(), *notes]
 
 
-def _runs(report: Report, protocol: str) -> list[str]:
+def _runs(report: EvaluationReport, protocol: str) -> list[str]:
     """Mean ± standard deviation over the training runs of a method."""
-    found = [each for each in report.runs if each.protocol == protocol]
+    repeated = [runs for runs in report.runs if runs.protocol == protocol]
     rows: dict[tuple[str, ...], list[str]] = {}
-    for each in found:
-        rows.setdefault(each.methods, []).append(f"{each.mean:.4e} ± {each.deviation:.1e}")
+    for runs in repeated:
+        rows.setdefault(runs.methods, []).append(f"{runs.mean:.4e} ± {runs.deviation:.1e}")
     if not rows:
         return []
-    metrics = list(dict.fromkeys(each.metric for each in found))
+    metrics = list(dict.fromkeys(runs.metric for runs in repeated))
     body = [[", ".join(names), *cells, str(len(names))] for names, cells in rows.items()]
     return ["over training runs (mean ± standard deviation)", *format_table(["", *metrics, "runs"], body).splitlines()]
 
@@ -563,7 +576,7 @@ def _cell(value: float, interval: Interval | None, sign: str = "") -> str:
     return f"{value:{sign}.4e}" + (f" [{interval.low:{sign}.3e}, {interval.high:{sign}.3e}]" if interval else "")
 
 
-def _left_out(report: Report) -> list[str]:
+def _left_out(report: EvaluationReport) -> list[str]:
     """What was cut, skipped or missing."""
     lines = []
     if report.unnamed_truths:
@@ -578,9 +591,9 @@ def _left_out(report: Report) -> list[str]:
 def _table_method(method: MethodResult) -> list[str]:
     missing = method.missing
     cut = [
-        f"{each.clip} (prediction {each.cut_prediction}, truth {each.cut_truth})"
-        for each in method.sequences
-        if each.cut_prediction or each.cut_truth
+        f"{sequence.clip} (prediction {sequence.cut_prediction}, truth {sequence.cut_truth})"
+        for sequence in method.sequences
+        if sequence.cut_prediction or sequence.cut_truth
     ]
     listed = {
         "frames cut": cut,

@@ -176,8 +176,8 @@ class Scorer:
             self._score(pair.predictions[condition].stem, prediction, truth, template)
             for condition, prediction in predictions.items()
         ]
-        weights = np.array([each.weights for each in done])
-        values = np.array([each.values for each in done])
+        weights = np.array([scores.weights for scores in done])
+        values = np.array([scores.values for scores in done])
         by_frames = np.array([column.pooling == "frames" for column in self.columns[: values.shape[1]]])
         # A condition's share of the clip is its frames where all frames count alike; they differ only if one was cut.
         shares = np.where(by_frames, weights, 1.0)
@@ -185,9 +185,9 @@ class Scorer:
         return ClipScores(
             (*((values * shares).sum(0) / shares.sum(0)).tolist(), *(value for value, _ in further)),
             (*weights.mean(0).tolist(), *(weight for _, weight in further)),
-            sum(each.frames for each in done),
-            sum(each.cut_prediction for each in done),
-            sum(each.cut_truth for each in done),
+            sum(scores.frames for scores in done),
+            sum(scores.cut_prediction for scores in done),
+            sum(scores.cut_truth for scores in done),
             states,
         )
 
@@ -199,7 +199,7 @@ class Scorer:
         Raises:
             FaceDiffError: if a metric refuses the clip.
         """
-        found: list[tuple[float, float]] = []
+        valued: list[tuple[float, float]] = []
         states: dict[str, Metric] = {}
         for name, chosen in self.chosen.items():
             one = chosen.clone()
@@ -214,13 +214,13 @@ class Scorer:
                         feed(one, inputs | {"prediction": motion, "clip_names": clip_names})
                 if not isinstance(one, SequenceMetric) or one.latest is None:
                     states[name] = one
-                    found.append((math.nan, 0.0))
+                    valued.append((math.nan, 0.0))
                     continue
                 frames, sequences = one.counts[:2].tolist()
-                found.append((one.compute().item(), frames / sequences) if sequences else (math.nan, 0.0))
+                valued.append((one.compute().item(), frames / sequences) if sequences else (math.nan, 0.0))
             except (ValueError, TypeError) as error:
                 raise FaceDiffError(f"metric {name}: {error}") from error
-        return found, states
+        return valued, states
 
     def _score(self, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> ClipScores:
         """One prediction."""
@@ -235,12 +235,12 @@ class Scorer:
                     raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
                 aligned[column.rule] = clips.attach("template", [template])
         first = next(iter(aligned.values()))
-        found = self._values(first)
-        each = [(found[column.source], column.absolute) for column in columns]
+        by_source = self._values(first)
+        valued = [(by_source[column.source], column.absolute) for column in columns]
         frames = first.clips[0].frames
         return ClipScores(
-            tuple(abs(value) if absolute else value for value, absolute in each),
-            (float(frames),) * len(each),
+            tuple(abs(value) if absolute else value for value, absolute in valued),
+            (float(frames),) * len(valued),
             frames,
             first.cut_prediction,
             first.cut_truth,
@@ -264,16 +264,16 @@ class Scorer:
             template=clip.template,
             uppers=[metric.indices for metric in dynamics.values()],
         )
-        found = dict(zip([*errors, *dynamics], torch.stack([*means, *deviations]).tolist(), strict=True))
+        by_source = dict(zip([*errors, *dynamics], torch.stack([*means, *deviations]).tolist(), strict=True))
         # An error over all vertices is finite only if every value of the frames is: the clip need not be read again.
-        whole = [found[source] for source, metric in errors.items() if metric.region is None]
-        if not whole or not all(map(math.isfinite, found.values())):
+        whole = [by_source[source] for source, metric in errors.items() if metric.region is None]
+        if not whole or not all(map(math.isfinite, by_source.values())):
             try:
                 clips.check_finite()
             except ValueError as error:
                 raise FaceDiffError(f"protocol {self.columns[0].protocol}: {error}") from error
-        others = self.metrics.keys() - found.keys()
-        return found | {source: float(self.metrics[source].clip_value(clip)) for source in others}
+        others = self.metrics.keys() - by_source.keys()
+        return by_source | {source: float(self.metrics[source].clip_value(clip)) for source in others}
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
@@ -320,7 +320,7 @@ def score_all(
     Raises:
         FaceDiffError: the first that a clip raises; clips not yet begun are left.
     """
-    found: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
+    by_method: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
     results = run_tasks(
         partial(_score_job, scorer),
         jobs,
@@ -334,8 +334,8 @@ def score_all(
         for (method, pair), scores in results:
             if isinstance(scores, WorkerDied):
                 scores = "killed the process that scored it, perhaps for lack of memory"  # noqa: PLW2901
-            found[method][pair.clip] = scores
-    return found
+            by_method[method][pair.clip] = scores
+    return by_method
 
 
 def _score_job(scorer: Scorer, job: tuple[str, Pair]) -> ClipScores | str:

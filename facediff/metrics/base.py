@@ -52,7 +52,7 @@ SIDE_WORDS: dict[Side, str] = {
 }
 
 
-def check_option(name: str, value: object, known: Any) -> None:  # noqa: ANN401 - a Literal has no type of its own
+def check_option(name: str, value: object, allowed: Any) -> None:  # noqa: ANN401 - a Literal has no type of its own
     """Refuse a value that is not among the known ones, a ``Literal`` type or strings.
 
     >>> check_option("pooling", "frame", Pooling)
@@ -60,9 +60,9 @@ def check_option(name: str, value: object, known: Any) -> None:  # noqa: ANN401 
     ...
     ValueError: unknown pooling 'frame': did you mean "frames"? known are frames, sequences
     """
-    words = get_args(known) or tuple(known)
-    if value not in words:
-        raise ValueError(f"unknown {name} {value!r}: {choices(str(value), words)}")
+    names = get_args(allowed) or tuple(allowed)
+    if value not in names:
+        raise ValueError(f"unknown {name} {value!r}: {choices(str(value), names)}")
 
 
 # From padded batches to pairs of sequences that can be compared frame by frame.
@@ -122,11 +122,11 @@ class Clips:
             raise ValueError(
                 f"{name} has shape {tuple(template.shape)}; expected {(batch, vertices, 3)} or {(vertices, 3)}"
             )
-        each = list(template.detach().expand(batch, vertices, 3))
-        for clip, neutral in zip(self.clips, each, strict=True):
+        templates = list(template.detach().expand(batch, vertices, 3))
+        for clip, neutral in zip(self.clips, templates, strict=True):
             if not bool(neutral.isfinite().all()):
                 raise NotFiniteError(f"the template of {clip.name} holds NaN or infinity; repair or omit this clip")
-        return self.attach("template", each)
+        return self.attach("template", templates)
 
     def check_finite(self) -> None:
         """Refuse NaN and infinity in the frames that are scored.
@@ -212,8 +212,8 @@ def align(
     if len(names) != batch:
         raise ValueError(f"{len(names)} clip_names for {batch} sequences; give one per sequence")
     valid = _valid_frames("lengths", lengths, truth)
-    given = prediction_lengths if prediction_lengths is not None else lengths
-    predicted = _valid_frames("prediction_lengths", given, prediction)
+    effective_lengths = prediction_lengths if prediction_lengths is not None else lengths
+    predicted = _valid_frames("prediction_lengths", effective_lengths, prediction)
     clips, cut_prediction, cut_truth = [], 0, 0
     for place, (name, theirs, ours) in enumerate(zip(names, valid, predicted, strict=True)):
         refused = ours < theirs if rule == "prediction" else ours != theirs
@@ -246,11 +246,11 @@ def _valid_frames(name: str, lengths: Lengths | None, motion: Tensor) -> list[in
             raise ValueError(f"the mask {name} must be true from the first frame on, without gaps")
     if values.is_floating_point() or values.ndim > 1 or values.numel() != batch:
         raise ValueError(f"{name} must hold {batch} whole numbers, one per sequence, not {tuple(values.shape)}")
-    found: list[int] = values.reshape(-1).tolist()
-    for value in found:
+    frames: list[int] = values.reshape(-1).tolist()
+    for value in frames:
         if not 0 <= value <= padded:
             raise ValueError(f"{name} holds {value}; the motion has {padded} frames, so 0 to {padded} can be valid")
-    return found
+    return frames
 
 
 # The classes from which metrics are derived.
@@ -275,7 +275,7 @@ class SequenceOptions(FiniteOptions, total=False):
     length_rule: LengthRule
 
 
-class BatchOptions(TypedDict, total=False):
+class UpdateOptions(TypedDict, total=False):
     """What every `update` takes in addition to motion; see `SequenceMetric.update`."""
 
     lengths: Lengths | None
@@ -283,15 +283,17 @@ class BatchOptions(TypedDict, total=False):
     clip_names: Sequence[str] | None
 
 
-_PACKED = {each.__name__: each for each in (ProcessOptions, FiniteOptions, SequenceOptions, BatchOptions)}
+_PACKED = {each.__name__: each for each in (ProcessOptions, FiniteOptions, SequenceOptions, UpdateOptions)}
 
 
 def _full_signature(cls: type, name: str) -> inspect.Signature:
     """A method's signature in which ``**options: Unpack[…]`` is written out, with the defaults of the base classes."""
-    known: dict[str, inspect.Parameter] = {}
+    inherited: dict[str, inspect.Parameter] = {}
     bases = [vars(base)[name] for base in cls.__mro__[1:] if issubclass(base, ExactMetric) and name in vars(base)]
     for source in (*bases, align):
-        known |= {key: each for key, each in inspect.signature(source).parameters.items() if key not in known}
+        inherited |= {
+            key: parameter for key, parameter in inspect.signature(source).parameters.items() if key not in inherited
+        }
     signature = inspect.signature(vars(cls)[name])
     written: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
@@ -299,7 +301,7 @@ def _full_signature(cls: type, name: str) -> inspect.Signature:
         if parameter.kind is not inspect.Parameter.VAR_KEYWORD or packed is None:
             written.append(parameter)
         else:
-            written += [known[key] for key in known if key in packed.__annotations__]
+            written += [inherited[key] for key in inherited if key in packed.__annotations__]
     return signature.replace(parameters=written)
 
 
@@ -447,9 +449,9 @@ class SequenceMetric(ExactMetric):
         check_option("pooling", pooling, Pooling)
         check_option("length rule", length_rule, LengthRule)
         named = None if region is None else as_region(region, "vertices")
-        words = (definition or self.words).replace("{pooling}", POOLING_WORDS[pooling])
-        words = words.replace("{region}", "all vertices" if named is None else str(named))
-        super().__init__(definition=words, settings=length_rule, **kwargs)
+        definition = (definition or self.words).replace("{pooling}", POOLING_WORDS[pooling])
+        definition = definition.replace("{region}", "all vertices" if named is None else str(named))
+        super().__init__(definition=definition, settings=length_rule, **kwargs)
         self.pooling: Pooling = pooling
         self.length_rule: LengthRule = length_rule
         self.check_finite = check_finite
@@ -477,7 +479,7 @@ class SequenceMetric(ExactMetric):
         if self.over is not None:
             self.over.check(n_vertices)
 
-    def update(self, prediction: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
+    def update(self, prediction: Tensor, truth: Tensor, **batch: Unpack[UpdateOptions]) -> None:
         """Add a batch of sequences.
 
         Args:
@@ -494,7 +496,7 @@ class SequenceMetric(ExactMetric):
         """
         self.add(self.align(prediction, truth, **batch))
 
-    def align(self, prediction: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> Clips:
+    def align(self, prediction: Tensor, truth: Tensor, **batch: Unpack[UpdateOptions]) -> Clips:
         """The sequences of a batch as the metric's length rule cuts them; see `update`."""
         return align(prediction, truth, rule=self.length_rule, **batch)
 
@@ -585,23 +587,23 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
     Returns:
         A function of proper name, signature and docstring, which returns a float64 scalar.
     """
-    made = inspect.signature(metric).parameters
+    constructor = inspect.signature(metric).parameters
     updated = {name: p for name, p in inspect.signature(metric.update).parameters.items() if name != "self"}
     by_place = inspect.Parameter.POSITIONAL_OR_KEYWORD
     order: dict[str, inspect.Parameter] = {name: p for name, p in updated.items() if p.kind is by_place}
-    order |= {name: p for name, p in made.items() if p.kind is by_place and name not in metric.inferred}
+    order |= {name: p for name, p in constructor.items() if p.kind is by_place and name not in metric.inferred}
     order |= {name: updated[name].replace(kind=by_place, default=inspect.Parameter.empty) for name in positional}
-    for name, parameter in (updated | made).items():
+    for name, parameter in (updated | constructor).items():
         internal = parameter.kind is inspect.Parameter.VAR_KEYWORD or name in _NOT_IN_FUNCTIONS
         if name not in order and name not in metric.inferred and not internal:
             order[name] = parameter
     signature = inspect.Signature(list(order.values()), return_annotation=Tensor)
 
     def function(*args: Any, **kwargs: Any) -> Tensor:  # noqa: ANN401
-        given = signature.bind(*args, **kwargs).arguments
-        options = {name: given[name] for name in given if name in made}
-        options |= {name: infer(given) for name, infer in metric.inferred.items()}
-        batch = {name: as_tensor(given[name]) for name in given if name in updated}
+        arguments = signature.bind(*args, **kwargs).arguments
+        options = {name: arguments[name] for name in arguments if name in constructor}
+        options |= {name: infer(arguments) for name, infer in metric.inferred.items()}
+        batch = {name: as_tensor(arguments[name]) for name in arguments if name in updated}
         device = next((value.device for value in batch.values() if isinstance(value, Tensor)), None)
         one = metric(**options, sync_on_compute=False).to(device)
         one.update(**batch)

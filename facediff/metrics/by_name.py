@@ -86,7 +86,7 @@ class Request:
             raise FaceDiffError(f"metric {self.text}: needs {reasons}")
         implementation = metrics.get(self.name)
         accepted = inspect.signature(implementation).parameters
-        given = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
+        arguments = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
         options = dict(self.options)
         region = options.get("region")
         if isinstance(region, str):  # a region that is given as an option by the name of its need
@@ -95,7 +95,7 @@ class Request:
                 raise FaceDiffError(f"metric {self.text}: there is no region {region!r}: {choices(region, regions)}")
             options["region"] = regions[region]
         try:
-            return cast(Metric, implementation(**given | options))
+            return cast(Metric, implementation(**arguments | options))
         except (TypeError, ValueError) as error:
             raise FaceDiffError(f"metric {self.text}: {error}") from error
 

@@ -65,11 +65,11 @@ class BlinkMetric(OpeningMetric, RatioMetric):
         if not isinstance(pairs, EyelidPairs):
             bare = pairs.pairs if isinstance(pairs, LipPairs) else pairs
             pairs = EyelidPairs.from_pairs("eyelid pairs", bare)
-        words = (
+        definition = (
             f"{definition}, a blink being a rise of 1 − opening / median opening of the sequence above {closed:g} "
             f"after it was below {reopened:g}, an opening the mean distance of {{pairs}}"
         )
-        super().__init__(pairs, definition=words, **options)
+        super().__init__(pairs, definition=definition, **options)
         self.closed = closed
         self.reopened = reopened
 
@@ -106,8 +106,8 @@ class BlinkRateRatio(BlinkMetric):
         reopened: float = REOPENED,
         **options: Unpack[SequenceOptions],
     ) -> None:
-        words = "blinks of the prediction over blinks of the truth"
-        super().__init__(pairs, definition=words, closed=closed, reopened=reopened, **options)
+        definition = "blinks of the prediction over blinks of the truth"
+        super().__init__(pairs, definition=definition, closed=closed, reopened=reopened, **options)
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Blinks of either side of one sequence."""
@@ -149,8 +149,8 @@ class BlinkRate(BlinkMetric):
         check_option("of", of, Blinker)
         if frames_per_second is None or not frames_per_second > 0:
             raise ValueError(f"frames_per_second is {frames_per_second}; a rate a minute needs the motion's, above 0")
-        words = f"blinks of the {of} over minutes at {frames_per_second:g} frames a second"
-        super().__init__(pairs, definition=words, closed=closed, reopened=reopened, **options)
+        definition = f"blinks of the {of} over minutes at {frames_per_second:g} frames a second"
+        super().__init__(pairs, definition=definition, closed=closed, reopened=reopened, **options)
         self.frames_per_second = frames_per_second
         self.of: Blinker = of
 

@@ -39,8 +39,8 @@ class RatioMetric(SequenceMetric):
     parts: Tensor
 
     def __init__(self, region: RegionLike | None = None, *, definition: str, **options: Any) -> None:  # noqa: ANN401 - the next base's
-        words = f"{definition}; ratio of sums over all sequences [{self.unit}]"
-        super().__init__(definition=words, region=region, **options)
+        definition = f"{definition}; ratio of sums over all sequences [{self.unit}]"
+        super().__init__(definition=definition, region=region, **options)
         self.add_state("parts", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
         self._latest_parts: list[Tensor] = []
 
@@ -98,8 +98,8 @@ class MotionLiveliness(RatioMetric):
     divides_by = "the truth does not move in any sequence"
 
     def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
-        words = "root of the prediction's variance over time, over that of the truth, over {region}"
-        super().__init__(region, definition=words, **options)
+        definition = "root of the prediction's variance over time, over that of the truth, over {region}"
+        super().__init__(region, definition=definition, **options)
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Summed squared distance of each side from its own mean over time."""
@@ -140,15 +140,17 @@ class SpectrumDistance(SequenceMetric):
     ) -> None:
         if octaves < 1:
             raise ValueError(f"octaves={octaves}: expected 1 or more")
-        words = f"mean over {octaves} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
-        super().__init__(definition=words, region=region, **options)
+        definition = (
+            f"mean over {octaves} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
+        )
+        super().__init__(definition=definition, region=region, **options)
         self.octaves = octaves
         self.add_state("powers", torch.zeros(2, octaves, dtype=torch.float64), dist_reduce_fx="sum")
         self._latest_powers: list[Tensor] = []
 
     def clip_powers(self, clip: Clip) -> Tensor:
         """Power of prediction and truth in each octave, the quickest first, of one sequence (2, octaves), float64."""
-        found = []
+        powers = []
         for side in (clip.prediction, clip.truth):
             motion = _of(side, self.indices).flatten(1)
             frames = len(motion)
@@ -160,8 +162,8 @@ class SpectrumDistance(SequenceMetric):
             share = 2 * torch.fft.fftfreq(frames, dtype=torch.float64, device=motion.device).abs()
             octave = (-share.clamp_min(1e-9).log2()).floor().clamp_max(self.octaves - 1).long()
             power[0] = 0.0  # what windowing leaves of the mean
-            found.append(power.new_zeros(self.octaves).index_add(0, octave, power))
-        return torch.stack(found)
+            powers.append(power.new_zeros(self.octaves).index_add(0, octave, power))
+        return torch.stack(powers)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The score of one sequence."""
@@ -223,8 +225,10 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
     def __init__(
         self, region: RegionLike | None = None, *, n_samples: int = 4, **options: Unpack[SequenceOptions]
     ) -> None:
-        words = f"of {n_samples} samples, mean distance between two of them, over that between one and the truth, over "
-        super().__init__(n_samples=n_samples, region=region, definition=f"{words}{{region}}", **options)
+        definition = (
+            f"of {n_samples} samples, mean distance between two of them, over that between one and the truth, over "
+        )
+        super().__init__(n_samples=n_samples, region=region, definition=f"{definition}{{region}}", **options)
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Distances between samples, and between samples and truth, summed over frames."""
@@ -276,8 +280,8 @@ class EnergyScore(OfSamples):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Unit)
-        words = f"energy score of {n_samples} samples, vectors being {of} of {{region}}; {{pooling}} [unit]"
-        super().__init__(n_samples=n_samples, definition=words, pooling=pooling, region=region, **options)
+        definition = f"energy score of {n_samples} samples, vectors being {of} of {{region}}; {{pooling}} [unit]"
+        super().__init__(n_samples=n_samples, definition=definition, pooling=pooling, region=region, **options)
         self.of: Unit = of
 
     def clip_value(self, clip: Clip) -> Tensor:

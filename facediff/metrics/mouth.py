@@ -16,7 +16,6 @@ from torch import Tensor
 
 from facediff.metrics.base import (
     SIDE_WORDS,
-    BatchOptions,
     Clip,
     Clips,
     LipMetric,
@@ -24,6 +23,7 @@ from facediff.metrics.base import (
     SequenceMetric,
     SequenceOptions,
     Side,
+    UpdateOptions,
     check_option,
     functional,
 )
@@ -68,8 +68,8 @@ def correlation(reference: Tensor, other: Tensor) -> Tensor:
         return torch.full((), torch.nan, dtype=torch.float64, device=reference.device)
     first, second = reference - reference.mean(), other - other.mean()
     scale = (first.square().sum() * second.square().sum()).sqrt()
-    found = ((first * second).sum() / scale).clamp(-1, 1)
-    return torch.where(_steady(reference), torch.nan, torch.where(_steady(other), 0.0, found))
+    coefficient = ((first * second).sum() / scale).clamp(-1, 1)
+    return torch.where(_steady(reference), torch.nan, torch.where(_steady(other), 0.0, coefficient))
 
 
 def _steady(series: Tensor) -> Tensor:
@@ -99,8 +99,8 @@ class OpeningMetric(SequenceMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         named = as_lip_pairs(pairs)
-        words = (definition or self.words).replace("{pairs}", str(named))
-        super().__init__(definition=words, pooling=pooling, **options)
+        definition = (definition or self.words).replace("{pairs}", str(named))
+        super().__init__(definition=definition, pooling=pooling, **options)
         self.pairs = named
         self.pair_indices: Tensor
         self.register_buffer("pair_indices", named.tensor(), persistent=False)
@@ -118,7 +118,7 @@ class OpeningMetric(SequenceMetric):
         return predicted, true
 
     def update(
-        self, prediction: Tensor, truth: Tensor, *, offsets_from: Tensor | None = None, **batch: Unpack[BatchOptions]
+        self, prediction: Tensor, truth: Tensor, *, offsets_from: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
         """Add a batch of sequences.
 
@@ -158,11 +158,11 @@ class MouthOpeningDifference(OpeningMetric):
     higher_is_better = False
 
     def __init__(self, pairs: LipPairsLike, *, pooling: Pooling = "frames", **options: Unpack[SequenceOptions]) -> None:
-        words = (
+        definition = (
             "in each frame the difference between the openings of the mouth, an opening being the mean "
             "distance of {pairs}; {pooling} [unit]"
         )
-        super().__init__(pairs, definition=words, pooling=pooling, **options)
+        super().__init__(pairs, definition=definition, pooling=pooling, **options)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The difference of one sequence, mean over its frames."""
@@ -295,11 +295,11 @@ class BilabialClosureRate(OpeningMetric):
         if not 0 <= threshold <= 1:
             raise ValueError(f"threshold is {threshold:g}; expected a share of the truth's opening range, 0 to 1")
         over = "all sequences" if pooling == "frames" else "each sequence, then mean over sequences"
-        words = (
+        definition = (
             f"share of {COUNTED_WORDS[count]}, {SIDE_WORDS[of]}; closed is an opening (mean distance of {{pairs}}) up "
             f"to the truth's smallest of the sequence plus {threshold:g} of its range; over {over} [1]"
         )
-        super().__init__(pairs, definition=words, pooling=pooling, **options)
+        super().__init__(pairs, definition=definition, pooling=pooling, **options)
         self.threshold = threshold
         self.count: Counted = count
         self.of: Side = of
@@ -316,8 +316,8 @@ class BilabialClosureRate(OpeningMetric):
         def rate(series: Tensor) -> Tensor:
             before = torch.cat([bounds.new_zeros(1), (series <= limit).cumsum(0)])
             hits = before[bounds[:, 1]] - before[bounds[:, 0]]  # closed frames of each closure
-            found = hits.sum() if self.count == "frames" else (hits > 0).sum()
-            return found.double() / self.clip_weight(clip)
+            closed = hits.sum() if self.count == "frames" else (hits > 0).sum()
+            return closed.double() / self.clip_weight(clip)
 
         if self.of == "gap":
             return rate(predicted) - rate(true)
@@ -334,7 +334,7 @@ class BilabialClosureRate(OpeningMetric):
         *,
         closures: Closures | None = None,
         offsets_from: Tensor | None = None,
-        **batch: Unpack[BatchOptions],
+        **batch: Unpack[UpdateOptions],
     ) -> None:
         """Add a batch of sequences.
 
@@ -367,22 +367,22 @@ def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: b
                 f"closures must be a boolean mask of shape {shape} or lists of intervals, not "
                 f"{closures.dtype} of shape {tuple(closures.shape)}"
             )
-        given: list[object] = []
+        by_clip: list[object] = []
         for row in closures.reshape(count, padded).tolist():
             framed = [False, *row, False]
             edges = [place for place in range(padded + 1) if framed[place] != framed[place + 1]]
-            given.append(list(zip(edges[::2], edges[1::2], strict=True)))  # runs of true values as intervals
+            by_clip.append(list(zip(edges[::2], edges[1::2], strict=True)))  # runs of true values as intervals
     else:
-        given = [closures] if single else list(closures)
-    if len(given) != count:
-        raise ValueError(f"closures of {len(given)} sequences for {count}; give a list of intervals for each")
-    checked = [_checked(clip, intervals) for clip, intervals in zip(clips.clips, given, strict=True)]
+        by_clip = [closures] if single else list(closures)
+    if len(by_clip) != count:
+        raise ValueError(f"closures of {len(by_clip)} sequences for {count}; give a list of intervals for each")
+    checked = [_checked(clip, intervals) for clip, intervals in zip(clips.clips, by_clip, strict=True)]
     return clips.attach("closures", checked)
 
 
 def _checked(clip: Clip, intervals: object) -> tuple[Interval, ...]:
     """The intervals of one clip, each checked, as far as they lie in its frames."""
-    found: list[Interval] = []
+    kept: list[Interval] = []
     earlier = 0
     for pair in intervals if isinstance(intervals, Sequence) else [intervals]:
         if not isinstance(pair, Sequence) or [type(frame) for frame in pair] != [int, int]:
@@ -395,8 +395,8 @@ def _checked(clip: Clip, intervals: object) -> tuple[Interval, ...]:
             )
         earlier = end
         if start < clip.frames:
-            found.append((start, min(end, clip.frames)))
-    return tuple(found)
+            kept.append((start, min(end, clip.frames)))
+    return tuple(kept)
 
 
 mouth_opening_difference = functional(MouthOpeningDifference)

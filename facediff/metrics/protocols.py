@@ -12,7 +12,6 @@ from torchmetrics import Metric, MetricCollection
 from facediff.metrics.base import (
     LENGTH_WORDS,
     POOLING_WORDS,
-    BatchOptions,
     Coverage,
     LengthRule,
     Pooling,
@@ -20,6 +19,7 @@ from facediff.metrics.base import (
     SequenceMetric,
     SequenceOptions,
     Sign,
+    UpdateOptions,
     align,
     check_option,
 )
@@ -82,10 +82,10 @@ class Protocol:
         pooling = POOLING_WORDS[self.pooling]
         lines = [f"protocol {self.name}: {self.source}"]
         if self.mve is not None:
-            words = vertex_error_words(reduction=self.mve, squared=self.mve_squared)
-            lines.append(f"  mve: {words.format(region='all vertices', pooling=pooling)}")
-        words = vertex_error_words(reduction="max", squared=self.lve_squared)
-        lines.append(f"  lve: {words.format(region='the lip vertices', pooling=pooling)}")
+            definition = vertex_error_words(reduction=self.mve, squared=self.mve_squared)
+            lines.append(f"  mve: {definition.format(region='all vertices', pooling=pooling)}")
+        definition = vertex_error_words(reduction="max", squared=self.lve_squared)
+        lines.append(f"  lve: {definition.format(region='the lip vertices', pooling=pooling)}")
         for name, sign in self.deviations().items():
             lines.append(f"  {name}: {dynamics_words(sign=sign).format(region='the upper-face vertices')}")
         lines.append(f"  lengths: {LENGTH_WORDS[self.length_rule]}")
@@ -231,7 +231,7 @@ class ProtocolMetrics(MetricCollection):
             self.add_metrics({name: score})
 
     def update(  # type: ignore[override]  # it is ModuleDict.update that torchmetrics has redefined
-        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[BatchOptions]
+        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
         """Add a batch of sequences to every metric.
 
@@ -249,7 +249,7 @@ class ProtocolMetrics(MetricCollection):
         super().update(prediction, truth, template=template, **batch)
 
     def forward(
-        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[BatchOptions]
+        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> dict[str, Tensor]:
         """Add a batch like `update` and return the scores of this batch alone."""
         self._check(prediction, truth, template, batch)
@@ -268,7 +268,7 @@ class ProtocolMetrics(MetricCollection):
         """The definition of every number, with the regions."""
         return "\n".join(f"{name}: {metric.describe()}" for name, metric in self.scores().items())
 
-    def _check(self, prediction: Tensor, truth: Tensor, template: Tensor | None, batch: BatchOptions) -> None:
+    def _check(self, prediction: Tensor, truth: Tensor, template: Tensor | None, batch: UpdateOptions) -> None:
         """Find every fault of a batch before it is added to the first metric."""
         clips = align(prediction, truth, rule=self.protocol.length_rule, **batch)
         for region in (self.lips, self.upper):

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 
-def _short_hash(words: Iterable[str]) -> str:
-    return hashlib.sha256(",".join(words).encode("ascii")).hexdigest()[:8]
+def _short_hash(parts: Iterable[str]) -> str:
+    return hashlib.sha256(",".join(parts).encode("ascii")).hexdigest()[:8]
 
 
 @dataclass(frozen=True)
@@ -131,13 +131,13 @@ class Region:
         to_list = getattr(indices, "tolist", None)  # tensors and arrays: plain integers are faster to check
         try:
             values = list(to_list() if to_list is not None else indices)
-            found = [operator.index(value) for value in values]
+            integers = [operator.index(value) for value in values]
         except TypeError:
             raise ValueError(f"the indices of region {name!r} must be a flat list of integers") from None
         if any(isinstance(value, bool) for value in values):  # would pass as the indices 0 and 1
             raise ValueError(f"region {name!r} was given a mask of booleans; give indices (mask.nonzero().flatten())")
-        distinct = tuple(sorted(set(found)))
-        return cls(name, distinct, n_vertices, duplicates=len(found) - len(distinct))
+        distinct = tuple(sorted(set(integers)))
+        return cls(name, distinct, n_vertices, duplicates=len(integers) - len(distinct))
 
     @classmethod
     def from_file(cls, path: str | PathLike[str], *, name: str | None = None, n_vertices: int | None = None) -> Region:
@@ -316,11 +316,11 @@ class LipPairs:
         >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
         middle (1 pairs, de4cd82d)
         """
-        given = [list(pair) for pair in (pairs.tolist() if isinstance(pairs, Tensor) else pairs)]
-        if any(len(pair) != 2 or any(type(index) is not int for index in pair) for pair in given):
+        listed = [list(pair) for pair in (pairs.tolist() if isinstance(pairs, Tensor) else pairs)]
+        if any(len(pair) != 2 or any(type(index) is not int for index in pair) for pair in listed):
             raise ValueError(f"{cls.what} {name!r} must be pairs of two whole numbers, vertex indices")
-        distinct = sorted({(min(pair), max(pair)) for pair in given})
-        return cls(name, tuple(distinct), duplicates=len(given) - len(distinct))
+        distinct = sorted({(min(pair), max(pair)) for pair in listed})
+        return cls(name, tuple(distinct), duplicates=len(listed) - len(distinct))
 
     @classmethod
     def from_file(cls, path: str | PathLike[str], *, name: str | None = None) -> Self:
@@ -366,18 +366,18 @@ def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:
 
 def read_indices(path: Path) -> list[int]:
     """Whole numbers of a text file, separated by commas, blanks or line ends; errors name the file."""
-    words = [word for word in re.split(r"[,\s]+", _read_text(path, "vertex indices separated by commas")) if word]
-    for place, word in enumerate(words, start=1):
+    entries = [word for word in re.split(r"[,\s]+", _read_text(path, "vertex indices separated by commas")) if word]
+    for place, word in enumerate(entries, start=1):
         if not (word.isascii() and word.isdigit()):
             raise ValueError(
                 f"{path}: entry {place} is {word[:40]!r}; expected vertex indices (whole numbers from 0) "
                 "separated by commas, blanks or line ends"
             )
-    return list(map(int, words))
+    return list(map(int, entries))
 
 
 def _read_weights(path: Path) -> list[float]:
-    found = []
+    weights = []
     for place, word in enumerate(_read_text(path, "one weight per line").split(), start=1):
         try:
             value = float(word)
@@ -385,8 +385,8 @@ def _read_weights(path: Path) -> list[float]:
             value = math.nan
         if not math.isfinite(value):
             raise ValueError(f"{path}: entry {place} is {word[:40]!r}; expected one finite weight per line")
-        found.append(value)
-    return found
+        weights.append(value)
+    return weights
 
 
 def _read_text(path: Path, expected: str) -> str:

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from facediff.metrics.base import (
-    BatchOptions,
     Clip,
     Clips,
     FiniteOptions,
@@ -24,6 +23,7 @@ from facediff.metrics.base import (
     Pooling,
     SequenceMetric,
     SequenceOptions,
+    UpdateOptions,
     align,
     check_option,
     functional,
@@ -39,7 +39,7 @@ def align_samples(
     *,
     n_samples: int | None,
     rule: LengthRule = "min",
-    **batch: Unpack[BatchOptions],
+    **batch: Unpack[UpdateOptions],
 ) -> Clips:
     """As `align`, for equally long predictions of each sequence, which become (frames, samples, vertices, 3).
 
@@ -58,15 +58,17 @@ def align_samples(
         )
     first = samples.select(-4, 0)
     clips = align(first, first if truth is None else truth, rule=rule, **batch)
-    each = [samples] if samples.ndim == 4 else list(samples)
+    by_clip = [samples] if samples.ndim == 4 else list(samples)
     predictions = [
-        several.detach()[:, : clip.frames].transpose(0, 1) for clip, several in zip(clips.clips, each, strict=True)
+        several.detach()[:, : clip.frames].transpose(0, 1) for clip, several in zip(clips.clips, by_clip, strict=True)
     ]
     clips = clips.attach("prediction", predictions)
     return clips if truth is not None else clips.attach("truth", predictions)
 
 
-SAMPLES_GIVEN: Inferred = {"n_samples": lambda given: given["samples"].shape[-4] if given["samples"].ndim > 3 else 2}
+SAMPLES_GIVEN: Inferred = {
+    "n_samples": lambda arguments: arguments["samples"].shape[-4] if arguments["samples"].ndim > 3 else 2
+}
 """How a function reads the number of samples from what it is given."""
 
 
@@ -89,14 +91,14 @@ class OfSamples(SequenceMetric):
         super().__init__(**options)
         self.n_samples = n_samples
 
-    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[BatchOptions]) -> None:
+    def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[UpdateOptions]) -> None:
         """Add a batch of sequences.
 
         Args:
             samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
                 vertices, 3), floating point.
             truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            **batch: Those of `BatchOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
+            **batch: Those of `UpdateOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
 
         Raises:
             ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
@@ -128,10 +130,10 @@ class SamplesMetric(OfSamples):
         **options: Unpack[SequenceOptions],
     ) -> None:
         distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
-        words = f"{self.words}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
-        words = words.replace("{samples}", f"{n_samples} samples")
+        definition = f"{self.words}, in each frame the largest {distance} over {{region}}; {{pooling}} [{unit}]"
+        definition = definition.replace("{samples}", f"{n_samples} samples")
         lip_region = as_region(lips, "lips")
-        super().__init__(n_samples=n_samples, definition=words, pooling=pooling, region=lip_region, **options)
+        super().__init__(n_samples=n_samples, definition=definition, pooling=pooling, region=lip_region, **options)
         self.squared = squared
 
 
@@ -208,8 +210,8 @@ class Diversity(SequenceMetric):
         pooling: Pooling,
         **options: Unpack[FiniteOptions],
     ) -> None:
-        words = f"{definition}, the mean distance over {{region}}; {{pooling}} [unit]"
-        super().__init__(definition=words, pooling=pooling, region=region, **options)
+        definition = f"{definition}, the mean distance over {{region}}; {{pooling}} [unit]"
+        super().__init__(definition=definition, pooling=pooling, region=region, **options)
 
     def pairs(self, count: int) -> list[tuple[int, int]]:
         """Which of ``count`` predictions are compared."""
@@ -273,8 +275,8 @@ class SampleDiversity(Diversity):
                 f"n_samples is {n_samples}; expected at least 2, and an even number to compare halves of them"
             )
         how = f"a random half with the other (seed {seed})" if pairing == "shuffled" else "all pairs"
-        words = f"of {n_samples} samples, {how}"
-        super().__init__(region, definition=words, pooling=pooling, **options)
+        definition = f"of {n_samples} samples, {how}"
+        super().__init__(region, definition=definition, pooling=pooling, **options)
         self.pairing: Pairing = pairing
         self.n_samples = n_samples
         self.seed = seed
@@ -327,8 +329,8 @@ class IdentityDiversity(Diversity):
         pooling: Pooling = "sequences",
         **options: Unpack[FiniteOptions],
     ) -> None:
-        words = "of predictions for several identities, all pairs"
-        super().__init__(region, definition=words, pooling=pooling, **options)
+        definition = "of predictions for several identities, all pairs"
+        super().__init__(region, definition=definition, pooling=pooling, **options)
 
     def update(  # type: ignore[override]  # there is no truth
         self, predictions: Tensor, *, lengths: Lengths | None = None, clip_names: Sequence[str] | None = None

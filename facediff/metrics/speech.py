@@ -14,7 +14,6 @@ from torch import Tensor
 
 from facediff.metrics.base import (
     SIDE_WORDS,
-    BatchOptions,
     Clip,
     Clips,
     Coverage,
@@ -22,6 +21,7 @@ from facediff.metrics.base import (
     SequenceMetric,
     SequenceOptions,
     Side,
+    UpdateOptions,
     check_option,
     functional,
 )
@@ -97,8 +97,8 @@ class SpeechLipMetric(SequenceMetric):
             raise ValueError("sample_rate and frames_per_second belong together; give both, or none with intensities")
         if sample_rate is not None and frames_per_second is not None and not 0 < frames_per_second <= sample_rate:
             raise ValueError(f"{frames_per_second} frames a second do not fit {sample_rate} samples a second")
-        words = (definition or self.words).replace("{side}", SIDE_WORDS[of])
-        super().__init__(definition=words, region=as_region(lips, "lips"), **options)
+        definition = (definition or self.words).replace("{side}", SIDE_WORDS[of])
+        super().__init__(definition=definition, region=as_region(lips, "lips"), **options)
         self.of: Side = of
         self.sample_rate = sample_rate
         self.frames_per_second = frames_per_second
@@ -110,7 +110,7 @@ class SpeechLipMetric(SequenceMetric):
         *,
         waveform: Tensor | None = None,
         intensity: Tensor | None = None,
-        **batch: Unpack[BatchOptions],
+        **batch: Unpack[UpdateOptions],
     ) -> None:
         """Add a batch of sequences with their speech.
 
@@ -130,18 +130,18 @@ class SpeechLipMetric(SequenceMetric):
 
     def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
         """The sequences with the intensity of their speech; ``single`` for one sequence without batch axis."""
-        given = intensity if waveform is None else waveform
-        if given is None or (waveform is not None and intensity is not None):
+        sound = intensity if waveform is None else waveform
+        if sound is None or (waveform is not None and intensity is not None):
             raise ValueError("give the speech once: as waveform= or as intensity=")
         name, read = ("intensity", self._cut) if waveform is None else ("waveform", self._intensity)
         count = len(clips.clips)
-        fits = given.ndim == 1 if single else given.ndim == 2 and len(given) == count
-        if not fits or not given.is_floating_point():
+        fits = sound.ndim == 1 if single else sound.ndim == 2 and len(sound) == count
+        if not fits or not sound.is_floating_point():
             raise ValueError(
-                f"{name} has shape {tuple(given.shape)} and type {given.dtype}; expected floating-point numbers, one "
+                f"{name} has shape {tuple(sound.shape)} and type {sound.dtype}; expected floating-point numbers, one "
                 f"row for each of {count} sequences"
             )
-        rows = [given.detach()] if single else list(given.detach())
+        rows = [sound.detach()] if single else list(sound.detach())
         spoken = [read(clip, row).to(clip.truth.device) for clip, row in zip(clips.clips, rows, strict=True)]
         return clips.attach("speech", spoken)
 
@@ -156,10 +156,10 @@ class SpeechLipMetric(SequenceMetric):
     def _cut(self, clip: Clip, intensity: Tensor) -> Tensor:
         if len(intensity) < clip.frames:
             raise ValueError(f"{clip.name}: intensity of {len(intensity)} frames for {clip.frames} frames of motion")
-        found = intensity[: clip.frames].double()
-        if not bool(found.isfinite().all()):
+        scored = intensity[: clip.frames].double()
+        if not bool(scored.isfinite().all()):
             raise ValueError(f"the intensity of {clip.name} holds NaN or infinity; repair or omit this clip")
-        return found
+        return scored
 
 
 @metric.register("frame_speech_lip_correlation")
@@ -208,8 +208,8 @@ _CLIPS, _FRAMES, _SPEECH, _SPEECH_SQUARED = range(4)
 _LIPS = {"prediction": (4, 5, 6), "truth": (7, 8, 9)}
 
 
-def _identity_count(given: Mapping[str, Any]) -> int:
-    identities = given.get("identities")
+def _identity_count(arguments: Mapping[str, Any]) -> int:
+    identities = arguments.get("identities")
     return 1 if identities is None else int(torch.as_tensor(identities).max()) + 1
 
 
@@ -260,13 +260,13 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
     ) -> None:
         if n_identities < 1:
             raise ValueError(f"n_identities is {n_identities}; expected at least 1")
-        words = (
+        definition = (
             "Pearson correlation over clips between the intensity of the speech and the root mean square "
             f"over frames of the mean speed of {{region}}, each standardised within {n_identities} identities, "
             "{side} [1]"
         )
         super().__init__(
-            lips, definition=words, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options
+            lips, definition=definition, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options
         )
         self.n_identities = n_identities
         self.add_state("moments", torch.zeros(n_identities, 10, dtype=torch.float64), dist_reduce_fx="sum")
@@ -279,7 +279,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         identities: Tensor | Sequence[int] | None = None,
         waveform: Tensor | None = None,
         intensity: Tensor | None = None,
-        **batch: Unpack[BatchOptions],
+        **batch: Unpack[UpdateOptions],
     ) -> None:
         """Add a batch of sequences with their speech.
 
@@ -365,15 +365,15 @@ def _standardised_correlation(moments: Tensor, side: str) -> Tensor:
     covariance = moments[:, product] - moments[:, _SPEECH] * moments[:, total] / moments[:, _CLIPS]
     lips = _deviation(moments, total, squared)
     scale = (_deviation(moments, _SPEECH, _SPEECH_SQUARED) * lips).sqrt()
-    each = torch.where(lips > 0, (covariance / scale).clamp(-1, 1), 0.0)
+    correlations = torch.where(lips > 0, (covariance / scale).clamp(-1, 1), 0.0)
     weights = moments[:, _CLIPS] - 1
-    return (weights * each).sum() / weights.sum()
+    return (weights * correlations).sum() / weights.sum()
 
 
 def _deviation(moments: Tensor, total: int, squared: int) -> Tensor:
     """Sum of squared deviations from the mean; 0 where they are no more than rounding."""
-    found = moments[:, squared] - moments[:, total].square() / moments[:, _CLIPS].clamp(min=1)
-    return torch.where(found > 1e-12 * moments[:, squared], found, 0.0)
+    deviation = moments[:, squared] - moments[:, total].square() / moments[:, _CLIPS].clamp(min=1)
+    return torch.where(deviation > 1e-12 * moments[:, squared], deviation, 0.0)
 
 
 frame_speech_lip_correlation = functional(FrameSpeechLipCorrelation)

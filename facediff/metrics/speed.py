@@ -48,8 +48,8 @@ class RealTimeFactor(ExactMetric):
     def __init__(self, hardware: str, **options: Unpack[ProcessOptions]) -> None:
         if not hardware.strip():
             raise ValueError("hardware is empty; name what computes, a factor means nothing without it")
-        words = f"seconds of computing for one second of speech, added up over clips, on {hardware} [1]"
-        super().__init__(definition=words, **options)
+        definition = f"seconds of computing for one second of speech, added up over clips, on {hardware} [1]"
+        super().__init__(definition=definition, **options)
         self.hardware = hardware
         self.add_state("seconds", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
 

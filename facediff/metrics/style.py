@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from facediff.metrics.base import (
-    BatchOptions,
     Clip,
     ExactMetric,
     FiniteOptions,
     ProcessOptions,
     SequenceMetric,
+    UpdateOptions,
     check_option,
     functional,
 )
@@ -252,12 +252,12 @@ class NearestSpeakerAccuracy(SequenceMetric):
         if components < 1 or not shrinkage > 0:
             raise ValueError(f"components is {components} and shrinkage {shrinkage:g}; expected 1 or more, and above 0")
         numbers, speaker = torch.unique(torch.tensor(gallery.speakers), return_inverse=True)
-        words = (
+        definition = (
             f"share of motions whose mean over time is nearest to that of their own speaker among {len(numbers)}, by "
             f"Mahalanobis distance within speakers in {components} principal components of {len(speaker)} recordings, "
             f"covariance shrunk by {shrinkage:g}; mean over sequences [1]"
         )
-        super().__init__(definition=words, **options)
+        super().__init__(definition=definition, **options)
         means = gallery.means.flatten(1).double().cpu()
         centre = means.mean(0)
         apart = means - centre
@@ -294,8 +294,8 @@ class NearestSpeakerAccuracy(SequenceMetric):
             mean = mean - clip.template.double()
         place = (mean.flatten() - self.centre) @ self.basis.T @ self.whitening
         nearest = self.numbers[(self.places - place).square().sum(1).argmin()]
-        known = (self.numbers == clip.identity).any()
-        return torch.where(known, (nearest == clip.identity).double(), torch.nan)
+        in_gallery = (self.numbers == clip.identity).any()
+        return torch.where(in_gallery, (nearest == clip.identity).double(), torch.nan)
 
     def update(
         self,
@@ -303,7 +303,7 @@ class NearestSpeakerAccuracy(SequenceMetric):
         identities: Tensor | Sequence[int],
         *,
         template: Tensor | None = None,
-        **batch: Unpack[BatchOptions],
+        **batch: Unpack[UpdateOptions],
     ) -> None:
         """Add a batch of sequences.
 

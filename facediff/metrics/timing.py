@@ -150,7 +150,7 @@ def extrema(series: list[float]) -> dict[int, int]:
     >>> extrema([0, 1, 1, 1, 0, 2, 3])
     {2: 1, 4: -1}
     """
-    found = {}
+    turns = {}
     start = 0
     for end in range(1, len(series)):
         if series[end] == series[start]:
@@ -158,9 +158,9 @@ def extrema(series: list[float]) -> dict[int, int]:
         if start:
             rises, falls = series[start - 1] < series[start], series[end] < series[start]
             if rises == falls:
-                found[(start + end - 1) // 2] = 1 if falls else -1
+                turns[(start + end - 1) // 2] = 1 if falls else -1
         start = end
-    return found
+    return turns
 
 
 def matched_lags(path: Path, truth: list[float], prediction: list[float]) -> list[int]:
@@ -242,12 +242,12 @@ class TemporalMisalignment(OpeningMetric):
         places = "pairs of like extrema" if at == "extrema" else "all its pairs"
         smoothed = f"smoothed over {smoothing:g} frames" if smoothing else "not smoothed"
         unit = "frames" if frames_per_second is None else "ms"
-        words = (
+        definition = (
             "in each sequence the mean lag |i − j| on the path of derivative dynamic time warping between "
             f"the mouth's openings (mean distance of {{pairs}}, {smoothed}), over {places}; mean over sequences "
             f"[{unit}]"
         )
-        super().__init__(pairs, definition=words, **options)
+        super().__init__(pairs, definition=definition, **options)
         self.at: Moments = at
         self.smoothing = smoothing
         self.frames_per_second = frames_per_second

@@ -11,13 +11,13 @@ from typing import Unpack
 from torch import Tensor
 
 from facediff.metrics.base import (
-    BatchOptions,
     Clip,
     Pooling,
     Reduction,
     SequenceMetric,
     SequenceOptions,
     Sign,
+    UpdateOptions,
     check_option,
     functional,
 )
@@ -57,8 +57,8 @@ class VertexError(SequenceMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("reduction", reduction, Reduction)
-        words = vertex_error_words(reduction=reduction, squared=squared)
-        super().__init__(definition=words, pooling=pooling, region=region, **options)
+        definition = vertex_error_words(reduction=reduction, squared=squared)
+        super().__init__(definition=definition, pooling=pooling, region=region, **options)
         self.reduction: Reduction = reduction
         self.squared = squared
 
@@ -199,7 +199,7 @@ class FaceDynamicsDeviation(SequenceMetric):
         return value if self.sign == "signed" else value.abs()
 
     def update(
-        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[BatchOptions]
+        self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
         """Add a batch of sequences.
 

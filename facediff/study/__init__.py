@@ -1,8 +1,9 @@
 """User studies: videos of methods side by side, a page that asks raters about them, and what their answers say.
 
 From top to bottom: :func:`plan_study` reads and checks animations and makes a :class:`StudyPlan`, whose ``make`` writes
-the study's folder; :func:`serve` hands the page out and stores answers; :func:`analyse_folder` makes a :class:`Report`
-of them. :func:`simulate` gives answers of raters whose preference is known. Names are loaded on first use.
+the study's folder; :func:`serve` hands the page out and stores answers; :func:`analyse_folder` makes a
+:class:`StudyReport` of them. :func:`simulate` gives answers of raters whose preference is known. Names are loaded on
+first use.
 """
 
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from facediff.study.making import StudyOptions as StudyOptions
     from facediff.study.making import StudyPlan as StudyPlan
     from facediff.study.making import plan_study as plan_study
-    from facediff.study.report import Report as Report
+    from facediff.study.report import StudyReport as StudyReport
     from facediff.study.report import analyse as analyse
     from facediff.study.report import analyse_folder as analyse_folder
     from facediff.study.server import serve as serve
@@ -27,7 +28,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "definition": "Study read_study",
         "making": "StudyOptions StudyPlan plan_study",
-        "report": "Report analyse analyse_folder",
+        "report": "StudyReport analyse analyse_folder",
         "server": "serve",
         "simulation": "simulate",
         "statistics": "raters_needed",

@@ -108,8 +108,8 @@ def check_rater(content: object, study: Study, source: object) -> Rater:
     if not isinstance(trials, list) or len(trials) > len(study.trials):
         raise FaceDiffError(f"{source}: trials are {quoted(trials)}; expected a list of at most {len(study.trials)}")
     answers: dict[str, Answer] = {}
-    for given in trials:
-        answer = check_answer(given, study, number, source)
+    for entry in trials:
+        answer = check_answer(entry, study, number, source)
         answers.setdefault(answer.trial, answer)  # what was submitted twice counts once, as first given
     if rater.finished is not None and len(answers) < len(study.trials_of(number)):
         rater = replace(rater, finished=None)
@@ -140,11 +140,11 @@ def check_language(content: Mapping[str, Any], source: object) -> str:
     return language
 
 
-def check_answer(given: object, study: Study, number: int, source: object) -> Answer:
+def check_answer(content: object, study: Study, number: int, source: object) -> Answer:
     """One video's answers.
 
     Args:
-        given: plain data from elsewhere.
+        content: plain data from elsewhere.
         study: what was asked.
         number: of the rater, whose schedule must hold the trial.
         source: for messages.
@@ -152,13 +152,13 @@ def check_answer(given: object, study: Study, number: int, source: object) -> An
     Raises:
         FaceDiffError: naming the field.
     """
-    if not isinstance(given, dict):
-        raise FaceDiffError(f"{source}: an answer is {quoted(given)}; expected an object")
-    name = given.get("trial")
+    if not isinstance(content, dict):
+        raise FaceDiffError(f"{source}: an answer is {quoted(content)}; expected an object")
+    name = content.get("trial")
     trial = study.by_id.get(name) if isinstance(name, str) else None
-    if trial is None or all(each.id != trial.id for each in study.trials_of(number)):
+    if trial is None or all(shown.id != trial.id for shown in study.trials_of(number)):
         raise FaceDiffError(f"{source}: trial is {quoted(name)}; expected one that this rater is asked about")
-    answers = given.get("answers")
+    answers = content.get("answers")
     asked = asked_of(study, trial)
     if not isinstance(answers, dict) or set(answers) != set(asked):
         raise FaceDiffError(f"{source}: answers are {quoted(answers)}; expected one each to {', '.join(asked)}")
@@ -170,9 +170,9 @@ def check_answer(given: object, study: Study, number: int, source: object) -> An
     return Answer(
         trial.id,
         {question: str(answers[question]) for question in asked},
-        check_number(source, "seconds", given.get("seconds"), 0, 1e7),
-        int(check_number(source, "plays", given.get("plays"), 0, 1e6, whole=True)),
-        _time(given.get("at"), "at", source),
+        check_number(source, "seconds", content.get("seconds"), 0, 1e7),
+        int(check_number(source, "plays", content.get("plays"), 0, 1e6, whole=True)),
+        _time(content.get("at"), "at", source),
     )
 
 
@@ -185,48 +185,50 @@ def asked_of(study: Study, trial: Trial) -> dict[str, Sequence[str]]:
     }
 
 
-def check_comments(given: object, study: Study, source: object) -> dict[str, str]:
+def check_comments(content: object, study: Study, source: object) -> dict[str, str]:
     """Free texts by question; empty ones are left out."""
-    known = [question.name for question in study.questions if question.kind == "text"]
-    if not isinstance(given, dict) or not set(given) <= set(known):
-        raise FaceDiffError(f"{source}: comments are {quoted(given)}; expected texts for {', '.join(known) or 'none'}")
-    texts = {name: clean(text, f"comments.{name}", source, LONGEST_COMMENT) for name, text in given.items()}
+    fields = [question.name for question in study.questions if question.kind == "text"]
+    if not isinstance(content, dict) or not set(content) <= set(fields):
+        raise FaceDiffError(
+            f"{source}: comments are {quoted(content)}; expected texts for {', '.join(fields) or 'none'}"
+        )
+    texts = {name: clean(text, f"comments.{name}", source, LONGEST_COMMENT) for name, text in content.items()}
     return {name: text for name, text in texts.items() if text}
 
 
-def clean(given: object, name: str, source: object, longest: int) -> str:
+def clean(text: object, name: str, source: object, longest: int) -> str:
     """A text from elsewhere without characters that control a terminal, or that no file can hold.
 
     Raises:
         FaceDiffError: if it is no text, or longer than ``longest`` characters.
     """
-    if not isinstance(given, str) or len(given) > longest:
-        what = quoted(given) if not isinstance(given, str) else f"{len(given)} characters long"
+    if not isinstance(text, str) or len(text) > longest:
+        what = quoted(text) if not isinstance(text, str) else f"{len(text)} characters long"
         raise FaceDiffError(f"{source}: {name} is {what}; expected a text of at most {longest} characters")
     return "".join(
         letter if letter == "\n" or (letter.isprintable() and not "\ud800" <= letter <= "\udfff") else " "
-        for letter in given.replace("\r\n", "\n")
+        for letter in text.replace("\r\n", "\n")
     ).strip()
 
 
-def _time(given: object, name: str, source: object) -> str:
-    if not isinstance(given, str) or not TIME.fullmatch(given):
-        raise FaceDiffError(f"{source}: {name} is {quoted(given)}; expected a time such as 2026-05-01T12:00:00Z")
-    return given
+def _time(text: object, name: str, source: object) -> str:
+    if not isinstance(text, str) or not TIME.fullmatch(text):
+        raise FaceDiffError(f"{source}: {name} is {quoted(text)}; expected a time such as 2026-05-01T12:00:00Z")
+    return text
 
 
 def merge(groups: Iterable[Iterable[Rater]]) -> list[Rater]:
     """Raters of several sources, each once: what one source has of a rater in addition is added to the first."""
-    found: dict[str, Rater] = {}
+    raters: dict[str, Rater] = {}
     for rater in (rater for group in groups for rater in group):
-        known = found.get(rater.token)
-        if known is None:
-            found[rater.token] = rater
+        earlier = raters.get(rater.token)
+        if earlier is None:
+            raters[rater.token] = rater
             continue
-        found[rater.token] = replace(
-            known,
-            answers={**rater.answers, **known.answers},
-            comments={**rater.comments, **known.comments},
-            finished=known.finished or rater.finished,
+        raters[rater.token] = replace(
+            earlier,
+            answers={**rater.answers, **earlier.answers},
+            comments={**rater.comments, **earlier.comments},
+            finished=earlier.finished or rater.finished,
         )
-    return sorted(found.values(), key=lambda rater: (rater.started, rater.token))
+    return sorted(raters.values(), key=lambda rater: (rater.started, rater.token))

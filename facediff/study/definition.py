@@ -202,25 +202,25 @@ def read_study(folder: Path) -> Study:
     read = _Reader(path)
     questions = [
         Question(
-            read.text(each, "name", NAME),
-            read.texts(each.get("text"), "text"),
-            read.one_of(each, "kind", ("choice", "text")),
-            each.get("reference") is True,
-            each.get("no_difference") is True,
+            read.text(entry, "name", NAME),
+            read.texts(entry.get("text"), "text"),
+            read.one_of(entry, "kind", ("choice", "text")),
+            entry.get("reference") is True,
+            entry.get("no_difference") is True,
         )
-        for each in read.objects(content, "questions")
+        for entry in read.objects(content, "questions")
     ]
     trials = [
         Trial(
-            read.text(each, "id", TOKEN),
-            read.one_of(each, "kind", get_args(Kind)),  # type: ignore[arg-type]
-            read.text(each, "clip"),
-            read.text(each, "left"),
-            read.text(each, "right"),
-            read.video(each, "video"),
-            None if each.get("reference") is None else read.video(each, "reference"),
+            read.text(entry, "id", TOKEN),
+            read.one_of(entry, "kind", get_args(Kind)),  # type: ignore[arg-type]
+            read.text(entry, "clip"),
+            read.text(entry, "left"),
+            read.text(entry, "right"),
+            read.video(entry, "video"),
+            None if entry.get("reference") is None else read.video(entry, "reference"),
         )
-        for each in read.objects(content, "trials")
+        for entry in read.objects(content, "trials")
     ]
     schedules = content.get("schedules")
     if not isinstance(schedules, list) or not all(isinstance(row, list) and row for row in schedules) or not schedules:
@@ -232,7 +232,9 @@ def read_study(folder: Path) -> Study:
         )
         for row in schedules
     ]
-    if len({trial.id for trial in trials}) < len(trials) or len({each.name for each in questions}) < len(questions):
+    if len({trial.id for trial in trials}) < len(trials) or len({question.name for question in questions}) < len(
+        questions
+    ):
         raise FaceDiffError(f"{path}: names a trial or a question twice; {remedy}")
     if not any(question.kind == "choice" for question in questions):
         raise FaceDiffError(f"{path}: questions ask for no choice; {remedy}")
@@ -258,21 +260,21 @@ def read_study(folder: Path) -> Study:
     return study
 
 
-def make_rule(given: object, source: object) -> Rule:
+def make_rule(content: object, source: object) -> Rule:
     """The rule that a file states; fields that it omits have their defaults.
 
     Raises:
         FaceDiffError: naming the field.
     """
-    if given is None:
+    if content is None:
         return Rule()
-    if not isinstance(given, dict):
-        raise FaceDiffError(f"{source}: rule is {quoted(given)}; expected fields such as least_right: 0.8")
-    known = asdict(Rule())
+    if not isinstance(content, dict):
+        raise FaceDiffError(f"{source}: rule is {quoted(content)}; expected fields such as least_right: 0.8")
+    defaults = asdict(Rule())
     values: dict[str, Any] = {}
-    for name, value in given.items():
-        if name not in known:
-            raise FaceDiffError(f'{source}: rule has no field "{name}": {choices(str(name), known)}')
+    for name, value in content.items():
+        if name not in defaults:
+            raise FaceDiffError(f'{source}: rule has no field "{name}": {choices(str(name), defaults)}')
         if name == "finished":
             if not isinstance(value, bool):
                 raise FaceDiffError(f"{source}: rule.finished is {quoted(value)}; expected true or false")
@@ -294,7 +296,7 @@ class _Reader:
 
     def objects(self, content: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
         value = content.get(name)
-        if not isinstance(value, list) or not value or not all(isinstance(each, dict) for each in value):
+        if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
             raise self.refuse(name, value, "a list of objects")
         return value
 
@@ -307,17 +309,17 @@ class _Reader:
     def video(self, content: Mapping[str, Any], name: str) -> str:
         return self.text(content, name, re.compile(r"[0-9a-f]{16}\.(mp4|webm)"))
 
-    def one_of(self, content: Mapping[str, Any], name: str, known: Sequence[str]) -> str:
+    def one_of(self, content: Mapping[str, Any], name: str, allowed: Sequence[str]) -> str:
         value = content.get(name)
-        if value not in known:
-            raise self.refuse(name, value, f"one of {', '.join(known)}")
+        if value not in allowed:
+            raise self.refuse(name, value, f"one of {', '.join(allowed)}")
         return str(value)
 
     def names(self, content: Mapping[str, Any], name: str, pattern: re.Pattern[str] | None = None) -> list[str]:
         value = content.get(name)
         if not isinstance(value, list) or not value:
             raise self.refuse(name, value, "a list of names")
-        return [self.text({name: each}, name, pattern) for each in value]
+        return [self.text({name: entry}, name, pattern) for entry in value]
 
     def texts(self, value: object, name: str) -> dict[str, str]:
         if not isinstance(value, dict) or not value:

@@ -117,7 +117,7 @@ def make_forms(
             for number in range(same):
                 name = shown[number % len(shown)]
                 form.append(Showing("same", control_clips[(still + number) % len(clips)], name, name))
-            form += [Showing("repeat", each.clip, each.right, each.left) for each in again]
+            form += [Showing("repeat", pair.clip, pair.right, pair.left) for pair in again]
             forms.append(list(dict.fromkeys(form)))  # more controls than clips would ask for one video twice
     return forms
 
@@ -153,5 +153,5 @@ def make_schedules(forms: Sequence[Sequence[Showing]], seed: int) -> tuple[list[
         mixed = [number[form[i]] for i in rng.permutation(len(form))]
         square = orders(len(form))
         rows.append([[mixed[place] for place in square[i]] for i in rng.permutation(len(square))])
-    most = max(len(each) for each in rows)
-    return trials, [each[turn % len(each)] for turn in range(most) for each in rows]
+    most = max(len(schedules) for schedules in rows)
+    return trials, [schedules[turn % len(schedules)] for turn in range(most) for schedules in rows]

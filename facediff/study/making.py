@@ -23,7 +23,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.render import Camera, Renderer, side_by_side, write_video
 from facediff.study.definition import DATABASE, PAGE_FOLDER, STUDY_FILE, VIDEO_FOLDER, Study, Trial
 from facediff.study.design import STILL, TRUTH, Design, Pairs, Showing, make_forms, make_pairs, make_schedules
-from facediff.study.material import Clip, Material, Motion, in_unit_of, read_sound
+from facediff.study.material import MotionFile, StudyAnimations, StudyClip, in_unit_of, read_sound
 from facediff.study.page import write_page
 from facediff.study.texts import Questionnaire, check_languages
 from facediff.utils import ranges
@@ -83,7 +83,7 @@ class StudyOptions:
 class VideoTask(FileTask):
     """A video to draw: one face, or two side by side."""
 
-    panels: tuple[tuple[Motion, bool], ...] = ()  # motion, and whether the face stays still
+    panels: tuple[tuple[MotionFile, bool], ...] = ()  # motion, and whether the face stays still
     camera: Camera | None = None
     colours: npt.NDArray[np.uint8] | None = None
     sound: Path | None = None
@@ -132,10 +132,10 @@ class StudyPlan:
         notes: what was left out, and why.
     """
 
-    material: Material
+    material: StudyAnimations
     options: StudyOptions
     study: Study
-    clips: Mapping[str, Clip]
+    clips: Mapping[str, StudyClip]
     notes: tuple[str, ...]
     videos: Mapping[str, VideoTask] = field(repr=False)
 
@@ -224,8 +224,8 @@ def check_output(output: Path, study: Study) -> None:
     if (output / DATABASE).exists():
         from facediff.study.store import count_raters, study_of
 
-        known = study_of(output / DATABASE)
-        if known not in (None, study.id) and count_raters(output / DATABASE):
+        stored = study_of(output / DATABASE)
+        if stored not in (None, study.id) and count_raters(output / DATABASE):
             raise FaceDiffError(
                 f"{output}: holds answers to another study, which this one would replace; choose a new folder"
             )
@@ -248,7 +248,7 @@ def plan_study(
     Args:
         methods: each method's folder; the first is compared with the others and with the truth.
         options: how the study is made.
-        truth: see :class:`facediff.study.material.Material`, likewise the rest.
+        truth: see :class:`facediff.study.material.StudyAnimations`, likewise the rest.
         references: likewise.
         identity: likewise.
         speech: likewise.
@@ -264,7 +264,7 @@ def plan_study(
         raise FaceDiffError("methods: there is nothing to compare; give the folders of two methods, or one and --truth")
     languages = check_languages(options.languages)
     questionnaire = Questionnaire(options.questions, languages)
-    material = Material(
+    material = StudyAnimations(
         methods,
         truth,
         references=references,
@@ -284,8 +284,8 @@ def plan_study(
     questions = questionnaire.questions
     if any(question.reference for question in questions):
         rng = np.random.default_rng([options.seed, 2])
-        found = {name: material.reference(name, names, rng) for name in names}
-        without = [name for name, reference in found.items() if reference is None]
+        references_by_clip = {name: material.reference(name, names, rng) for name in names}
+        without = [name for name, reference in references_by_clip.items() if reference is None]
         if without and questionnaire.chosen:
             raise FaceDiffError(
                 f"{without[0]}: has no reference, another clip of the same speaker, which a question needs; give them "
@@ -295,7 +295,7 @@ def plan_study(
             notes.append(f"style is not asked about: {without[0]} has no reference, another clip of the same speaker")
             questions = [question for question in questions if not question.reference]
         else:
-            clips = {name: replace(clip, reference=found[name]) for name, clip in clips.items()}
+            clips = {name: replace(clip, reference=references_by_clip[name]) for name, clip in clips.items()}
     still = options.still if truth is not None else 0
     if options.still and not still:
         notes.append("there are no controls against a still face, since no truth is given")
@@ -334,7 +334,7 @@ def plan_study(
     return StudyPlan(material, options, study, clips, tuple(notes), videos)
 
 
-def choose_clips(material: Material, options: StudyOptions) -> list[str]:
+def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
     """The clips that are asked for, or a seeded choice, evenly among the speakers.
 
     Raises:
@@ -356,8 +356,8 @@ def choose_clips(material: Material, options: StudyOptions) -> list[str]:
 
 
 def _trials(
-    material: Material,
-    clips: Mapping[str, Clip],
+    material: StudyAnimations,
+    clips: Mapping[str, StudyClip],
     showings: Sequence[Showing],
     options: StudyOptions,
     videos: dict[str, VideoTask],
@@ -384,14 +384,14 @@ def _trials(
 
 
 def _pair_task(
-    material: Material, clip: Clip, showing: Showing, options: StudyOptions, digests: dict[Path, str]
+    material: StudyAnimations, clip: StudyClip, showing: Showing, options: StudyOptions, digests: dict[Path, str]
 ) -> VideoTask:
     panels = tuple((clip.motion(condition), condition == STILL) for condition in (showing.left, showing.right))
     camera = Camera.framing(list(clip.templates), view=options.view)
     return _task(panels, camera, clip.colours, clip.sound, clip.frames, material.remark, options, digests)
 
 
-def _reference_task(material: Material, name: str, options: StudyOptions, digests: dict[Path, str]) -> VideoTask:
+def _reference_task(material: StudyAnimations, name: str, options: StudyOptions, digests: dict[Path, str]) -> VideoTask:
     motion = material.references[name]
     animation = motion.read()
     sound = material.sound_of(name, motion)
@@ -403,7 +403,7 @@ def _reference_task(material: Material, name: str, options: StudyOptions, digest
 
 
 def _task(
-    panels: tuple[tuple[Motion, bool], ...],
+    panels: tuple[tuple[MotionFile, bool], ...],
     camera: Camera,
     colours: npt.NDArray[np.uint8] | None,
     sound: Path | None,

@@ -29,7 +29,7 @@ UNEQUAL = 0.1
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionFile:
     """Where an animation comes from; picklable, and read where it is drawn.
 
     Attributes:
@@ -58,15 +58,15 @@ class Motion:
 
     def digest(self) -> str:
         """What of the facts decides pictures, as a checksum."""
-        found = hashlib.sha256(str(self.stride).encode())
+        checksum = hashlib.sha256(str(self.stride).encode())
         for name, value in sorted(self.facts.items()):
-            found.update(name.encode())
-            found.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-        return found.hexdigest()
+            checksum.update(name.encode())
+            checksum.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        return checksum.hexdigest()
 
 
 @dataclass(frozen=True)
-class Clip:
+class StudyClip:
     """A clip that all methods have.
 
     Attributes:
@@ -83,7 +83,7 @@ class Clip:
 
     name: str
     subject: str
-    motions: Mapping[str, Motion]
+    motions: Mapping[str, MotionFile]
     sound: Path
     frames: int
     frame_rate: float
@@ -96,14 +96,14 @@ class Clip:
         """How long it lasts."""
         return self.frames / self.frame_rate
 
-    def motion(self, condition: str) -> Motion:
+    def motion(self, condition: str) -> MotionFile:
         """The motion that a condition shows; a still face is that of the truth, or else of the first method."""
         if condition == STILL:
             return self.motions.get(TRUTH) or next(iter(self.motions.values()))
         return self.motions[condition]
 
 
-class Material:
+class StudyAnimations:
     """The files of a study.
 
     Args:
@@ -156,14 +156,14 @@ class Material:
         if unit is not None:
             self._facts["unit"] = unit
         self._templates: dict[str, AnimationFacts] = {}
-        self._files: dict[str, dict[str, Motion]] = {}
+        self._files: dict[str, dict[str, MotionFile]] = {}
         if truth is not None:
             self._files[TRUTH] = self._truths(truth, mesh, frame_rate, unit)
         for name, folder in methods.items():
-            found = find_animations(folder, list(self._templates), identity)
-            self._files[name] = {clip: Motion(path, self.facts_for(clip)) for clip, path in found.items()}
+            animations = find_animations(folder, list(self._templates), identity)
+            self._files[name] = {clip: MotionFile(path, self.facts_for(clip)) for clip, path in animations.items()}
         self.references = {
-            clip: Motion(path, self.facts_for(clip))
+            clip: MotionFile(path, self.facts_for(clip))
             for clip, path in ({} if references is None else find_animations(references, list(self._templates))).items()
         } or self._files.get(TRUTH, {})
         sets = [set(files) for files in self._files.values()]
@@ -176,35 +176,37 @@ class Material:
                 f"<clip>_condition_<identity>.npy"
             )
 
-    def _truths(self, truth: Path, mesh: Path | None, frame_rate: float | None, unit: str | None) -> dict[str, Motion]:
+    def _truths(
+        self, truth: Path, mesh: Path | None, frame_rate: float | None, unit: str | None
+    ) -> dict[str, MotionFile]:
         """The truth's motions by clip; what its corpus knows of faces and sound is kept for bare arrays."""
         corpus_like = truth == Path("puppet") or any((truth / name).is_dir() for name in MOTION_FOLDERS)
         if not corpus_like and any(truth.glob("*.npz")):
-            found = find_animations(truth)
-            return {clip: Motion(path, self._facts) for clip, path in found.items()}
-        known = gather({}, truth, mesh=mesh, frame_rate=frame_rate, unit=unit)
-        self.remark = known.remark
-        facts: dict[str, Any] = {"unit": known.unit or "m"}
-        if known.frame_rate is not None:
-            facts["frame_rate"] = known.rate
-        if known.faces is not None:
-            facts["faces"] = known.faces
-        if known.colours is not None:
-            facts["colours"] = known.colours
-        if known.rest is not None:
-            facts["template"] = known.rest.astype(np.float32)
+            animations = find_animations(truth)
+            return {clip: MotionFile(path, self._facts) for clip, path in animations.items()}
+        corpus = gather({}, truth, mesh=mesh, frame_rate=frame_rate, unit=unit)
+        self.remark = corpus.remark
+        facts: dict[str, Any] = {"unit": corpus.unit or "m"}
+        if corpus.frame_rate is not None:
+            facts["frame_rate"] = corpus.rate
+        if corpus.faces is not None:
+            facts["faces"] = corpus.faces
+        if corpus.colours is not None:
+            facts["colours"] = corpus.colours
+        if corpus.rest is not None:
+            facts["template"] = corpus.rest.astype(np.float32)
         self._facts = {**facts, **self._facts}  # type: ignore[typeddict-item]
-        for subject, template in known.templates.items():
+        for subject, template in corpus.templates.items():
             self._templates[subject] = {**self._facts, "template": np.asarray(template, np.float32)}
-        for clip, found_truth in known.truths.items():
+        for clip, found_truth in corpus.truths.items():
             self._subjects[clip] = found_truth.name.subject
-            if self.speech is None and known.corpus is not None:
-                sound = known.corpus / "wav" / f"{found_truth.path.stem}.wav"
+            if self.speech is None and corpus.corpus is not None:
+                sound = corpus.corpus / "wav" / f"{found_truth.path.stem}.wav"
                 if sound.is_file():
                     self._sounds[clip] = sound
         return {
-            clip: Motion(found_truth.path, self.facts_for(clip), known.truth_stride)
-            for clip, found_truth in known.truths.items()
+            clip: MotionFile(found_truth.path, self.facts_for(clip), corpus.truth_stride)
+            for clip, found_truth in corpus.truths.items()
         }
 
     def subject(self, clip: str) -> str:
@@ -215,7 +217,7 @@ class Material:
         """What a bare array of a clip lacks."""
         return self._templates.get(self.subject(clip), self._facts)
 
-    def open(self, name: str) -> Clip:
+    def open(self, name: str) -> StudyClip:
         """Read and check all animations of a clip.
 
         Raises:
@@ -245,7 +247,7 @@ class Material:
         templates = tuple(in_unit_of(first, animation).template for animation in read.values())
         colours = next((animation.colours for animation in read.values() if animation.colours is not None), None)
         same_mesh = len({len(template) for template in templates}) == 1
-        return Clip(
+        return StudyClip(
             name,
             self.subject(name),
             motions,
@@ -266,7 +268,7 @@ class Material:
         unused = [other for other in own if other not in used]
         return str(rng.choice(unused or own)) if own else None
 
-    def sound_of(self, clip: str, motion: Motion) -> Path | None:
+    def sound_of(self, clip: str, motion: MotionFile) -> Path | None:
         """The sound of a reference: its recording, or its own file if that is an archive."""
         return self._sounds.get(clip) or (motion.path if motion.path.suffix == ".npz" else None)
 
@@ -293,30 +295,30 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
             f"`facediff predict`"
         )
     pattern = NamePattern(DEFAULT_PATTERNS[0], subjects)
-    found: dict[str, dict[str | None, Path]] = {}
+    by_clip: dict[str, dict[str | None, Path]] = {}
     own: dict[str, str] = {}
     for file in files:
         read = pattern.match(file.stem)
         clip, condition = (read.clip, read.identity) if read is not None else (file.stem, None)
-        conditions = found.setdefault(clip, {})
+        conditions = by_clip.setdefault(clip, {})
         if condition in conditions:
             raise FaceDiffError(f"{file}: is of the same clip as {conditions[condition]}; keep one of them")
         conditions[condition] = file
         if read is not None and read.identity == read.subject:
             own[clip] = read.subject
     chosen = {}
-    for clip, conditions in found.items():
-        wanted = own.get(clip) if identity == OWN else identity
-        if wanted in conditions:
-            chosen[clip] = conditions[wanted]
+    for clip, conditions in by_clip.items():
+        asked_for = own.get(clip) if identity == OWN else identity
+        if asked_for in conditions:
+            chosen[clip] = conditions[asked_for]
         elif None in conditions:
             chosen[clip] = conditions[None]
         elif identity == OWN and len(conditions) == 1:
             chosen[clip] = next(iter(conditions.values()))
     if not chosen:
-        known = sorted({str(name) for conditions in found.values() for name in conditions if name})
+        stored = sorted({str(name) for conditions in by_clip.values() for name in conditions if name})
         raise FaceDiffError(
-            f"{folder}: holds no animation under the condition {identity}, but under {', '.join(known)}; choose one "
+            f"{folder}: holds no animation under the condition {identity}, but under {', '.join(stored)}; choose one "
             f"with --identity"
         )
     return chosen
@@ -326,10 +328,10 @@ def _recordings(folder: Path) -> dict[str, Path]:
     """Recordings of a folder by their names without the suffix."""
     if not folder.is_dir():
         raise FaceDiffError(f"--speech {folder}: no such folder; expected recordings named like the clips")
-    found = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES + CONTAINERS}
-    if not found:
+    recordings = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES + CONTAINERS}
+    if not recordings:
         raise FaceDiffError(f"--speech {folder}: holds no recording; expected {', '.join(SUFFIXES)}")
-    return found
+    return recordings
 
 
 def in_unit_of(first: Animation, other: Animation) -> Animation:
@@ -353,5 +355,5 @@ def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int
         speech, rate = animation.speech, animation.sample_rate
     else:
         speech, rate = read_speech(path), SAMPLE_RATE
-    wanted = round(seconds * rate)
-    return np.pad(speech[:wanted], (0, max(0, wanted - len(speech)))).astype(np.float32), rate
+    length = round(seconds * rate)
+    return np.pad(speech[:length], (0, max(0, length - len(speech)))).astype(np.float32), rate

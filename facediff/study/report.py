@@ -24,7 +24,7 @@ from facediff.study.statistics import (
     share_between_raters,
     wilson_interval,
 )
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from facediff.utils import ranges
 from facediff.utils.statistics import holm
 
@@ -89,7 +89,7 @@ class Preference:
 
 
 @dataclass(frozen=True)
-class Scores:
+class StrengthScores:
     """Bradley-Terry scores of one question.
 
     Attributes:
@@ -125,7 +125,7 @@ class Agreement:
 
 
 @dataclass(frozen=True)
-class Report:
+class StudyReport:
     """What the answers to a study say.
 
     Attributes:
@@ -146,7 +146,7 @@ class Report:
     raters: tuple[Rater, ...]
     checks: tuple[Checks, ...]
     preferences: tuple[Preference, ...]
-    scores: tuple[Scores, ...]
+    scores: tuple[StrengthScores, ...]
     agreement: tuple[Agreement, ...]
     sides: dict[str, tuple[float, tuple[float, float], int]]
     level: float
@@ -163,9 +163,9 @@ class Report:
         """The preference of one pair."""
         return next(
             (
-                each
-                for each in self.preferences
-                if (each.question, each.first, each.second) == (question, first, second)
+                preference
+                for preference in self.preferences
+                if (preference.question, preference.first, preference.second) == (question, first, second)
             ),
             None,
         )
@@ -181,24 +181,24 @@ class Report:
             "level": self.level,
             "interval": self.interval,
             "checks": [asdict(check) for check in self.checks],
-            "preferences": [asdict(each) | {"answers": each.answers} for each in self.preferences],
-            "bradley_terry": [asdict(each) for each in self.scores],
-            "agreement": [asdict(each) for each in self.agreement],
+            "preferences": [asdict(preference) | {"answers": preference.answers} for preference in self.preferences],
+            "bradley_terry": [asdict(scores) for scores in self.scores],
+            "agreement": [asdict(agreement) for agreement in self.agreement],
             "sides": {
                 question: {"left": share, "interval": interval, "answers": count}
                 for question, (share, interval, count) in self.sides.items()
             },
             "notes": self.notes,
         }
-        found: dict[str, Any] = _finite(content)
-        return found
+        finite: dict[str, Any] = _finite(content)
+        return finite
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401 - plain data
     if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
+        return {key: _finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
+        return [_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -216,8 +216,8 @@ def gather_raters(
     Returns:
         the raters, and a note on every file that was set aside.
     """
-    stored = Store(folder / DATABASE, study, read_only=True).raters() if (folder / DATABASE).is_file() else []
-    found: list[Rater] = []
+    stored = AnswerStore(folder / DATABASE, study, read_only=True).raters() if (folder / DATABASE).is_file() else []
+    downloaded: list[Rater] = []
     notes: list[str] = []
     for path in answer_files(files):
         try:
@@ -225,8 +225,8 @@ def gather_raters(
         except FaceDiffError as error:
             notes.append(f"set aside: {error}")
             continue
-        found += [] if rater is None else [rater]
-    return merge([stored, found]), notes
+        downloaded += [] if rater is None else [rater]
+    return merge([stored, downloaded]), notes
 
 
 def answer_files(paths: Sequence[Path]) -> list[Path]:
@@ -235,7 +235,7 @@ def answer_files(paths: Sequence[Path]) -> list[Path]:
     Raises:
         FaceDiffError: if one is not there, or a folder has none.
     """
-    found: dict[Path, Path] = {}
+    files: dict[Path, Path] = {}
     for path in paths:
         inside = sorted(path.glob("*.json")) if path.is_dir() else [path]
         if not inside:
@@ -243,8 +243,8 @@ def answer_files(paths: Sequence[Path]) -> list[Path]:
         if not path.exists():
             raise FaceDiffError(f"--answers {path}: no such file; expected answers that a rater has downloaded")
         for file in inside:
-            found.setdefault(file.resolve(), file)
-    return list(found.values())
+            files.setdefault(file.resolve(), file)
+    return list(files.values())
 
 
 def check_rater(rater: Rater, study: Study) -> Checks:
@@ -287,10 +287,10 @@ def check_rater(rater: Rater, study: Study) -> Checks:
 def answers_of(rater: Rater, trials: dict[str, Trial]) -> list[tuple[Trial, str, str]]:
     """Trial, question and answer, for every answer of a rater to a trial that the study has."""
     return [
-        (trials[answer.trial], question, given)
+        (trials[answer.trial], question, choice)
         for answer in rater.answers.values()
         if answer.trial in trials
-        for question, given in answer.answers.items()
+        for question, choice in answer.answers.items()
     ]
 
 
@@ -305,7 +305,7 @@ def analyse(
     resamples: ranges.Resamples = 1000,
     seed: ranges.Seed = 0,
     notes: Sequence[str] = (),
-) -> Report:
+) -> StudyReport:
     """Analyse the answers to a study. Controls and repeated pairs are no part of preferences.
 
     Args:
@@ -346,7 +346,7 @@ def analyse(
             unit = units[question].setdefault((trial.clip, frozenset((trial.left, trial.right))), [])
             unit.append(SAME if chosen is None else "first" if place[chosen] == i else "second")
     preferences: list[Preference] = []
-    scores: list[Scores] = []
+    scores: list[StrengthScores] = []
     agreement: list[Agreement] = []
     for question in questions:
         preferences += _preferences(
@@ -354,18 +354,18 @@ def analyse(
         )
         both = ties[question] + ties[question].transpose(0, 2, 1)
         try:
-            found = bradley_terry(wins[question] + both / 2)
+            strengths = bradley_terry(wins[question] + both / 2)
         except FaceDiffError:
-            found = None  # nobody has answered, or conditions that nobody has compared
-        if found is not None:
-            ends = found.intervals(level)
+            strengths = None  # nobody has answered, or conditions that nobody has compared
+        if strengths is not None:
+            ends = strengths.intervals(level)
             scores.append(
-                Scores(
+                StrengthScores(
                     question,
-                    {condition: float(found.scores[i]) for condition, i in place.items()},
+                    {condition: float(strengths.scores[i]) for condition, i in place.items()},
                     {condition: (float(ends[i, 0]), float(ends[i, 1])) for condition, i in place.items()},
-                    found.robust,
-                    found.bounded,
+                    strengths.robust,
+                    strengths.bounded,
                 )
             )
         judged = [unit for unit in units[question].values() if len(unit) > 1]
@@ -386,7 +386,7 @@ def analyse(
         for question, counted in sides.items()
         if counted[LEFT] + counted[RIGHT]
     }
-    return Report(
+    return StudyReport(
         name,
         study,
         tuple(raters),
@@ -413,16 +413,16 @@ def _preferences(
 ) -> list[Preference]:
     """The preferences of one question, the pairs in the order of the conditions."""
     of_answers = wilson_interval if interval == "wilson" else binomial_interval
-    found = []
+    preferences = []
     for i, first in enumerate(conditions):
         for j in range(i + 1, len(conditions)):
             won, lost, same = wins[:, i, j], wins[:, j, i], ties[:, i, j]
-            each = won + lost + same
-            count = int(each.sum())
+            answers = won + lost + same
+            count = int(answers.sum())
             if not count:
                 continue
             better = won + same / 2
-            found.append(
+            preferences.append(
                 Preference(
                     question,
                     first,
@@ -432,13 +432,16 @@ def _preferences(
                     int(same.sum()),
                     float(better.sum()) / count,
                     of_answers(float(better.sum()), count, level),
-                    share_between_raters(better, each, level, resamples=resamples, seed=seed),
+                    share_between_raters(better, answers, level, resamples=resamples, seed=seed),
                     binomial_p(int(won.sum()), int(won.sum() + lost.sum())),
                     1.0,
                 )
             )
-    corrected = holm([each.p for each in found])
-    return [Preference(**{**vars(each), "p_corrected": value}) for each, value in zip(found, corrected, strict=True)]
+    corrected = holm([preference.p for preference in preferences])
+    return [
+        Preference(**{**vars(preference), "p_corrected": value})
+        for preference, value in zip(preferences, corrected, strict=True)
+    ]
 
 
 def analyse_folder(
@@ -448,7 +451,7 @@ def analyse_folder(
     name: str | None = None,
     others: Collection[str] = (),
     **options: Any,  # noqa: ANN401 - passed on
-) -> Report:
+) -> StudyReport:
     """Analyse the study of a folder: what its server has stored, and files that raters have downloaded.
 
     Args:

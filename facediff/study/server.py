@@ -24,7 +24,7 @@ from facediff.study.answers import (
 )
 from facediff.study.definition import DATABASE, PAGE_FOLDER, VIDEO_FOLDER, Study, read_study
 from facediff.study.page import PAGE
-from facediff.study.store import FullError, Store
+from facediff.study.store import AnswerStore, FullError
 from facediff.utils.server import RefusedError, WithHeaders, read_body, require_server, run_server
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ MOST_BYTES = 32_768
 """Of a body; the longest comment in any script, and more."""
 
 
-def make_app(folder: Path, study: Study, store: Store) -> Starlette:
+def make_app(folder: Path, study: Study, store: AnswerStore) -> Starlette:
     """The ASGI application.
 
     Args:
@@ -126,7 +126,7 @@ def serve(
     port: int = 8000,
     most_raters: int | None = None,
     ready: Callable[[str], object] | None = None,
-) -> Store:
+) -> AnswerStore:
     """Serve a study until Ctrl-C; where its answers are.
 
     Args:
@@ -142,7 +142,7 @@ def serve(
     """
     require_server("serving a study")
     study = check_folder(folder)
-    store = Store(folder / DATABASE, study, most_raters=most_raters or MOST_RATERS)
+    store = AnswerStore(folder / DATABASE, study, most_raters=most_raters or MOST_RATERS)
     with suppress(KeyboardInterrupt):
         run_server(lambda _: make_app(folder, study, store), host=host, port=port, ready=ready)
     return store

@@ -81,9 +81,9 @@ def _rater(
     answers = {}
     for index, trial in enumerate(study.trials_of(number)):
         asked = asked_of(study, trial)
-        given = {question: answer(trial, tuple(allowed)) for question, allowed in asked.items()}
+        chosen = {question: answer(trial, tuple(allowed)) for question, allowed in asked.items()}
         at = f"2026-01-01T{index // 60 % 24:02d}:{index % 60:02d}:00Z"
-        answers[trial.id] = Answer(trial.id, given, float(rng.uniform(5, 30)), int(rng.integers(1, 4)), at)
+        answers[trial.id] = Answer(trial.id, chosen, float(rng.uniform(5, 30)), int(rng.integers(1, 4)), at)
     token = hashlib.sha256(f"{seed}/{number}".encode()).hexdigest()[:32]
     day = "2026-01-01"
     return Rater(token, number, study.languages[0], "simulated", f"{day}T00:00:00Z", f"{day}T23:59:59Z", answers)

@@ -227,11 +227,11 @@ def alpha_interval(
     values = sorted({value for unit in usable for value in unit})
     counts = np.array([[unit.count(value) for value in values] for unit in usable], np.float64)
     rng = np.random.default_rng(seed)
-    found = np.array([_alpha(counts[rng.integers(0, len(counts), len(counts))]) for _ in range(resamples)])
-    found = found[np.isfinite(found)]
-    if not len(found):
+    alphas = np.array([_alpha(counts[rng.integers(0, len(counts), len(counts))]) for _ in range(resamples)])
+    alphas = alphas[np.isfinite(alphas)]
+    if not len(alphas):
         return math.nan, math.nan
-    lower, upper = np.quantile(found, [(1 - level) / 2, (1 + level) / 2])
+    lower, upper = np.quantile(alphas, [(1 - level) / 2, (1 + level) / 2])
     return float(lower), float(upper)
 
 
@@ -246,8 +246,8 @@ def _powers(counts: npt.NDArray[np.int64], share: float, level: float) -> Array:
     # The largest number of wins that is still rejected at the lower end; the upper end mirrors it.
     low = binom.ppf((1 - level) / 2, counts, 0.5)
     low = np.where(binom.cdf(low, counts, 0.5) > (1 - level) / 2, low - 1, low)
-    found: Array = binom.cdf(low, counts, share) + binom.sf(counts - low - 1, counts, share)
-    return np.where(low < 0, 0.0, found)
+    power: Array = binom.cdf(low, counts, share) + binom.sf(counts - low - 1, counts, share)
+    return np.where(low < 0, 0.0, power)
 
 
 @dataclass(frozen=True)

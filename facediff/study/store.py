@@ -38,7 +38,7 @@ class FullError(FaceDiffError):
     """There are as many raters as the study takes."""
 
 
-class Store:
+class AnswerStore:
     """The answers to a study.
 
     Every call opens the file anew, so that a store may be used from several threads and processes. Transactions are
@@ -63,16 +63,16 @@ class Store:
             database.execute("PRAGMA journal_mode = WAL")
             database.executescript(SCHEMA)
             database.execute("BEGIN IMMEDIATE")
-            known = [row[0] for row in database.execute("SELECT id FROM study")]
+            studies = [row[0] for row in database.execute("SELECT id FROM study")]
             if database.execute("SELECT 1 FROM raters LIMIT 1").fetchone():
-                self._refuse_other(next(iter(known), None))
+                self._refuse_other(next(iter(studies), None))
             database.execute("DELETE FROM study")
             database.execute("INSERT INTO study VALUES (?)", (study.id,))
             database.execute("COMMIT")
 
-    def _refuse_other(self, known: str | None) -> None:
-        if known not in (None, self.study.id):
-            raise FaceDiffError(f"{self.path}: holds answers to another study, {known}; move it to another folder")
+    def _refuse_other(self, stored: str | None) -> None:
+        if stored not in (None, self.study.id):
+            raise FaceDiffError(f"{self.path}: holds answers to another study, {stored}; move it to another folder")
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
@@ -99,9 +99,9 @@ class Store:
             FullError: if there are as many raters as the study takes.
         """
         with self._write() as database:
-            known = database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()
-            if known is not None:
-                return int(known[0])
+            row = database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()
+            if row is not None:
+                return int(row[0])
             number = int(database.execute("SELECT coalesce(max(number) + 1, 0) FROM raters").fetchone()[0])
             if number >= self.most_raters:
                 raise FullError(f"the study has its {self.most_raters} raters; thank you all the same")
@@ -111,8 +111,8 @@ class Store:
     def number(self, token: str) -> int | None:
         """The number of a rater; None if the rater is not known."""
         with self._open() as database:
-            known = database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()
-            return None if known is None else int(known[0])
+            row = database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()
+            return None if row is None else int(row[0])
 
     def save(self, token: str, answer: Answer) -> bool:
         """Store a known rater's answers to a trial; False if there were some already, which stay."""
@@ -130,8 +130,8 @@ class Store:
         """
         with self._write() as database:
             number = int(database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()[0])
-            given = {row[0] for row in database.execute("SELECT trial FROM answers WHERE rater = ?", (token,))}
-            if not {trial.id for trial in self.study.trials_of(number)} <= given:
+            answered = {row[0] for row in database.execute("SELECT trial FROM answers WHERE rater = ?", (token,))}
+            if not {trial.id for trial in self.study.trials_of(number)} <= answered:
                 return False
             for question, text in comments.items():
                 database.execute(
@@ -145,10 +145,10 @@ class Store:
         with self._open() as database:
             database.execute("BEGIN")  # one moment for all tables
             answers: dict[str, dict[str, Answer]] = {}
-            for rater, trial, given, seconds, plays, at in database.execute(
+            for rater, trial, stored, seconds, plays, at in database.execute(
                 "SELECT rater, trial, answers, seconds, plays, at FROM answers ORDER BY at, trial"
             ):
-                answers.setdefault(rater, {})[trial] = Answer(trial, parse_json(given, self.path), seconds, plays, at)
+                answers.setdefault(rater, {})[trial] = Answer(trial, parse_json(stored, self.path), seconds, plays, at)
             comments: dict[str, dict[str, str]] = {}
             for rater, question, text in database.execute("SELECT rater, question, text FROM comments"):
                 comments.setdefault(rater, {})[question] = text

@@ -16,7 +16,7 @@ from typing import Any
 
 from facediff.errors import printable
 from facediff.study.definition import SAME
-from facediff.study.report import Preference, Report, answers_of
+from facediff.study.report import Preference, StudyReport, answers_of
 from facediff.utils.files import atomic
 from facediff.utils.plain_files import json_text, write_rows
 from facediff.utils.tables import format_table, html_table, latex_table, markdown_table
@@ -36,7 +36,7 @@ svg { max-width: 100%; height: auto; } svg text { fill: currentColor; font-size:
 WIDTH, LEFT_EDGE, ROW = 720, 260, 26
 
 
-def write_report(reports: Sequence[Report], folder: Path) -> list[Path]:
+def write_report(reports: Sequence[StudyReport], folder: Path) -> list[Path]:
     """Write all forms into a folder; the files.
 
     ``table.*`` is the table, ``report.*`` is everything, and ``answers.*`` holds every single answer.
@@ -77,12 +77,12 @@ def between(ends: tuple[float, float], show: Callable[[float], str]) -> str:
     return "–" if not all(map(math.isfinite, ends)) else f"[{show(ends[0])}, {show(ends[1])}]"
 
 
-def questions(reports: Sequence[Report]) -> list[str]:
+def questions(reports: Sequence[StudyReport]) -> list[str]:
     """Names of the questions of all studies, in order."""
     return list(dict.fromkeys(question.name for report in reports for question in report.study.choices))
 
 
-def main_table(reports: Sequence[Report], question: str) -> tuple[list[str], Cells]:
+def main_table(reports: Sequence[StudyReport], question: str) -> tuple[list[str], Cells]:
     """Table 4: how often the first method was preferred, in percent with an interval; a column a data set."""
     pairs = list(
         dict.fromkeys(
@@ -103,7 +103,7 @@ def main_table(reports: Sequence[Report], question: str) -> tuple[list[str], Cel
     return head, rows
 
 
-def pair_table(report: Report, question: str) -> tuple[list[str], Cells]:
+def pair_table(report: StudyReport, question: str) -> tuple[list[str], Cells]:
     """Every pair of a study with everything that is known of it."""
     head = ["pair", "answers", "first %", report.interval, "between raters", "p", "p corrected"]
     head += ["no difference"] if any(each.same for each in report.preferences) else []
@@ -123,7 +123,7 @@ def p_value(value: float) -> str:
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
-def score_table(report: Report, question: str) -> tuple[list[str], Cells]:
+def score_table(report: StudyReport, question: str) -> tuple[list[str], Cells]:
     """Bradley-Terry scores, the highest first."""
     found = next((each for each in report.scores if each.question == question), None)
     rows: Cells = []
@@ -133,14 +133,14 @@ def score_table(report: Report, question: str) -> tuple[list[str], Cells]:
     return ["Bradley-Terry", "score", "interval"], rows
 
 
-def rater_table(report: Report) -> tuple[list[str], Cells]:
+def rater_table(report: StudyReport) -> tuple[list[str], Cells]:
     """Why raters are not counted, and how many."""
     reasons = Counter(reason.split(" in ")[0] for check in report.checks for reason in check.reasons)
     rows: Cells = [["all", str(len(report.raters))], ["counted", str(len(report.counted))]]
     return ["raters", "number"], rows + [[reason, str(count)] for reason, count in sorted(reasons.items())]
 
 
-def facts(report: Report) -> list[str]:
+def facts(report: StudyReport) -> list[str]:
     """What the numbers are, in sentences."""
     rule, level = report.study.rule, f"{100 * report.level:g} %"
     kind = "Wilson's score" if report.interval == "wilson" else "the exact binomial (Clopper-Pearson)"
@@ -176,12 +176,12 @@ def facts(report: Report) -> list[str]:
     return [*lines, *report.notes]
 
 
-def preference_rows(reports: Sequence[Report]) -> list[dict[str, Any]]:
+def preference_rows(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
     """One flat row for each study, question and pair."""
     return [_flat(report, each) for report in reports for each in report.preferences]
 
 
-def _flat(report: Report, each: Preference) -> dict[str, Any]:
+def _flat(report: StudyReport, each: Preference) -> dict[str, Any]:
     known = math.isfinite(each.between_raters[0])
     return {
         "study": report.name,
@@ -205,12 +205,12 @@ def _flat(report: Report, each: Preference) -> dict[str, Any]:
     }
 
 
-def answer_rows(reports: Sequence[Report]) -> list[dict[str, Any]]:
+def answer_rows(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
     """One flat row for every answer of every rater."""
     return [row for report in reports for row in _answers(report)]
 
 
-def _answers(report: Report) -> Iterator[dict[str, Any]]:
+def _answers(report: StudyReport) -> Iterator[dict[str, Any]]:
     counted = {rater.token for rater in report.counted}
     for rater in report.raters:
         for trial, question, answer in answers_of(rater, report.study.by_id):
@@ -236,7 +236,7 @@ def _answers(report: Report) -> Iterator[dict[str, Any]]:
             }
 
 
-def comments(reports: Sequence[Report]) -> list[dict[str, Any]]:
+def comments(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
     """One flat row for every free text."""
     return [
         {"study": report.name, "rater": rater.token, "language": rater.language, "question": question, "text": text}
@@ -249,7 +249,7 @@ def comments(reports: Sequence[Report]) -> list[dict[str, Any]]:
 # Forms.
 
 
-def markdown(reports: Sequence[Report]) -> str:
+def markdown(reports: Sequence[StudyReport]) -> str:
     """The report in Markdown."""
     parts = ["# User study"]
     for question in questions(reports):
@@ -264,7 +264,7 @@ def markdown(reports: Sequence[Report]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def latex(reports: Sequence[Report]) -> str:
+def latex(reports: Sequence[StudyReport]) -> str:
     """The main tables for a paper."""
     lines = ["% \\usepackage{booktabs}"]
     for question in questions(reports):
@@ -278,7 +278,7 @@ def latex(reports: Sequence[Report]) -> str:
     return "\n\n".join(lines) + "\n"
 
 
-def text(report: Report) -> str:
+def text(report: StudyReport) -> str:
     """The report for the terminal."""
     lines = [f"{report.name}: {len(report.counted)} of {len(report.raters)} raters are counted"]
     for question in report.study.choices:
@@ -289,7 +289,7 @@ def text(report: Report) -> str:
     return "\n".join(lines)
 
 
-def page(reports: Sequence[Report]) -> str:
+def page(reports: Sequence[StudyReport]) -> str:
     """The report as one page that loads nothing."""
     escape = html.escape
     parts = ["<h1>User study</h1>"]
@@ -310,7 +310,7 @@ def page(reports: Sequence[Report]) -> str:
     return f'<!doctype html>\n<html lang="en"><head>{meta}</head>\n<body>\n{body}\n</body></html>\n'
 
 
-def plot(report: Report, question: str) -> str:
+def plot(report: StudyReport, question: str) -> str:
     """Shares with their intervals, as SVG."""
     rows = [each for each in report.preferences if each.question == question]
     high = ROW * len(rows) + 40
@@ -337,6 +337,6 @@ def plot(report: Report, question: str) -> str:
     return f"<figure>{drawing}<figcaption>{words}</figcaption></figure>"
 
 
-def json_report(reports: Sequence[Report]) -> str:
+def json_report(reports: Sequence[StudyReport]) -> str:
     """Everything as JSON."""
     return json.dumps({"studies": [report.as_dict() for report in reports]}, indent=2, ensure_ascii=True)

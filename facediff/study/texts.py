@@ -30,12 +30,12 @@ MOST_QUESTIONS = 20
 def bundled_texts() -> dict[str, dict[str, Any]]:
     """The words of the page by language: all that ``assets/texts`` holds, English first."""
     folder = resources.files("facediff.study").joinpath("assets", "texts")
-    found = {
+    by_language = {
         entry.name.removesuffix(".json"): parse_json(entry.read_bytes(), entry.name)
         for entry in folder.iterdir()
         if entry.name.endswith(".json")
     }
-    return dict(sorted(found.items(), key=lambda item: (item[0] != "en", item[0])))
+    return dict(sorted(by_language.items(), key=lambda item: (item[0] != "en", item[0])))
 
 
 def check_languages(languages: Sequence[str] | None) -> list[str]:
@@ -44,11 +44,11 @@ def check_languages(languages: Sequence[str] | None) -> list[str]:
     Raises:
         FaceDiffError: if the words of one are not bundled.
     """
-    known = bundled_texts()
+    bundled = bundled_texts()
     for language in languages or ():
-        if language not in known:
-            raise FaceDiffError(f'--languages: there are no texts in "{language}": {choices(language, known)}')
-    return list(languages or known)
+        if language not in bundled:
+            raise FaceDiffError(f'--languages: there are no texts in "{language}": {choices(language, bundled)}')
+    return list(languages or bundled)
 
 
 def standard(name: str, languages: Sequence[str]) -> dict[str, str]:
@@ -64,9 +64,9 @@ def bundled_question(name: str, languages: Sequence[str]) -> Question:
     """
     if name not in BUNDLED:
         raise FaceDiffError(f'there is no bundled question "{name}": {choices(name, BUNDLED)}')
-    known = BUNDLED[name]
+    question = BUNDLED[name]
     text = {language: bundled_texts()[language]["questions"][name] for language in languages}
-    return Question(name, text, known.kind, known.reference, known.no_difference)
+    return Question(name, text, question.kind, question.reference, question.no_difference)
 
 
 class Questionnaire:
@@ -98,18 +98,18 @@ class Questionnaire:
             content = load_yaml(path, REMEDY)
         for key in content:
             if key not in ("questions", "title", "consent", "rule"):
-                known = choices(key, ("questions", "title", "consent", "rule"))
-                raise FaceDiffError(f'{path}: has the unknown field "{key}": {known}')
+                advice = choices(key, ("questions", "title", "consent", "rule"))
+                raise FaceDiffError(f'{path}: has the unknown field "{key}": {advice}')
         self.title = self._texts(content.get("title"), "title", standard("title", languages))
         self.consent = self._texts(content.get("consent"), "consent", standard("consent", languages))
         self.rule: Rule = make_rule(content.get("rule"), path)
-        given = content.get("questions")
-        self.chosen = given is not None
-        if given is None:
-            given = [*PAPER_QUESTIONS, "comments"]
-        if not isinstance(given, list) or not 1 <= len(given) <= MOST_QUESTIONS:
+        listed = content.get("questions")
+        self.chosen = listed is not None
+        if listed is None:
+            listed = [*PAPER_QUESTIONS, "comments"]
+        if not isinstance(listed, list) or not 1 <= len(listed) <= MOST_QUESTIONS:
             raise FaceDiffError(f"{path}: questions are no list of 1 to {MOST_QUESTIONS}; {REMEDY}")
-        self.questions = [self._question(each, f"questions[{i}]") for i, each in enumerate(given)]
+        self.questions = [self._question(entry, f"questions[{i}]") for i, entry in enumerate(listed)]
         names = [question.name for question in self.questions]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
@@ -117,54 +117,54 @@ class Questionnaire:
         if not any(question.kind == "choice" for question in self.questions):
             raise FaceDiffError(f"{path}: questions ask for no choice between two videos; {REMEDY}")
 
-    def _question(self, given: object, place: str) -> Question:
-        if isinstance(given, str):
+    def _question(self, content: object, place: str) -> Question:
+        if isinstance(content, str):
             try:
-                return bundled_question(given, self.languages)
+                return bundled_question(content, self.languages)
             except FaceDiffError as error:
                 raise FaceDiffError(f"{self.source}: {place}: {error}") from error
-        if not isinstance(given, dict):
-            raise FaceDiffError(f"{self.source}: {place} is {quoted(given)}; {REMEDY}")
-        known = ("name", "text", "kind", "reference", "no_difference")
-        wrong = next((key for key in given if key not in known), None)
+        if not isinstance(content, dict):
+            raise FaceDiffError(f"{self.source}: {place} is {quoted(content)}; {REMEDY}")
+        keys = ("name", "text", "kind", "reference", "no_difference")
+        wrong = next((key for key in content if key not in keys), None)
         if wrong is not None:
-            raise FaceDiffError(f"{self.source}: {place} has the unknown field {quoted(wrong)}: {choices('', known)}")
-        name = given.get("name")
+            raise FaceDiffError(f"{self.source}: {place} has the unknown field {quoted(wrong)}: {choices('', keys)}")
+        name = content.get("name")
         if not isinstance(name, str) or not NAME.fullmatch(name):
             raise FaceDiffError(
                 f"{self.source}: {place}.name is {quoted(name)}; expected small letters, digits and underscores"
             )
         flags = {}
         for flag in ("reference", "no_difference"):
-            value = given.get(flag, getattr(BUNDLED.get(name), flag, False))
+            value = content.get(flag, getattr(BUNDLED.get(name), flag, False))
             if not isinstance(value, bool):
                 raise FaceDiffError(f"{self.source}: {place}.{flag} is {quoted(value)}; expected true or false")
             flags[flag] = value
-        kind = given.get("kind", BUNDLED[name].kind if name in BUNDLED else "choice")
+        kind = content.get("kind", BUNDLED[name].kind if name in BUNDLED else "choice")
         if kind not in ("choice", "text"):
             raise FaceDiffError(f"{self.source}: {place}.kind is {quoted(kind)}; expected choice or text")
         if kind == "text" and any(flags.values()):
             raise FaceDiffError(f"{self.source}: {place}: a text has no reference and no third answer; omit them")
         standard_text = bundled_question(name, self.languages).text if name in BUNDLED else None
-        return Question(name, self._texts(given.get("text"), f"{place}.text", standard_text), kind, **flags)
+        return Question(name, self._texts(content.get("text"), f"{place}.text", standard_text), kind, **flags)
 
-    def _texts(self, given: object, place: str, default: Texts | None) -> dict[str, str]:
+    def _texts(self, content: object, place: str, default: Texts | None) -> dict[str, str]:
         """A text for every language: one for all, or one by language."""
-        if given is None and default is not None:
+        if content is None and default is not None:
             return dict(default)
-        found = dict.fromkeys(self.languages, given) if isinstance(given, str) else given
-        if not isinstance(found, dict):
-            raise FaceDiffError(f"{self.source}: {place} is {quoted(given)}; expected a text, or one by language")
-        for language in found:
+        texts = dict.fromkeys(self.languages, content) if isinstance(content, str) else content
+        if not isinstance(texts, dict):
+            raise FaceDiffError(f"{self.source}: {place} is {quoted(content)}; expected a text, or one by language")
+        for language in texts:
             if not isinstance(language, str) or not LANGUAGE.fullmatch(language):
                 raise FaceDiffError(f"{self.source}: {place} has the language {quoted(language)}; expected en, de …")
         for language in self.languages:
-            text = found.get(language)
+            text = texts.get(language)
             if not isinstance(text, str) or not text.strip() or len(text) > LONGEST_TEXT:
                 raise FaceDiffError(
                     f"{self.source}: {place} has no text in {language}; add one, or choose --languages without it"
                 )
-        return {language: str(found[language]) for language in self.languages}
+        return {language: str(texts[language]) for language in self.languages}
 
 
 def page_texts(languages: Sequence[str]) -> Mapping[str, Mapping[str, str]]:

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from facediff.benchmark.statistics import Scores, compared, difference, marked, sign_flip, welch
+from facediff.benchmark.statistics import RowScores, compared, difference, marked, sign_flip, welch
 from facediff.evaluation.report import Bootstrap
 from facediff.utils.statistics import holm
 
 BOOTSTRAP = Bootstrap(2000, 0.95, 0)
 
 
-def scores(values: np.ndarray, weights: np.ndarray | None = None, *, fixed: bool = False) -> Scores:
+def scores(values: np.ndarray, weights: np.ndarray | None = None, *, fixed: bool = False) -> RowScores:
     """Scores of a row from values (runs, sentences)."""
     weights = np.ones(values.shape[1]) if weights is None else weights
-    return Scores(
+    return RowScores(
         (values * weights).sum(1) / weights.sum(), values, weights, tuple(map(str, range(len(weights)))), fixed
     )
 
 
-def table(rows: int, rng: np.random.Generator, *, runs: int = 3, sentences: int = 12) -> dict[str, Scores]:
+def table(rows: int, rng: np.random.Generator, *, runs: int = 3, sentences: int = 12) -> dict[str, RowScores]:
     """Rows without any difference but chance: of sentences, of runs, and of both together."""
     difficulty = rng.normal(0, 1, sentences)
     return {
@@ -102,7 +102,7 @@ def test_a_difference_is_that_of_the_pooled_scores_over_common_sentences() -> No
     found = difference(one, other, BOOTSTRAP)
     assert found.value == pytest.approx(one.mean - other.mean)
     assert found.p == max(found.p_sentences or 0, found.p_runs or 0)
-    part = Scores(other.runs, other.values[:, 3:], frames[3:], other.clips[3:])  # type: ignore[index]
+    part = RowScores(other.runs, other.values[:, 3:], frames[3:], other.clips[3:])  # type: ignore[index]
     less = difference(one, part, BOOTSTRAP)
     assert less.common == 9
     mine = np.average(one.values[:, 3:], axis=1, weights=frames[3:]).mean()  # type: ignore[index]

@@ -20,7 +20,7 @@ from facediff.cli.app import COMMANDS, load, main
 from facediff.cli.options import named_folders
 from facediff.cli.parsing import arguments_of
 from facediff.errors import FaceDiffError
-from facediff.evaluation.figures import Material
+from facediff.evaluation.figures import FigureData
 from tests.fakes.tiny import VERTICES
 from tests.fakes.words import last_of_each
 
@@ -85,11 +85,11 @@ def test_in_a_process_of_its_own(corpus: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "figure.pdf").read_bytes().startswith(b"%PDF")
 
 
-def gather(corpus: Path, *more: str) -> Material:
+def gather(corpus: Path, *more: str) -> FigureData:
     """What the command finds by its options."""
     words = [str(corpus.parent / "ours"), str(corpus), "-o", "a.png", *more]
     given = arguments_of(load("figure heatmap"), "facediff figure heatmap", words)
-    material: Material = given["files"].gather(given["predictions"], given["truth"], given["page"])[1]
+    material: FigureData = given["files"].gather(given["predictions"], given["truth"], given["page"])[1]
     return material
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from facediff.evaluation import Report, evaluate
+from facediff.evaluation import EvaluationReport, evaluate
 from facediff.metrics import Region
 from facediff.utils.pickles import load_pickle
 
@@ -56,7 +56,7 @@ class Files:
         loaded: dict[str, Array] = load_pickle(self.root / "templates.pkl")
         return loaded
 
-    def evaluate(self, *methods: str, **options: object) -> Report:
+    def evaluate(self, *methods: str, **options: object) -> EvaluationReport:
         """The evaluator with this corpus's regions and templates."""
         defaults: dict[str, Any] = {
             "lips": Region.from_indices("lips", LIPS),
@@ -139,5 +139,5 @@ def expected(truths: list[Array], predictions: list[Array], templates: list[Arra
     }
 
 
-def scores_of(report: Report, method: int = 0) -> dict[str, float]:
+def scores_of(report: EvaluationReport, method: int = 0) -> dict[str, float]:
     return {f"{score.protocol}/{score.metric}": score.value for score in report.methods[method].scores}

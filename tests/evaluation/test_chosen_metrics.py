@@ -16,7 +16,7 @@ from torchmetrics import Metric
 import facediff.metrics as fm
 from facediff import registry
 from facediff.errors import FaceDiffError
-from facediff.evaluation import Report, text
+from facediff.evaluation import EvaluationReport, text
 from facediff.metrics import LipPairs, parse
 from facediff.speech.phonemes import closures, read_phonemes
 from tests.evaluation.conftest import LENGTHS, LIPS, VERTICES, Files, write_corpus
@@ -61,11 +61,11 @@ def corpus(tmp_path: Path) -> Files:
     return files
 
 
-def scored(files: Files, *metrics: str, **options: object) -> Report:
+def scored(files: Files, *metrics: str, **options: object) -> EvaluationReport:
     return files.evaluate(metrics=metrics, corpus=files.root, protocols=["meshtalk"], **options)
 
 
-def values(report: Report) -> dict[str, float]:
+def values(report: EvaluationReport) -> dict[str, float]:
     return {score.metric: score.value for score in report.methods[0].scores if score.protocol == "metrics"}
 
 

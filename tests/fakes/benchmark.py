@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from facediff.benchmark import Outline, Result
+from facediff.benchmark import ReportOutline, Result
 from facediff.benchmark.outline import write_outline
 
 COLUMNS: dict[str, dict[str, str | None]] = {
@@ -80,9 +80,9 @@ def _result(place: int, run: int, sequences: list[dict[str, object]], corpus: st
     )
 
 
-def outline(*, rows: int = 3, seeds: int = 3, corpus: str = "tiny", baseline: str = "method_0") -> Outline:
+def outline(*, rows: int = 3, seeds: int = 3, corpus: str = "tiny", baseline: str = "method_0") -> ReportOutline:
     """The outline that :func:`results` belong to."""
-    return Outline(
+    return ReportOutline(
         name="made",
         title="Made-up methods",
         description="",

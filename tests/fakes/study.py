@@ -16,7 +16,7 @@ from facediff.study.definition import DATABASE, PAGE_FOLDER, VIDEO_FOLDER, Rule,
 from facediff.study.design import Design, Pairs, make_forms, make_pairs, make_schedules
 from facediff.study.page import write_page
 from facediff.study.simulation import simulate
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from facediff.study.texts import bundled_question, standard
 from tests.fakes.clicks import RATE, SAMPLE_RATE, clicks
 
@@ -74,9 +74,9 @@ def write_study(folder: Path, study: Study) -> Path:
     return folder
 
 
-def write_answers(folder: Path, study: Study, raters: int, seed: int = 0) -> Store:
+def write_answers(folder: Path, study: Study, raters: int, seed: int = 0) -> AnswerStore:
     """Simulated raters, as the server stores them."""
-    store = Store(folder / DATABASE, study)
+    store = AnswerStore(folder / DATABASE, study)
     for rater in simulate(study, SCORES, raters, seed=seed):
         assert store.register(rater.token, rater.language, rater.code) == rater.number
         for answer in rater.answers.values():

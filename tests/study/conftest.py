@@ -10,7 +10,7 @@ import pytest
 from facediff.study import StudyOptions, plan_study, read_study
 from facediff.study.definition import DATABASE
 from facediff.study.server import make_app
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from tests.fakes.serving import servers
 from tests.fakes.study import write_methods
 
@@ -24,7 +24,7 @@ def serve() -> Iterator[Serve]:
 
         def start(folder: Path) -> str:
             study = read_study(folder)
-            return running.start(make_app(folder, study, Store(folder / DATABASE, study)))[0]
+            return running.start(make_app(folder, study, AnswerStore(folder / DATABASE, study)))[0]
 
         yield start
 

@@ -24,7 +24,7 @@ from facediff.render import video as encoding
 from facediff.study import StudyOptions, plan_study, read_study
 from facediff.study.definition import DATABASE, Trial
 from facediff.study.page import page_of
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from facediff.study.texts import bundled_texts
 from tests.fakes.study import write_methods
 from tests.fakes.tiny import write_tiny
@@ -213,7 +213,7 @@ def test_animations_that_do_not_belong_together_are_refused(place: Path, refused
 def test_a_study_with_answers_is_not_replaced(place: Path, refused: Callable[..., str]) -> None:
     assert make(*FEW) == 0
     study = read_study(place / "study")
-    Store(place / "study" / DATABASE, study).register("a" * 32, "en", "")
+    AnswerStore(place / "study" / DATABASE, study).register("a" * 32, "en", "")
     assert make(*FEW) == 0  # the same study
     words = ("ours=ours", "theirs=theirs", "--truth", "truth", "-o", "study", "--seed", "5")
     assert "answers" in refused(*words)

@@ -13,7 +13,7 @@ from facediff.study import read_study
 from facediff.study.answers import check_rater
 from facediff.study.definition import DATABASE, PAGE_FOLDER
 from facediff.study.report import analyse_folder
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from tests.study.conftest import Serve
 from tools.browser.chromium import Chromium, Page
 
@@ -88,7 +88,7 @@ def test_served_from_the_first_click_to_the_report(made: Path, serve: Serve, bro
     page.wait_for("facediffStudy.state.closed")
     stays_clean(page)
     assert {url.split("/")[2] for url in page.requests if url.startswith("http")} == {address.split("/")[2]}
-    (rater,) = Store(made / DATABASE, study).raters()
+    (rater,) = AnswerStore(made / DATABASE, study).raters()
     assert [trial.id for trial in study.trials_of(0)] == list(rater.answers)
     given = [answer.answers for answer in rater.answers.values()]
     assert given == [{"realism": side, "lips": side} for side in ("left", "right", "left")]
@@ -153,7 +153,7 @@ def test_two_raters_at_once_have_numbers_and_answers_of_their_own(made: Path, se
         for page in pages:
             page.wait_for("facediffStudy.state.sent === 1")
             stays_clean(page)
-    raters = Store(made / DATABASE, study).raters()
+    raters = AnswerStore(made / DATABASE, study).raters()
     assert [rater.number for rater in raters] == [0, 1]
     assert [[list(a.answers.values()) for a in r.answers.values()] for r in raters] == [
         [["left", "left"]],

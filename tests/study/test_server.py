@@ -20,7 +20,7 @@ from facediff.study import serve as serve_study
 from facediff.study import simulate
 from facediff.study.definition import DATABASE, Study
 from facediff.study.server import MOST_BYTES, check_folder
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from tests.fakes.study import SCORES, small_study, write_study
 from tests.study.conftest import Serve
 
@@ -74,7 +74,7 @@ def test_a_rater_answers_and_finishes_and_repeats_change_nothing(address: str, s
     for place in range(len(study.trials_of(0))):
         assert ask(f"{address}/api/answers", given(study, 0, place))[0] == 200
     assert ask(f"{address}/api/finish", end) == ask(f"{address}/api/finish", end) == (200, {"finished": True})
-    first, second = Store(tmp_path / "study" / DATABASE, study).raters()
+    first, second = AnswerStore(tmp_path / "study" / DATABASE, study).raters()
     assert first.comments == {"comments": "'; DROP TABLE raters; --"}
     assert [len(first.answers), len(second.answers)] == [len(study.trials_of(0)), 0]
     assert first.answers[study.trials_of(0)[0].id].seconds == 2.5
@@ -107,7 +107,7 @@ def test_what_the_page_does_not_send_is_refused_and_not_stored(
     begin(address, study)
     status, _ = ask(f"{address}/api/answers", given(study, 0, **WRONG[name]))
     assert status == 400
-    assert not Store(tmp_path / "study" / DATABASE, study).raters()[0].answers
+    assert not AnswerStore(tmp_path / "study" / DATABASE, study).raters()[0].answers
 
 
 def test_bodies_of_other_kinds_and_sizes_are_refused(address: str, study: Study) -> None:

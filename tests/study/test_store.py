@@ -16,7 +16,7 @@ import pytest
 from facediff.errors import FaceDiffError
 from facediff.study import simulate
 from facediff.study.answers import Answer
-from facediff.study.store import FullError, Store
+from facediff.study.store import AnswerStore, FullError
 from tests.fakes.study import SCORES, small_study, write_answers
 
 HOSTILE = "'); DROP TABLE answers; -- \"<script>alert(1)</script>\n=cmd() \u202e 😀"
@@ -37,7 +37,7 @@ def test_what_is_stored_comes_back(tmp_path: Path) -> None:
 
 def test_a_second_submission_changes_nothing(tmp_path: Path) -> None:
     study = small_study()
-    store = Store(tmp_path / "a.sqlite", study)
+    store = AnswerStore(tmp_path / "a.sqlite", study)
     assert [store.register(TOKEN, "en", ""), store.register(TOKEN, "de", "x")] == [0, 0]
     trial = study.trials_of(0)[0].id
     first = Answer(trial, {"realism": "left", "style": "right"}, 3.0, 1, "2026-01-01T00:00:00Z")
@@ -51,7 +51,7 @@ def test_a_second_submission_changes_nothing(tmp_path: Path) -> None:
 
 def test_hostile_text_is_text(tmp_path: Path) -> None:
     study = small_study()
-    store = Store(tmp_path / "a.sqlite", study)
+    store = AnswerStore(tmp_path / "a.sqlite", study)
     store.register(TOKEN, "en", HOSTILE)
     for trial in study.trials_of(0):
         store.save(TOKEN, Answer(trial.id, {"realism": "left", "style": "left"}, 1.0, 1, "2026-01-01T00:00:00Z"))
@@ -64,7 +64,7 @@ def test_hostile_text_is_text(tmp_path: Path) -> None:
 
 def test_raters_at_the_same_time_get_numbers_of_their_own_and_lose_nothing(tmp_path: Path) -> None:
     study = small_study()
-    store = Store(tmp_path / "a.sqlite", study)
+    store = AnswerStore(tmp_path / "a.sqlite", study)
     raters = simulate(study, SCORES, 12, seed=3)
 
     def answer(index: int) -> int:
@@ -84,10 +84,10 @@ WRITER = """
 import sys
 from pathlib import Path
 from facediff.study.answers import Answer
-from facediff.study.store import Store
+from facediff.study.store import AnswerStore
 from tests.fakes.study import small_study
 study = small_study(clips=40)
-store = Store(Path(sys.argv[1]), study)
+store = AnswerStore(Path(sys.argv[1]), study)
 store.register("0" * 32, "en", "")
 for trial in study.trials_of(0):
     store.save("0" * 32, Answer(trial.id, {"realism": "left", "style": "left"}, 1.0, 1, "2026-01-01T00:00:00Z"))
@@ -104,25 +104,25 @@ def test_a_kill_loses_nothing_that_was_acknowledged(tmp_path: Path) -> None:
         said = [process.stdout.readline().strip() for _ in range(15)]
         os.kill(process.pid, signal.SIGKILL)
         said += process.stdout.read().split()
-    (rater,) = Store(tmp_path / "a.sqlite", small_study(clips=40)).raters()
+    (rater,) = AnswerStore(tmp_path / "a.sqlite", small_study(clips=40)).raters()
     assert {each for each in said if each and each != "all"} <= set(rater.answers)
 
 
 def test_a_full_study_other_studies_and_damaged_files_are_refused(tmp_path: Path) -> None:
     study = small_study()
-    store = Store(tmp_path / "a.sqlite", study, most_raters=1)
-    Store(tmp_path / "a.sqlite", small_study(seed=1))  # nobody has answered yet
-    store = Store(tmp_path / "a.sqlite", study, most_raters=1)
+    store = AnswerStore(tmp_path / "a.sqlite", study, most_raters=1)
+    AnswerStore(tmp_path / "a.sqlite", small_study(seed=1))  # nobody has answered yet
+    store = AnswerStore(tmp_path / "a.sqlite", study, most_raters=1)
     store.register(TOKEN, "en", "")
     assert store.register(TOKEN, "en", "") == 0
     with pytest.raises(FullError):
         store.register("f" * 32, "en", "")
     for read_only in (False, True):
         with pytest.raises(FaceDiffError, match=r"a\.sqlite"):
-            Store(tmp_path / "a.sqlite", small_study(seed=1), read_only=read_only)
+            AnswerStore(tmp_path / "a.sqlite", small_study(seed=1), read_only=read_only)
     (tmp_path / "b.sqlite").write_bytes(b"no database at all " * 100)
     for read_only in (False, True):
         with pytest.raises(FaceDiffError, match=r"b\.sqlite"):
-            Store(tmp_path / "b.sqlite", study, read_only=read_only)
+            AnswerStore(tmp_path / "b.sqlite", study, read_only=read_only)
     with closing(sqlite3.connect(tmp_path / "a.sqlite")) as database:
         assert database.execute("PRAGMA journal_mode").fetchone() == ("wal",)

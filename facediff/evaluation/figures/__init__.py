@@ -12,8 +12,8 @@ from facediff.evaluation.figures.frames import (
     pick_frames,
 )
 from facediff.evaluation.figures.heatmaps import VertexMap, draw_error, draw_heatmap, error_maps, motion_maps
-from facediff.evaluation.figures.lips import Curves, Sound, draw_lips, opening_curves
-from facediff.evaluation.figures.material import Material, find_clips
+from facediff.evaluation.figures.lips import Curves, SpeechTrack, draw_lips, opening_curves
+from facediff.evaluation.figures.material import FigureData, find_clips
 from facediff.evaluation.figures.page import COLUMN, PAGE, Paper
 from facediff.evaluation.figures.training import (
     Curve,
@@ -32,11 +32,11 @@ __all__ = [
     "PAGE",
     "Curve",
     "Curves",
-    "Material",
+    "FigureData",
     "Moment",
     "Paper",
     "TimedPhoneme",
-    "Sound",
+    "SpeechTrack",
     "VertexMap",
     "choose_scalars",
     "draw_error",

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from facediff.errors import FaceDiffError, choices
-from facediff.evaluation.figures.material import Array, Material, Painter
+from facediff.evaluation.figures.material import Array, FigureData, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
 from facediff.speech.phonemes import LENGTH, STRESS, TimedPhoneme
 
 HIGHEST = 50.0  # Largest height of a picture in mm
 
 
-def find_phoneme(wanted: str, phonemes: Sequence[TimedPhoneme], clip: str) -> TimedPhoneme:
+def find_phoneme(selector: str, phonemes: Sequence[TimedPhoneme], clip: str) -> TimedPhoneme:
     """A phoneme by name: ``m`` is the first of the clip, ``m:2`` the second.
 
     An exact match takes precedence; else stress marks are ignored, then length marks and diacritics; else the name is
@@ -27,7 +27,7 @@ def find_phoneme(wanted: str, phonemes: Sequence[TimedPhoneme], clip: str) -> Ti
     Raises:
         FaceDiffError: if the clip has no such phoneme, or not so many.
     """
-    name, _, number = wanted.rpartition(":") if re.search(r".:\d+$", wanted) else (wanted, "", "1")
+    name, _, number = selector.rpartition(":") if re.search(r".:\d+$", selector) else (selector, "", "1")
     place, spoken = int(number), [phoneme for phoneme in phonemes if phoneme.ipa]
     for same in (
         lambda p: p.ipa == name,
@@ -35,13 +35,13 @@ def find_phoneme(wanted: str, phonemes: Sequence[TimedPhoneme], clip: str) -> Ti
         lambda p: _without_marks(p.ipa) == _without_marks(name),
         lambda p: name in p.viseme.split("+"),
     ):
-        found = [phoneme for phoneme in spoken if same(phoneme)]
-        if found:
-            if 1 <= place <= len(found):
-                return found[place - 1]
-            raise FaceDiffError(f'phoneme "{wanted}": clip {clip} has {name} {len(found)} times, counted from 1')
-    known = dict.fromkeys(phoneme.plain for phoneme in spoken)
-    raise FaceDiffError(f'phoneme "{wanted}": not spoken in clip {clip}: {choices(name, known)}')
+        matches = [phoneme for phoneme in spoken if same(phoneme)]
+        if matches:
+            if 1 <= place <= len(matches):
+                return matches[place - 1]
+            raise FaceDiffError(f'phoneme "{selector}": clip {clip} has {name} {len(matches)} times, counted from 1')
+    symbols = dict.fromkeys(phoneme.plain for phoneme in spoken)
+    raise FaceDiffError(f'phoneme "{selector}": not spoken in clip {clip}: {choices(name, symbols)}')
 
 
 def _without_marks(ipa: str) -> str:
@@ -74,7 +74,7 @@ def frame_at(time: float, frame_rate: float) -> int:
     return int(np.floor(time * frame_rate + 1e-6)) if np.isfinite(time) else -1
 
 
-def pick_frames(material: Material, clip: str, moments: Sequence[Moment]) -> dict[str, list[Array]]:
+def pick_frames(material: FigureData, clip: str, moments: Sequence[Moment]) -> dict[str, list[Array]]:
     """Faces (V, 3) of the truth and each method at every moment.
 
     Raises:
@@ -99,7 +99,7 @@ def pick_frames(material: Material, clip: str, moments: Sequence[Moment]) -> dic
 
 
 def draw_frames(
-    material: Material,
+    material: FigureData,
     clip: str,
     moments: Sequence[Moment],
     output: Path,

@@ -16,7 +16,7 @@ from facediff.data.check.layouts import by_name, list_folder, recognise
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.data.puppet import built_in_mesh, cache_root, made_root
 from facediff.errors import FaceDiffError
-from facediff.evaluation.figures.material import Material, find_clips
+from facediff.evaluation.figures.material import FigureData, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
 from facediff.mesh.files import SUFFIXES, read_mesh
 from facediff.mesh.mesh import Mesh
@@ -41,7 +41,7 @@ def gather(
     frame_rate: ranges.FrameRate | None = None,
     truth_stride: ranges.Stride | None = None,
     unit: str | None = None,
-) -> Material:
+) -> FigureData:
     """Find truth, methods and what is known about their mesh; where an option is None, the corpus says it.
 
     Args:
@@ -61,10 +61,10 @@ def gather(
         FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
     """
     if truth == Path("puppet") and not truth.is_dir():
-        made = made_root(0)
-        if made is None:
+        built_in = made_root(0)
+        if built_in is None:
             raise FaceDiffError(f"{cache_root(0)}: the built-in corpus does not exist yet; `facediff demo` makes it")
-        truth = made
+        truth = built_in
     folder, corpus = find_truths(truth)
     manifest = read_manifest(corpus) if corpus else {}
     module = _recognise(topology, corpus or folder, manifest)
@@ -76,12 +76,12 @@ def gather(
     faces = {} if templates is None else read_templates(templates, n_vertices)
     found_mesh = _find_mesh(mesh, corpus or folder, module, n_vertices)
     rate, stride = _rates(frame_rate, truth_stride, manifest, module)
-    truths, found = find_clips(
+    truths, predictions = find_clips(
         methods, folder, subjects=list(faces), patterns=patterns, truth_pattern=truth_pattern, identity=identity
     )
-    return Material(
+    return FigureData(
         truths,
-        found,
+        predictions,
         n_vertices,
         rate,
         stride,
@@ -95,7 +95,7 @@ def gather(
     )
 
 
-def sound_of(material: Material, clip: str, file: Path | None = None) -> npt.NDArray[np.float32] | None:
+def sound_of(material: FigureData, clip: str, file: Path | None = None) -> npt.NDArray[np.float32] | None:
     """Speech (S,) of a clip at 16 kHz: from the file given, else the corpus's; None if there is none.
 
     Raises:
@@ -107,7 +107,7 @@ def sound_of(material: Material, clip: str, file: Path | None = None) -> npt.NDA
     return None if file is None else read_speech(file)
 
 
-def phonemes_of(material: Material, clip: str, file: Path | None = None) -> list[TimedPhoneme]:
+def phonemes_of(material: FigureData, clip: str, file: Path | None = None) -> list[TimedPhoneme]:
     """Phonemes of a clip: from the table given, else the corpus's; none if there is no table.
 
     Raises:
@@ -130,12 +130,12 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
     return module if module is not None and module.n_vertices == folder.n_vertices() else None
 
 
-def _find_mesh(given: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
+def _find_mesh(path: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
     """The mesh given, else the one in the corpus folder, else that of the built-in corpus; None without one."""
-    if given is not None:
-        mesh = read_mesh(given)
+    if path is not None:
+        mesh = read_mesh(path)
         if len(mesh.vertices) != n_vertices:
-            raise FaceDiffError(f"{given}: has {len(mesh.vertices)} vertices, the motion {n_vertices}; give its mesh")
+            raise FaceDiffError(f"{path}: has {len(mesh.vertices)} vertices, the motion {n_vertices}; give its mesh")
         return mesh
     places = [root, root / "templates"]
     files = [place / file for file in (module.mesh_files if module else ()) for place in places]

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from facediff.evaluation.figures.material import FLAT, TRUTH, Array, Material, Painter, chunks, shortest
+from facediff.evaluation.figures.material import FLAT, TRUTH, Array, FigureData, Painter, chunks, shortest
 from facediff.evaluation.figures.page import (
     GAP,
     SMALLEST_TEXT,
@@ -48,7 +48,7 @@ class VertexMap:
 
 
 def motion_maps(
-    material: Material, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
+    material: FigureData, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
 ) -> tuple[dict[str, VertexMap], list[str]]:
     """How far each vertex is from the identity's template, over all frames of the clips, of truth and methods.
 
@@ -70,7 +70,7 @@ def motion_maps(
 
 
 def _from_template(
-    material: Material, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
+    material: FigureData, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
 ) -> Iterator[Array]:
     template = material.template(clip)
     for part in chunks(motions[name], material.path(clip, name), frames):
@@ -78,7 +78,7 @@ def _from_template(
 
 
 def error_maps(
-    material: Material, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
+    material: FigureData, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
 ) -> tuple[dict[str, VertexMap], list[str]]:
     """How far each vertex is from the truth's, over all frames of the clips, of every method.
 
@@ -98,14 +98,14 @@ def error_maps(
 
 
 def _from_truth(
-    material: Material, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
+    material: FigureData, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
 ) -> Iterator[Array]:
     true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
     for one, other in zip(chunks(motions[name], material.path(clip, name), frames), true, strict=True):
         yield np.linalg.norm(one - other, axis=2)
 
 
-Distances = Callable[[Material, str, str, Mapping[str, Tensor], int], Iterator[Array]]
+Distances = Callable[[FigureData, str, str, Mapping[str, Tensor], int], Iterator[Array]]
 """Distances (n, V) of a clip (its name, a method's name, all motions, frames), a few frames at a time."""
 
 
@@ -120,7 +120,7 @@ class _Part:
 
 
 def _parts(
-    material: Material, distances: Distances, names: Sequence[str], task: tuple[int, str]
+    material: FigureData, distances: Distances, names: Sequence[str], task: tuple[int, str]
 ) -> tuple[str, list[list[_Part]]]:
     """What a clip, numbered since it may be asked for twice, adds, by name; and a note on frames that are left out."""
     _, clip = task
@@ -136,7 +136,7 @@ def _parts(
 
 
 def _vertex_maps(
-    material: Material,
+    material: FigureData,
     clips: Sequence[str],
     names: Sequence[str],
     distances: Distances,
@@ -172,7 +172,7 @@ def _vertex_maps(
 
 @ranges.checked
 def draw_heatmap(
-    material: Material,
+    material: FigureData,
     clips: Sequence[str],
     output: Path,
     *,
@@ -204,8 +204,8 @@ def draw_heatmap(
     material.mesh(clips)  # refuses before the work
     maps, notes = motion_maps(material, clips, workers=workers, scheduler=scheduler)
     rows: list[Row] = [
-        ("mean of motion", {name: each.mean for name, each in maps.items()}, highest[0]),
-        ("std of motion", {name: each.deviation for name, each in maps.items()}, highest[1]),
+        ("mean of motion", {name: vertex_map.mean for name, vertex_map in maps.items()}, highest[0]),
+        ("std of motion", {name: vertex_map.deviation for name, vertex_map in maps.items()}, highest[1]),
     ]
     _draw(material, clips, rows, output, paper or Paper(), view)
     return notes
@@ -213,7 +213,7 @@ def draw_heatmap(
 
 @ranges.checked
 def draw_error(
-    material: Material,
+    material: FigureData,
     clips: Sequence[str],
     output: Path,
     *,
@@ -233,15 +233,17 @@ def draw_error(
     material.mesh(clips)  # refuses before the work
     maps, notes = error_maps(material, clips, workers=workers, scheduler=scheduler)
     rows: dict[str, Row] = {
-        "mean": ("mean error", {name: each.mean for name, each in maps.items()}, highest[0]),
-        "max": ("maximum error", {name: each.maximum for name, each in maps.items()}, highest[1]),
+        "mean": ("mean error", {name: vertex_map.mean for name, vertex_map in maps.items()}, highest[0]),
+        "max": ("maximum error", {name: vertex_map.maximum for name, vertex_map in maps.items()}, highest[1]),
     }
     chosen = list(rows.values()) if statistic == "both" else [rows[statistic]]
     _draw(material, clips, chosen, output, paper or Paper(), view)
     return notes
 
 
-def _draw(material: Material, clips: Sequence[str], rows: Sequence[Row], output: Path, paper: Paper, view: str) -> None:
+def _draw(
+    material: FigureData, clips: Sequence[str], rows: Sequence[Row], output: Path, paper: Paper, view: str
+) -> None:
     from facediff.render.panels import heat_colours
 
     factor, unit = material.scale
@@ -265,7 +267,7 @@ def _draw(material: Material, clips: Sequence[str], rows: Sequence[Row], output:
             for column, name in enumerate(names):
                 colours = heat_colours(values[name] * factor, end)
                 grid.picture(painter.paint(shape, colours), number, column)
-            beyond = max(float(each.max()) for each in values.values()) * factor > end * (1 + 1e-9)
+            beyond = max(float(array.max()) for array in values.values()) * factor > end * (1 + 1e-9)
             _draw_bar(grid, number, end, f"{label} [{unit}]", beyond=beyond)
         save(figure, output)
 
@@ -274,7 +276,7 @@ def scale_end(values: Mapping[str, Array], factor: float, highest: float | None)
     """Value of a row's last colour, in the unit shown."""
     if highest is not None:
         return highest
-    largest = max(float(each.max()) for each in values.values()) * factor
+    largest = max(float(array.max()) for array in values.values()) * factor
     return largest if largest > 0 else 1.0  # nothing moves: any scale is right
 
 

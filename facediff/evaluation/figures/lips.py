@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from facediff.errors import FaceDiffError
-from facediff.evaluation.figures.material import TRUTH, Array, Material, chunks, shortest
+from facediff.evaluation.figures.material import TRUTH, Array, FigureData, chunks, shortest
 from facediff.evaluation.figures.page import (
     BLACK,
     FAINT,
@@ -47,7 +47,7 @@ class Curves:
 
 
 @dataclass(frozen=True)
-class Sound:
+class SpeechTrack:
     """The speech of a clip."""
 
     # Speech (S,); empty if there is none.
@@ -56,7 +56,7 @@ class Sound:
     phonemes: Sequence[TimedPhoneme] = ()  # phonemes in time; empty if they are not known
 
 
-def opening_curves(material: Material, clip: str, pairs: LipPairs) -> tuple[Curves, str | None]:
+def opening_curves(material: FigureData, clip: str, pairs: LipPairs) -> tuple[Curves, str | None]:
     """The opening of truth and methods in a clip: the mean distance of the pairs, as in `MouthOpeningDifference`.
 
     Returns:
@@ -94,7 +94,7 @@ def envelope(samples: npt.NDArray[np.float32], columns: int) -> tuple[Array, Arr
 @ranges.checked
 def draw_lips(
     curves: Curves,
-    sound: Sound,
+    sound: SpeechTrack,
     output: Path,
     *,
     paper: Paper | None = None,
@@ -133,7 +133,7 @@ def draw_lips(
         rest = list(axes[1:])
         if sound.phonemes:
             # Grey where the lips close in speech: a good method's curve is low there.
-            label: str | None = ", ".join(f"/{each}/" for each in BILABIALS)
+            label: str | None = ", ".join(f"/{phone}/" for phone in BILABIALS)
             for phoneme in sound.phonemes:
                 if phoneme.plain in BILABIALS:
                     axes[0].axvspan(
@@ -146,8 +146,8 @@ def draw_lips(
         figure.legend(loc="outside upper center", ncols=legend_columns(axes[0], paper))
         axes[-1].set_xlim(low, high)
         axes[-1].set_xlabel("time [s]")
-        for each in axes[:-1]:
-            each.tick_params(axis="x", bottom=False, labelbottom=False)
+        for panel in axes[:-1]:
+            panel.tick_params(axis="x", bottom=False, labelbottom=False)
         if remark:
             figure.supxlabel(plain(remark), size=SMALLEST_TEXT, color=GREY, x=0.99, ha="right")
         save(figure, output)
@@ -181,7 +181,7 @@ def _draw_phonemes(axes: Axes, phonemes: Sequence[TimedPhoneme], span: tuple[flo
         axes.text(phoneme.middle, (0.75, 0.2)[level], phoneme.plain, size=SMALLEST_TEXT, ha="center", va="center")
 
 
-def _draw_waveform(axes: Axes, sound: Sound, span: tuple[float, float], paper: Paper) -> None:
+def _draw_waveform(axes: Axes, sound: SpeechTrack, span: tuple[float, float], paper: Paper) -> None:
     first, last = (round(second * sound.sample_rate) for second in span)
     low, high = envelope(sound.samples[first:last], min(paper.pixels(paper.width) // 2, 1000))
     stop = min(last, sound.samples.size) / sound.sample_rate

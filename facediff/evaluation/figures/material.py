@@ -51,7 +51,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Material:
+class FigureData:
     """The files of truth and methods, and what is known about them."""
 
     truths: dict[str, Truth]  # truths by clip, ``<subject>_<sentence>``
@@ -140,8 +140,10 @@ class Material:
         """
         subject = self.truths[clip].name.subject
         if subject not in self.templates:
-            known = f"there are templates of {', '.join(self.templates)}" if self.templates else "give --templates FILE"
-            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; {known}")
+            advice = (
+                f"there are templates of {', '.join(self.templates)}" if self.templates else "give --templates FILE"
+            )
+            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; {advice}")
         return np.asarray(self.templates[subject], np.float64)
 
     def mesh(self, clips: Sequence[str]) -> tuple[npt.NDArray[np.int32], Array]:
@@ -155,8 +157,8 @@ class Material:
                 "the triangles of the mesh are not known; give --mesh FILE, a .ply or .obj of this topology"
             )
         subjects = dict.fromkeys(self.truths[clip].name.subject for clip in clips)
-        found = [np.asarray(self.templates[name], np.float64) for name in subjects if name in self.templates]
-        return self.faces, np.mean(found, axis=0) if found else self.rest
+        templates = [np.asarray(self.templates[name], np.float64) for name in subjects if name in self.templates]
+        return self.faces, np.mean(templates, axis=0) if templates else self.rest
 
 
 def find_clips(
@@ -184,7 +186,7 @@ def find_clips(
     if not truths:
         raise FaceDiffError(f"{truth}: no file is named like {truth_pattern}.npy; give --truth-pattern")
     readers = [NamePattern(pattern, subjects) for pattern in patterns]
-    found: dict[str, dict[str, Path]] = {}
+    predictions: dict[str, dict[str, Path]] = {}
     for method, folder in methods.items():
         files, _ = list_names(folder, readers)
         pairs, _ = pair_up(files, truths, identity)
@@ -193,8 +195,8 @@ def find_clips(
                 f"{folder}: no file is a prediction of a truth's clip under the condition {identity}; the truth has "
                 f"{few(truths)}; give --pattern, or choose another --identity"
             )
-        found[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
-    return truths, found
+        predictions[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
+    return truths, predictions
 
 
 def few(clips: Mapping[str, object], like: str = "") -> str:

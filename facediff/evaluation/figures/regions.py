@@ -57,8 +57,8 @@ def draw_regions(
         whose = "a person's folder" if view.data_module is None else view.corpus
         raise FaceDiffError(f"{root}: {whose} has no mesh of its own; give a corpus folder of the same topology")
     if mesh is None:
-        wanted = " or ".join(view.mesh_files)
-        raise FaceDiffError(f"{root}: no mesh to draw the regions on; put {wanted} into this folder")
+        names = " or ".join(view.mesh_files)
+        raise FaceDiffError(f"{root}: no mesh to draw the regions on; put {names} into this folder")
     regions, lines = {}, {}
     for part, own in (("lips", lips), ("upper_face", upper_face)):
         sources = view.region_sources.get(part, ()) if own is None else (own,)

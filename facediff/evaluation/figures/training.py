@@ -92,22 +92,22 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
     return {name: Curve(table[:, 0], table[:, 1]) for name, table in tables.items()}
 
 
-def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], wanted: Sequence[str] | None) -> list[str]:
+def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str] | None) -> list[str]:
     """Scalars to draw: those asked for, else the loss of training and the LVE of validation as far as they were logged.
 
     Raises:
         FaceDiffError: if a run has not logged a scalar, or none of the usual ones.
     """
-    if wanted is None:
-        wanted = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
-        if not wanted:
-            known = ", ".join(dict.fromkeys(name for curves in runs.values() for name in curves))
-            raise FaceDiffError(f"no run logged {', '.join(USUAL_SCALARS)}; choose with --scalar from {known}")
+    if scalars is None:
+        scalars = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
+        if not scalars:
+            logged = ", ".join(dict.fromkeys(name for curves in runs.values() for name in curves))
+            raise FaceDiffError(f"no run logged {', '.join(USUAL_SCALARS)}; choose with --scalar from {logged}")
     for run, curves in runs.items():
-        for name in wanted:
+        for name in scalars:
             if name not in curves:
                 raise FaceDiffError(f'{run}: logged no scalar "{name}": {choices(name, curves)}')
-    return list(dict.fromkeys(wanted))
+    return list(dict.fromkeys(scalars))
 
 
 def find_gaps(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str], *, log: bool = False) -> list[str]:

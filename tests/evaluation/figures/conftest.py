@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from facediff.data.corpus import read_templates
-from facediff.evaluation.figures import Material, find_clips
+from facediff.evaluation.figures import FigureData, find_clips
 from facediff.mesh.files import read_mesh
 from tests.fakes.tiny import RATE, VERTICES
 
@@ -32,15 +32,15 @@ def methods(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 @pytest.fixture(scope="session")
-def own_material(tiny_root: Path, methods: dict[str, Path]) -> Material:
+def own_material(tiny_root: Path, methods: dict[str, Path]) -> FigureData:
     return make_material(tiny_root, methods)
 
 
 @pytest.fixture
-def damaged(tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> Callable[..., Material]:
+def damaged(tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> Callable[..., FigureData]:
     """The material with one of ours' files replaced."""
 
-    def make(array: NDArray[np.floating], clip: str = "A_e06") -> Material:
+    def make(array: NDArray[np.floating], clip: str = "A_e06") -> FigureData:
         shutil.copytree(methods["ours"], tmp_path / "ours", dirs_exist_ok=True)
         np.save(tmp_path / "ours" / f"{clip}_condition_A.npy", array)
         return make_material(tiny_root, {"ours": tmp_path / "ours"})
@@ -48,11 +48,11 @@ def damaged(tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> Callab
     return make
 
 
-def make_material(root: Path, methods: dict[str, Path], **options: object) -> Material:
+def make_material(root: Path, methods: dict[str, Path], **options: object) -> FigureData:
     templates = read_templates(root / "templates.pkl", VERTICES)
     truths, found = find_clips(methods, root / "vertices_npy", subjects=list(templates))
     mesh = read_mesh(root / "tiny.ply")
-    made = Material(truths, found, VERTICES, float(RATE), 1, "m", templates, mesh.faces, mesh.vertices, corpus=root)
+    made = FigureData(truths, found, VERTICES, float(RATE), 1, "m", templates, mesh.faces, mesh.vertices, corpus=root)
     return replace(made, **options)  # type: ignore[arg-type]
 
 

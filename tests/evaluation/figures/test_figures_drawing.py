@@ -18,10 +18,10 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.evaluation.figures import (
     Curve,
     Curves,
-    Material,
+    FigureData,
     Moment,
     Paper,
-    Sound,
+    SpeechTrack,
     TimedPhoneme,
     draw_error,
     draw_frames,
@@ -52,7 +52,7 @@ RUNS = {
 }
 
 
-def draw(name: str, material: Material, path: Path) -> None:
+def draw(name: str, material: FigureData, path: Path) -> None:
     if name == "frames":
         draw_frames(material, "A_e06", [Moment(0.1, PHONEMES[1]), Moment(0.5)], path, paper=SMALL)
     elif name == "heatmap":
@@ -60,7 +60,7 @@ def draw(name: str, material: Material, path: Path) -> None:
     elif name == "error":
         draw_error(material, ["A_e06"], path, paper=SMALL, statistic="both", highest=(1.0, None))
     elif name == "lips":
-        sound = Sound(SPEECH, phonemes=PHONEMES)
+        sound = SpeechTrack(SPEECH, phonemes=PHONEMES)
         draw_lips(LIPS, sound, path, paper=SMALL, scale=(1000, "mm"), remark="tiny: synthetic corpus")
     else:
         draw_training(RUNS, ["val/lve"], path, paper=SMALL, smoothing=0.6, log=True)
@@ -76,7 +76,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_every_figure_in_every_format(name: str, own_material: Material, tmp_path: Path) -> None:
+def test_every_figure_in_every_format(name: str, own_material: FigureData, tmp_path: Path) -> None:
     material = replace(own_material, remark="tiny: synthetic corpus")
     files = [tmp_path / "new" / f"figure.{suffix}" for suffix in ("png", "pdf", "svg")]
     for path in files:
@@ -126,7 +126,7 @@ def check_svg(path: Path, texts: list[str]) -> None:
     assert min(found.values()) >= SMALLEST_TEXT
 
 
-def test_the_users_own_settings_neither_matter_nor_change(own_material: Material, tmp_path: Path) -> None:
+def test_the_users_own_settings_neither_matter_nor_change(own_material: FigureData, tmp_path: Path) -> None:
     import matplotlib
 
     draw("lips", own_material, tmp_path / "one.svg")
@@ -136,7 +136,7 @@ def test_the_users_own_settings_neither_matter_nor_change(own_material: Material
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
 
 
-def test_colours_of_the_heat_map_are_those_of_the_bar(own_material: Material, tmp_path: Path) -> None:
+def test_colours_of_the_heat_map_are_those_of_the_bar(own_material: FigureData, tmp_path: Path) -> None:
     """A surface that faces the viewer shows the ramp's colour itself, so that it can be read off the bar."""
     faces, shape = own_material.mesh(["A_e06"])
     painter = Painter(faces, shape, look=FLAT)
@@ -152,7 +152,7 @@ def test_colours_of_the_heat_map_are_those_of_the_bar(own_material: Material, tm
 
 
 def test_a_known_motion_has_the_colours_of_its_numbers(
-    own_material: Material, damaged: Callable[..., Material], tmp_path: Path
+    own_material: FigureData, damaged: Callable[..., FigureData], tmp_path: Path
 ) -> None:
     """Vertices that all stay 2 mm off the template: at four fifths of a scale to 2.5 mm, without deviation."""
     still = np.repeat(own_material.template("A_e06")[None], 24, axis=0) + (0.002, 0, 0)
@@ -172,7 +172,7 @@ def test_a_known_motion_has_the_colours_of_its_numbers(
     assert top < bottom
 
 
-def test_the_end_of_a_scale(own_material: Material, tmp_path: Path) -> None:
+def test_the_end_of_a_scale(own_material: FigureData, tmp_path: Path) -> None:
     values = {"a": np.array([0.001, 0.002]), "b": np.array([0.004, 0.0])}
     assert scale_end(values, 1000, None) == pytest.approx(4)
     assert scale_end(values, 1000, 2.5) == 2.5
@@ -182,7 +182,7 @@ def test_the_end_of_a_scale(own_material: Material, tmp_path: Path) -> None:
             draw_error(own_material, ["A_e06"], tmp_path / "error.png", highest=(wrong, None))
 
 
-def test_pictures_are_white_around_and_as_large_as_asked(own_material: Material) -> None:
+def test_pictures_are_white_around_and_as_large_as_asked(own_material: FigureData) -> None:
     faces, shape = own_material.mesh(["A_e06"])
     for region in (None, range(6)):
         painter = Painter(faces, shape, region=region)
@@ -252,7 +252,7 @@ def test_options_of_curves_that_cannot_be(tmp_path: Path) -> None:
         draw_training(below, ["x"], path, log=True)
     for span in ((1.0, 0.5), (3.0, 4.0), (-1.0, 1.0)):
         with pytest.raises(FaceDiffError, match="span"):
-            draw_lips(LIPS, Sound(), path, span=span)
+            draw_lips(LIPS, SpeechTrack(), path, span=span)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -261,7 +261,7 @@ def test_lips_are_drawn_at_their_times_and_in_their_unit(monkeypatch: pytest.Mon
     monkeypatch.setattr(lips_module, "save", lambda figure, path: saved.append(figure))
     click = np.zeros(32_000, "f4")
     click[16_000] = 1
-    sound = Sound(click, phonemes=PHONEMES)
+    sound = SpeechTrack(click, phonemes=PHONEMES)
     draw_lips(LIPS, sound, tmp_path / "a.png", paper=SMALL, scale=(1000, "mm"), span=(0.1, 1.6))
     opening, _, wave = saved[0].axes
     assert opening.get_xlim() == wave.get_xlim() == (0.1, 1.6)
@@ -274,7 +274,7 @@ def test_lips_are_drawn_at_their_times_and_in_their_unit(monkeypatch: pytest.Mon
 
 
 def test_without_sound_or_phonemes_there_is_the_curve_alone(tmp_path: Path) -> None:
-    draw_lips(LIPS, Sound(), tmp_path / "alone.svg", paper=SMALL, span=(0.5, 1.5))
+    draw_lips(LIPS, SpeechTrack(), tmp_path / "alone.svg", paper=SMALL, span=(0.5, 1.5))
     text = (tmp_path / "alone.svg").read_text(encoding="utf-8")
     assert "lip opening" in text
     assert "sound" not in text
@@ -289,7 +289,7 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_nothing_is_left_of_a_figure_that_failed(
-    own_material: Material, tmp_path: Path, damaged: Callable[..., Material]
+    own_material: FigureData, tmp_path: Path, damaged: Callable[..., FigureData]
 ) -> None:
     with pytest.raises(FaceDiffError):
         draw_frames(own_material, "A_e06", [Moment(0.1), Moment(77)], tmp_path / "a.png")

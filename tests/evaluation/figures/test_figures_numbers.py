@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import (
-    Material,
+    FigureData,
     Moment,
     choose_scalars,
     error_maps,
@@ -48,7 +48,7 @@ def chunk(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.usefixtures("chunk")
 def test_motion_maps_are_distances_from_the_identitys_template(
-    own_material: Material, read: Read, tiny_root: Path
+    own_material: FigureData, read: Read, tiny_root: Path
 ) -> None:
     templates = load_pickle(tiny_root / "templates.pkl")
     maps, notes = motion_maps(own_material, own_material.choose())
@@ -66,7 +66,7 @@ def test_motion_maps_are_distances_from_the_identitys_template(
 
 
 @pytest.mark.usefixtures("chunk")
-def test_error_maps_are_distances_from_the_truth(own_material: Material, read: Read) -> None:
+def test_error_maps_are_distances_from_the_truth(own_material: FigureData, read: Read) -> None:
     maps, _ = error_maps(own_material, ["A_e07", "B_e06"])
     assert list(maps) == NAMES[1:]
     for name, found in maps.items():
@@ -79,7 +79,7 @@ def test_error_maps_are_distances_from_the_truth(own_material: Material, read: R
 
 
 @pytest.mark.usefixtures("chunk")
-def test_opening_curves_are_those_of_the_metrics(own_material: Material, read: Read, tiny_root: Path) -> None:
+def test_opening_curves_are_those_of_the_metrics(own_material: FigureData, read: Read, tiny_root: Path) -> None:
     pairs = read_pairs(None, tiny_root, VERTICES)
     curves, note = opening_curves(own_material, "A_e06", pairs)
     assert note is None
@@ -93,7 +93,7 @@ def test_opening_curves_are_those_of_the_metrics(own_material: Material, read: R
     assert np.abs(curves.openings["ours"] - curves.openings["truth"]).mean() == pytest.approx(apart.item())
 
 
-def test_lengths_are_cut_to_the_shortest_with_a_note(damaged: Callable[..., Material], read: Read) -> None:
+def test_lengths_are_cut_to_the_shortest_with_a_note(damaged: Callable[..., FigureData], read: Read) -> None:
     whole = read("ours", "A_e06")
     material = damaged(whole[:5])
     maps, notes = error_maps(material, ["A_e06"])
@@ -105,12 +105,12 @@ def test_lengths_are_cut_to_the_shortest_with_a_note(damaged: Callable[..., Mate
     assert note is not None
 
 
-def test_a_stride_of_the_truth(own_material: Material, read: Read) -> None:
+def test_a_stride_of_the_truth(own_material: FigureData, read: Read) -> None:
     opened = replace(own_material, truth_stride=2).open("A_e06")
     np.testing.assert_array_equal(opened["truth"].numpy(), read("truth", "A_e06")[::2].astype("f4"))
 
 
-def test_a_time_picks_the_frame_on_the_screen(own_material: Material, read: Read) -> None:
+def test_a_time_picks_the_frame_on_the_screen(own_material: FigureData, read: Read) -> None:
     # At 25 frames a second frame 3 is shown from 0.12 s to 0.16 s.
     assert [frame_at(time, 25) for time in (0.0, 0.0399, 0.04, 0.12, 0.1599, 0.16)] == [0, 0, 1, 3, 3, 4]
     picked = pick_frames(own_material, "A_e06", [Moment(0.13), Moment(0.0)])
@@ -157,7 +157,7 @@ def test_damaged_phonemes(tmp_path: Path, text: str) -> None:
         read_phonemes(tmp_path / "p.csv")
 
 
-def test_unusable_files_are_named(damaged: Callable[..., Material], read: Read) -> None:
+def test_unusable_files_are_named(damaged: Callable[..., FigureData], read: Read) -> None:
     whole = read("ours", "A_e06")
     with pytest.raises(FaceDiffError, match=r"ours: .*A_e06.*holds no numbers"):
         damaged(whole[:0]).open("A_e06")
@@ -174,17 +174,17 @@ def test_unusable_files_are_named(damaged: Callable[..., Material], read: Read) 
 
 
 @pytest.mark.parametrize("time", [9.0, -0.1, float("nan"), float("inf")])
-def test_times_outside_a_motion(own_material: Material, time: float) -> None:
+def test_times_outside_a_motion(own_material: FigureData, time: float) -> None:
     with pytest.raises(FaceDiffError, match=r"has no frame at .* s; truth lasts from 0 to 0\.96 s \(24 frames at 25 a"):
         pick_frames(own_material, "A_e06", [Moment(time)])
 
 
-def test_a_method_that_ends_early_is_named(damaged: Callable[..., Material], read: Read) -> None:
+def test_a_method_that_ends_early_is_named(damaged: Callable[..., FigureData], read: Read) -> None:
     with pytest.raises(FaceDiffError, match=r"ours lasts from 0 to 0\.2 s"):
         pick_frames(damaged(read("ours", "A_e06")[:5]), "A_e06", [Moment(0.3)])
 
 
-def test_choosing_clips(own_material: Material, tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> None:
+def test_choosing_clips(own_material: FigureData, tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> None:
     assert own_material.choose(["B_e06", "B_e06"]) == ["B_e06"]
     with pytest.raises(FaceDiffError, match=r'no clip "A_e66".*did you mean "A_e06"'):
         own_material.choose(["A_e66"])
@@ -200,7 +200,7 @@ def test_choosing_clips(own_material: Material, tiny_root: Path, methods: dict[s
         replace(own_material, methods=parted).choose()
 
 
-def test_unknown_facts_name_the_option_that_gives_them(own_material: Material) -> None:
+def test_unknown_facts_name_the_option_that_gives_them(own_material: FigureData) -> None:
     with pytest.raises(FaceDiffError, match="--mesh"):
         replace(own_material, faces=None).mesh(["A_e06"])
     with pytest.raises(FaceDiffError, match="--frame-rate"):
