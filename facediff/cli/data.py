@@ -20,7 +20,7 @@ from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler
 
 if TYPE_CHECKING:
-    from facediff.data.prepare.runner import Plan, Report
+    from facediff.data.prepare.runner import PreparationPlan, PreparationReport
 
 Root = Annotated[Path, Option(reads=True)]
 Packed = Annotated[str, Option(reads=True)]
@@ -114,26 +114,26 @@ def run(name: str, arguments: Sequence[str]) -> int:
     return prepare(make_plan, **values)
 
 
-def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], Plan], dict[str, Any]]:
+def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], PreparationPlan], dict[str, Any]]:
     """What makes the plan of a raw folder, and the arguments of :func:`prepare`, from a command line."""
-    corpus, *words = arguments
+    corpus, *remaining = arguments
     if corpus not in CORPORA:
         raise FaceDiffError(f'there is no corpus "{corpus}" to prepare: {choices(corpus, CORPORA)}')
     module = importlib.import_module(f"facediff.data.prepare.{corpus}")
     title = (module.__doc__ or "").partition("\n")[0]
-    values = parse(options_of(module.plan), words, f"facediff data prepare {corpus}", title)
+    values = parse(options_of(module.plan), remaining, f"facediff data prepare {corpus}", title)
     own = {name: values.pop(name) for name in plan_options(module.plan)}
     if "quiet" in inspect.signature(module.plan).parameters:  # a scan that takes long has a progress bar
         own["quiet"] = values["quiet"]
     return partial(module.plan, **own), values
 
 
-def plan_options(plan: Callable[..., Plan]) -> dict[str, Parameter | OptionGroup]:
+def plan_options(plan: Callable[..., PreparationPlan]) -> dict[str, Parameter | OptionGroup]:
     """Keyword parameters of a corpus's plan: each is an option of the command, in addition to the common ones."""
     return {name: entry for name, entry in parameters_of(plan).items() if name not in ("raw", "quiet")}
 
 
-def options_of(plan: Callable[..., Plan]) -> Parameters:
+def options_of(plan: Callable[..., PreparationPlan]) -> Parameters:
     """The options of ``facediff data prepare`` for a corpus."""
 
     def common(
@@ -159,7 +159,7 @@ def options_of(plan: Callable[..., Plan]) -> Parameters:
 
 
 def prepare(
-    make_plan: Callable[[Path], Plan],
+    make_plan: Callable[[Path], PreparationPlan],
     *,
     raw: Path,
     out: Path,
@@ -185,7 +185,7 @@ def prepare(
     return 0 if report.sound else 1
 
 
-def describe(report: Report) -> list[str]:
+def describe(report: PreparationReport) -> list[str]:
     """The report as lines for the screen."""
     totals = report.totals
     lines = [

@@ -79,9 +79,9 @@ class Augmentation(ABC):
     def __init__(self, *, share: Share = 0.5) -> None:
         self.share = share
 
-    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         """Let every constructor refuse options that are out of range."""
-        super().__init_subclass__(**words)
+        super().__init_subclass__(**options)
         if "__init__" in vars(cls):
             cls.__init__ = checks_arguments(cls.__init__, "data.augmentations")  # type: ignore[method-assign]
 
@@ -122,9 +122,9 @@ class Augmenter:
         random = np.random.default_rng(seed)
         if random.random() >= self.share:
             return example
-        for each in self.augmentations:
-            if random.random() < each.share:
-                example = each(example, random)
+        for change in self.augmentations:
+            if random.random() < change.share:
+                example = change(example, random)
         peak = float(np.abs(example.speech).max(initial=0))
         return replace(example, speech=example.speech / peak) if peak > 1 else example
 
@@ -136,17 +136,17 @@ def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
         FaceDiffError: if there is no such augmentation or option, or a value is out of range.
 
     Example:
-        >>> [type(each).__name__ for each in read_augmentations(["voice:semitones=3", "room"])]
+        >>> [type(change).__name__ for change in read_augmentations(["voice:semitones=3", "room"])]
         ['Voice', 'Room']
     """
-    made = []
+    augmentations = []
     for text in texts:
         try:
             name, options = augmentation.read(text)
         except UnknownComponentError as error:
             raise FaceDiffError(f"data.augmentations: {error}") from error
-        made.append(cast(Augmentation, augmentation.get(name)(**options)))
-    return made
+        augmentations.append(cast(Augmentation, augmentation.get(name)(**options)))
+    return augmentations
 
 
 # Voices.
@@ -499,12 +499,12 @@ _WINDOW = np.hanning(SIZE + 1)[:-1].astype(np.float32)
 
 def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
     """Speech that lasts ``ratio`` times as long and has the same pitch: a phase vocoder (Flanagan and Golden 1966)."""
-    given = spectra(speech)
+    spectrum = spectra(speech)
     length = round(len(speech) * ratio)
     places = np.arange(int(np.ceil(length / HOP)) + 1) / ratio
-    low = np.clip(np.floor(places).astype(int), 0, len(given) - 2)
+    low = np.clip(np.floor(places).astype(int), 0, len(spectrum) - 2)
     share = np.clip(places - low, 0, 1)[:, None].astype(np.float32)
-    size, angle = np.abs(given), np.angle(given)
+    size, angle = np.abs(spectrum), np.angle(spectrum)
     sizes = (1 - share) * size[low] + share * size[low + 1]
     # The phase advances as it does from one spectrum to the next where the frame comes from.
     advance = (2 * np.pi * HOP / SIZE * np.arange(SIZE // 2 + 1)).astype(np.float32)
@@ -523,8 +523,8 @@ def shifted(speech: Wave, ratio: float) -> Wave:
     import soxr
 
     longer = stretched(speech, ratio)
-    made: Wave = soxr.resample(longer.astype(np.float32), 1000 * ratio, 1000, quality="LQ")
-    return fit_length(made, len(speech))
+    resampled: Wave = soxr.resample(longer.astype(np.float32), 1000 * ratio, 1000, quality="LQ")
+    return fit_length(resampled, len(speech))
 
 
 def warped(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:

@@ -304,9 +304,9 @@ class Assets:
             FaceDiffError: naming the field that is missing, of another type, or does not fit the others. A checkpoint
                 may come from anybody, and these fields reach meshes, file names and sizes of arrays.
         """
-        known = {each.name for each in fields(cls)}
-        if not isinstance(state, dict) or state.keys() != known:
-            odd = sorted(map(str, known ^ state.keys())) if isinstance(state, dict) else []
+        expected = {attribute.name for attribute in fields(cls)}
+        if not isinstance(state, dict) or state.keys() != expected:
+            odd = sorted(map(str, expected ^ state.keys())) if isinstance(state, dict) else []
             raise FaceDiffError(
                 f"its assets are not those of this version of facediff (different: {quoted(odd)}); train it again"
             )
@@ -359,11 +359,11 @@ class Assets:
 
 def _check_tensor(name: str, value: object, shape: tuple[int | None, ...], *, below: int | None = None) -> None:
     """Refuse anything but a finite tensor of a shape (None: any size), or of indices ``below`` a number."""
-    wanted = ", ".join("any" if size is None else str(size) for size in shape)
+    sizes = ", ".join("any" if size is None else str(size) for size in shape)
     kind = "finite numbers" if below is None else f"whole numbers from 0 to {below - 1}"
     fits = isinstance(value, Tensor) and value.layout == torch.strided and value.ndim == len(shape)
     if not fits or any(size not in (None, own) for size, own in zip(shape, value.shape, strict=True)):  # type: ignore[attr-defined]
-        raise _bad(name, value, f"{kind} of the shape ({wanted})")
+        raise _bad(name, value, f"{kind} of the shape ({sizes})")
     tensor = cast(Tensor, value)
     if below is None:
         good = tensor.is_floating_point() and bool(tensor.isfinite().all())
@@ -371,7 +371,7 @@ def _check_tensor(name: str, value: object, shape: tuple[int | None, ...], *, be
         good = not tensor.is_floating_point() and not tensor.is_complex() and tensor.dtype != torch.bool
         good = good and (not tensor.numel() or (int(tensor.min()) >= 0 and int(tensor.max()) < below))
     if not good:
-        raise _bad(name, value, f"{kind} of the shape ({wanted})")
+        raise _bad(name, value, f"{kind} of the shape ({sizes})")
 
 
 def _bad(name: str, value: object, expected: str) -> FaceDiffError:

@@ -51,8 +51,8 @@ class Biwi(SpeechMotionDataModule):
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
         """``F2_e01``; the neutral sequences (``F2_01``) are not used by the field."""
-        found = re.fullmatch(r"([FM]\d)_(e\d\d)", name)
-        return Clip(name, found[1], found[2]) if found else None
+        match = re.fullmatch(r"([FM]\d)_(e\d\d)", name)
+        return Clip(name, match[1], match[2]) if match else None
 
     @classmethod
     def expected_clips(cls) -> dict[str, list[str]]:

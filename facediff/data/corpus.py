@@ -81,8 +81,8 @@ class Clip:
     @property
     def words(self) -> str:
         """What is said: the words of the column ``text`` of ``clips.csv`` if there is one, else the sentence."""
-        words = re.findall(r"[^\W_]+", self.attributes.get("text", "").casefold())
-        return " ".join(words) or self.sentence
+        spoken = re.findall(r"[^\W_]+", self.attributes.get("text", "").casefold())
+        return " ".join(spoken) or self.sentence
 
 
 NameParser = Callable[[str], Clip | None]
@@ -317,16 +317,16 @@ def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
         ValueError: saying what is wrong with it.
     """
     try:
-        given = np.asarray(value)
+        entry = np.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:  # lists of unequal length
         raise ValueError(f"is no array of numbers; expected ({n_vertices}, 3)") from error
-    if given.dtype.kind != "f":
+    if entry.dtype.kind != "f":
         # Anything else would lose something: an imaginary part, or what comes after the point.
-        raise ValueError(f"is no array of floating-point numbers but of {given.dtype}; expected ({n_vertices}, 3)")
-    if given.shape not in ((3 * n_vertices,), (n_vertices, 3)):
-        raise ValueError(f"has shape {given.shape}, expected ({n_vertices}, 3)")
+        raise ValueError(f"is no array of floating-point numbers but of {entry.dtype}; expected ({n_vertices}, 3)")
+    if entry.shape not in ((3 * n_vertices,), (n_vertices, 3)):
+        raise ValueError(f"has shape {entry.shape}, expected ({n_vertices}, 3)")
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-        array = np.array(given.reshape(n_vertices, 3), np.float32)
+        array = np.array(entry.reshape(n_vertices, 3), np.float32)
     bad = np.count_nonzero(~(np.abs(array) <= COORDINATE).all(axis=1))
     if bad:
         raise ValueError(
@@ -352,7 +352,7 @@ def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
     twice = [name for name in header if name and header.count(name) > 1] if len(header) <= WIDEST else header
     if twice:
         raise FaceDiffError(f"{path}: has {len(header)} columns, {quoted(twice[0])} more than once; {remedy}")
-    found: dict[str, dict[str, str]] = {}
+    table: dict[str, dict[str, str]] = {}
     for number, cells in enumerate(rows, 2):
         where = f"{path}: row {number}"
         if len(cells) < len(header) or any(cells[len(header) :]):
@@ -362,10 +362,10 @@ def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
         if wrong is not None:
             raise FaceDiffError(f"{where} holds {quoted(wrong)}; expected text that can be printed")
         clip = row.pop("clip")
-        if clip in found:
+        if clip in table:
             raise FaceDiffError(f"{where} is another one of clip {quoted(clip)}; {remedy}")
-        found[clip] = row
-    return found
+        table[clip] = row
+    return table
 
 
 def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, help_text: str = "") -> Region:

@@ -209,17 +209,17 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     options_path = "data"
 
-    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         """Let every corpus keep its constructor's arguments."""
-        super().__init_subclass__(**words)
+        super().__init_subclass__(**options)
         if "score_attributes" not in vars(cls) and "reference_attributes" in vars(cls):
             cls.score_attributes = cls.reference_attributes
         if "__init__" in vars(cls):
             cls.__init__ = keeps_arguments(cls.__init__)  # type: ignore[method-assign]
 
-    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+    def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the constructor's arguments as plain data, so that checkpoints load with ``weights_only=True``."""
-        self.save_hyperparameters(plain({**defaults(type(self)), **given}))
+        self.save_hyperparameters(plain({**defaults(type(self)), **arguments}))
 
     @classmethod
     def load_from_checkpoint(
@@ -235,13 +235,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """
         with open_checkpoint(checkpoint_path) as (stream, path):
             content = load_tensors(stream, path)
-            given = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
-            if not isinstance(given, dict):
+            hyperparameters = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
+            if not isinstance(hyperparameters, dict):
                 raise FaceDiffError(f"{path}: holds no options of a data module; expected a file of `facediff fit`")
-            read_options(str(path), cls, given, {})
+            read_options(str(path), cls, hyperparameters, {})
             stream.seek(0)
-            made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
-        return made
+            data: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
+        return data
 
     @classmethod
     def corpus_licence(cls) -> Licence:
@@ -336,10 +336,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def clips(self, split: str) -> list[Clip]:
         """The clips of a split, sorted by name."""
-        found = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
+        clips = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
         if split == "train" and self.train_identities is not None:
-            found = [clip for clip in found if clip.identity in self.train_identities]
-        return found
+            clips = [clip for clip in clips if clip.identity in self.train_identities]
+        return clips
 
     def find_split(self, clip: Clip) -> str | None:
         """The split of any clip.
@@ -377,11 +377,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def known_clips(self) -> dict[str, list[Clip]]:
         """Each speaker's clips outside the evaluated splits, by speaker; speakers who have none are left out."""
-        found: dict[str, list[Clip]] = {}
+        by_speaker: dict[str, list[Clip]] = {}
         for clip in self.corpus.clips.values():
             if self.find_split(clip) in ("train", None):
-                found.setdefault(clip.identity, []).append(clip)
-        return found
+                by_speaker.setdefault(clip.identity, []).append(clip)
+        return by_speaker
 
     def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
         """The samples of a split: whole clips with fixed references, or (``training``) random windows and references.
@@ -406,7 +406,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             window=self.window if training else None,
             decoys=split.startswith("test"),
             features=self.features,
-            words=[self.words_of(clip) for clip in clips],
+            texts=[self.words_of(clip) for clip in clips],
             context=self.window_context if training and self.window is not None else (0, 0),
             aligner=self.aligner if training and self.pair_sentences else None,
             augmenter=self.augmenter if training else None,
@@ -424,7 +424,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 "data.augmentations: speech features that were computed before training are those of the recordings "
                 "as they are; omit the callback that caches them, or the augmentations"
             )
-        moving = [each for each in (self.augmenter.augmentations if self.augmenter else []) if each.moves]
+        moving = [change for change in (self.augmenter.augmentations if self.augmenter else []) if change.moves]
         if moving and (self.window is not None or self.pair_sentences):
             raise FaceDiffError(
                 "data.augmentations: speed changes the number of frames, which windows and pairs of clips rely on; "
@@ -472,10 +472,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             FaceDiffError: if the file that was chosen does not exist, or is not that.
         """
         file = self.eyelid_file or EYELID_PAIRS
-        found = self.corpus.read_pairs(file)
-        if found is None and self.eyelid_file is not None:
+        pairs = self.corpus.read_pairs(file)
+        if pairs is None and self.eyelid_file is not None:
             raise FaceDiffError(f"data.eyelid_pairs: {self.root / file}: no such file; expected pairs of vertices")
-        return found
+        return pairs
 
     # What is measured on the training motion before training: see facediff.data.measuring.
 
@@ -487,7 +487,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         Raises:
             FaceDiffError: if the training clips hold no motion at all.
         """
-        return measure_scale(self)
+        return measure_scale(self.corpus, self.clips("train"), self.trainer)
 
     def principal_motion(self, count: int, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean and principal components of the training motion, in the corpus's unit.
@@ -500,7 +500,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             the mean (3V,), and components (at most ``count``, 3V), each as long as its standard deviation, the largest
             first.
         """
-        return measure_components(self, count, weights)
+        return measure_components(self.corpus, self.clips("train"), self.trainer, count, weights)
 
     # The loaders.
 

@@ -179,8 +179,8 @@ class ClipBatches(DistributedSampler[list[Pick]]):
     def _batches(self, generator: torch.Generator) -> list[list[int]]:
         units = self._units(generator)
         if self.max_frames is None:
-            each = max(1, self.batch_size // (1 if self.groups is None else 2))
-            return [sum(units[i : i + each], []) for i in range(0, len(units), each)]
+            per_batch = max(1, self.batch_size // (1 if self.groups is None else 2))
+            return [sum(units[i : i + per_batch], []) for i in range(0, len(units), per_batch)]
         # Lengths are rounded up to buckets. Otherwise the number of batches would depend on which clips the shuffle
         # puts together, and the length of an epoch would change.
         width = max(1, self.max_frames // BUCKETS)
@@ -345,7 +345,7 @@ class MotionDataset(Dataset[Sample]):
         window: longest training window in frames; whole clips if None.
         decoys: give every clip the speech of another sentence in addition to its own.
         features: returns cached features of the speech, if there are any.
-        words: what each clip says, where that is not its sentence; clips that say the same can be aligned.
+        texts: what each clip says, where that is not its sentence; clips of equal text can be aligned.
         context: frames before and after a training window that are read with it.
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
         augmenter: changes training speech; None leaves it as it was recorded.
@@ -361,7 +361,7 @@ class MotionDataset(Dataset[Sample]):
     window: int | None = None
     decoys: bool = False
     features: FeatureReader | None = None
-    words: list[str] | None = None
+    texts: list[str] | None = None
     context: tuple[int, int] = (0, 0)
     aligner: Aligner | None = None
     augmenter: Augmenter | None = None
@@ -420,14 +420,14 @@ class MotionDataset(Dataset[Sample]):
         # A recording begins and ends without speech: of its two ends, the one nearer to the neutral face.
         mouth = np.ones(len(motion[0]), np.float32) if self.mouth is None else self.mouth
         ends = [self.corpus.read_motion(clip, place, place + 1)[0].numpy() for place in (0, frames - 1)]
-        rest = min(ends, key=lambda each: float(np.square(each[mouth > 0]).sum()))
+        rest = min(ends, key=lambda face: float(np.square(face[mouth > 0]).sum()))
         example = Example(audio.numpy(), motion.numpy(), self.corpus.frame_rate, rest, mouth)
         changed = augmenter(example, seed)
         return torch.from_numpy(changed.speech), torch.from_numpy(changed.motion)
 
     def says(self, index: int) -> str:
         """What a clip says: clips of which it is equal have the same words."""
-        return self.clips[index].sentence if self.words is None else self.words[index]
+        return self.clips[index].sentence if self.texts is None else self.texts[index]
 
     def pair(self, one: Pick, other: Pick) -> list[Sample]:
         """Two neighbours of a batch; if they say the same, their windows begin at the same sound.
@@ -439,7 +439,7 @@ class MotionDataset(Dataset[Sample]):
             return [self.sample(one), self.sample(other)]
         picks = (one, other)
         counts = [self.corpus.frames(self.clips[pick.index]) for pick in picks]
-        paths = [self._path(self.aligner, *each) for each in ((one.index, other.index), (other.index, one.index))]
+        paths = [self._path(self.aligner, *indices) for indices in ((one.index, other.index), (other.index, one.index))]
         start, _ = self._window(counts[0], self.window, torch.Generator().manual_seed(one.seed))
         # A window near the end of the second clip is moved back, so that it has its full length.
         begins = [start, max(0, min(int(paths[0][start]), counts[1] - self.window))]

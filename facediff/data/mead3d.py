@@ -68,12 +68,12 @@ class Mead3D(SpeechMotionDataModule):
 
         Sequences of one number have the same words within one emotion only.
         """
-        found = re.fullmatch(r"([MW]\d{3})_(\d{3})_([0-7])_([0-2])", name)
-        if found is None:
+        match = re.fullmatch(r"([MW]\d{3})_(\d{3})_([0-7])_([0-2])", name)
+        if match is None:
             return None
-        emotion = EMOTIONS[int(found[3])]
-        attributes = {"emotion": emotion, "intensity": str(int(found[4]) + 1)}
-        return Clip(name, found[1], f"{emotion}_{found[2]}", attributes)
+        emotion = EMOTIONS[int(match[3])]
+        attributes = {"emotion": emotion, "intensity": str(int(match[4]) + 1)}
+        return Clip(name, match[1], f"{emotion}_{match[2]}", attributes)
 
     def split_of(self, clip: Clip) -> str | None:
         """By speaker (``identity``), or by sentence for the training speakers (``sentence``)."""

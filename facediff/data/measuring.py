@@ -1,27 +1,26 @@
-"""What is measured on the training motion before training starts: its scale and its principal components.
+"""Statistics of the training motion that are computed before training: its scale and its principal components.
 
-Both look at a few frames of every training clip. Each clip's file is opened once for them, the results are kept on disk
-until the corpus changes, and of several training processes one measures and the others receive what it found: on
-network storage, where opening a file takes milliseconds, starting would take minutes otherwise.
+Both read a few frames of every training clip. On network storage, where opening a file takes milliseconds, that could
+delay the start of training by minutes. So each clip is opened once, the results are cached on disk until the corpus
+changes, and of several training processes only the first measures and broadcasts its result.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from lightning.pytorch import Trainer
 from torch import Tensor
 
+from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
-
-if TYPE_CHECKING:
-    from facediff.data.datamodule import SpeechMotionDataModule
 
 FRAMES = 16
 """Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
@@ -30,36 +29,43 @@ PRINCIPAL_NUMBERS = 30_000_000
 """Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
 
 METHOD = 1
-"""Goes up when the same corpus is measured in another way, so that what was kept before is not used."""
+"""Goes up when the same corpus is measured in another way, so that results cached by an older version are not used."""
 
 
-def measure_scale(data: SpeechMotionDataModule) -> float:
-    """One over the root mean square of the training motion's coordinates.
+def measure_scale(corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None) -> float:
+    """One over the root mean square of the motion's coordinates.
+
+    Args:
+        corpus: the corpus.
+        clips: its training clips.
+        trainer: the trainer whose processes share the result; None outside training.
 
     Raises:
-        FaceDiffError: if the training clips hold no motion at all.
+        FaceDiffError: if the clips hold no motion at all.
     """
 
     def measure() -> npt.NDArray[np.float64]:
         total, count = 0.0, 0
-        for motion in _spread_frames(data, FRAMES):
+        for motion in _spread_frames(corpus, clips, FRAMES):
             for frame in motion:
                 total += float(frame.double().square().sum())
                 count += frame.numel()
         if not total:
-            raise FaceDiffError(f"{data.root}: the training split holds no motion at all; check vertices_npy/")
+            raise FaceDiffError(f"{corpus.root}: the training split holds no motion at all; check vertices_npy/")
         return np.array([(count / total) ** 0.5])
 
-    return float(_measured(data, ("scale", FRAMES), measure)[0])
+    return float(_measured(corpus, clips, trainer, ("scale", FRAMES), measure)[0])
 
 
-def measure_components(data: SpeechMotionDataModule, count: int, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Mean (3V,) and principal components (at most ``count``, 3V) of the training motion."""
+def measure_components(
+    corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None, count: int, weights: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Mean (3V,) and principal components (at most ``count``, 3V) of the motion; the arguments as above."""
     weighted = "" if weights is None else hashlib.sha256(weights.detach().cpu().numpy().tobytes()).hexdigest()
 
     def measure() -> npt.NDArray[np.float32]:
-        each = max(2, PRINCIPAL_NUMBERS // (3 * data.n_vertices * max(1, len(data.clips("train")))))
-        frames = torch.cat([motion.flatten(1) for motion in _spread_frames(data, min(each, FRAMES))]).double()
+        frames_per_clip = min(FRAMES, max(2, PRINCIPAL_NUMBERS // (3 * corpus.n_vertices * max(1, len(clips)))))
+        frames = torch.cat([motion.flatten(1) for motion in _spread_frames(corpus, clips, frames_per_clip)]).double()
         mean = frames.mean(0)
         frames -= mean
         if weights is not None:
@@ -75,40 +81,42 @@ def measure_components(data: SpeechMotionDataModule, count: int, weights: Tensor
             shapes = vectors[:, kept].T * (values[kept, None] / len(frames)).sqrt()
         return torch.cat([mean[None], shapes]).float().numpy()
 
-    found = torch.from_numpy(
-        np.array(_measured(data, ("components", FRAMES, PRINCIPAL_NUMBERS, count, weighted), measure))
-    )
-    return found[0], found[1:]
+    what = ("components", FRAMES, PRINCIPAL_NUMBERS, count, weighted)
+    components = torch.from_numpy(np.array(_measured(corpus, clips, trainer, what, measure)))
+    return components[0], components[1:]
 
 
-def _spread_frames(data: SpeechMotionDataModule, count: int) -> Iterator[Tensor]:
-    """At most ``count`` evenly spread frames (n, V, 3) of every training clip."""
-    for clip in data.clips("train"):
-        yield data.corpus.read_spread(clip, count)
+def _spread_frames(corpus: Corpus, clips: Sequence[Clip], count: int) -> Iterator[Tensor]:
+    """At most ``count`` evenly spread frames (n, V, 3) of every clip."""
+    for clip in clips:
+        yield corpus.read_spread(clip, count)
 
 
 def _measured(
-    data: SpeechMotionDataModule, what: tuple[object, ...], measure: Callable[[], npt.NDArray[Any]]
+    corpus: Corpus,
+    clips: Sequence[Clip],
+    trainer: Trainer | None,
+    what: tuple[object, ...],
+    measure: Callable[[], npt.NDArray[Any]],
 ) -> npt.NDArray[Any]:
-    """An array that the training motion decides: received from the first process, read from disk, or measured."""
+    """An array that depends on the training motion only: received from the first process, cached, or measured."""
 
-    def find() -> npt.NDArray[Any]:
+    def read_or_measure() -> npt.NDArray[Any]:
         store = ArrayStore(cache_dir() / "measured")
-        key = store.key(METHOD, *what, data.n_vertices, data.corpus.fingerprint(data.clips("train")))
-        kept = store.get(key)
-        return store.put(key, measure()) if kept is None else np.array(kept)
+        key = store.key(METHOD, *what, corpus.n_vertices, corpus.fingerprint(clips))
+        cached = store.get(key)
+        return store.put(key, measure()) if cached is None else np.array(cached)
 
-    trainer = data.trainer
     if trainer is None or trainer.world_size == 1:
-        return find()
-    # A process that failed alone would leave the others waiting, so what went wrong is shared as well.
-    found: npt.NDArray[Any] | str = ""
+        return read_or_measure()
+    # If the first process failed alone, the others would wait for ever, so its error is broadcast as well.
+    measured: npt.NDArray[Any] | str = ""
     if trainer.global_rank == 0:
         try:
-            found = find()
+            measured = read_or_measure()
         except FaceDiffError as error:
-            found = str(error)
-    found = trainer.strategy.broadcast(found, src=0)
-    if isinstance(found, str):
-        raise FaceDiffError(found)
-    return found
+            measured = str(error)
+    measured = trainer.strategy.broadcast(measured, src=0)
+    if isinstance(measured, str):
+        raise FaceDiffError(measured)
+    return measured

@@ -36,8 +36,8 @@ def cache_root(seed: int, drawn_speakers: int = 0) -> Path:
 def made_root(seed: int) -> Path | None:
     """A folder of :func:`cache_root` that is there, with or without drawn speakers; None if there is none."""
     usual = cache_root(seed)
-    found = [usual, *sorted(usual.parent.glob(f"{usual.name}-drawn*"))]
-    return next((folder for folder in found if folder.is_dir()), None)
+    folders = [usual, *sorted(usual.parent.glob(f"{usual.name}-drawn*"))]
+    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def built_in_mesh() -> Mesh:
@@ -108,8 +108,8 @@ class Puppet(SpeechMotionDataModule):
 
     def eyelid_pairs(self) -> Tensor | None:
         """Those of the corpus folder, or of the mesh itself where the folder was made before it had such a file."""
-        found = super().eyelid_pairs()
-        return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1)) if found is None else found
+        pairs = super().eyelid_pairs()
+        return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1)) if pairs is None else pairs
 
     def split_of(self, clip: Clip) -> str | None:
         """By speaker and sentence number, like BIWI."""

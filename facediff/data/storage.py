@@ -66,15 +66,15 @@ class ClipFolder:
         Raises:
             FaceDiffError: if a name cannot be printed.
         """
-        found = []
+        names = []
         for name in sorted(path.stem for path in (self.root / "wav").glob("*.wav")):
             if not name.isprintable():
                 raise FaceDiffError(
                     f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"
                 )
             if motion_path(self.root, name).is_file():
-                found.append(name)
-        return found
+                names.append(name)
+        return names
 
     def open(self, name: str) -> MotionFile:
         """Map a clip's file into memory.

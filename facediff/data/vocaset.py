@@ -60,8 +60,8 @@ class Vocaset(SpeechMotionDataModule):
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
         """``FaceTalk_170728_03272_TA_sentence01``."""
-        found = re.fullmatch(r"(FaceTalk_\d+_\d+_TA)_(sentence\d\d)", name)
-        return Clip(name, found[1], found[2]) if found else None
+        match = re.fullmatch(r"(FaceTalk_\d+_\d+_TA)_(sentence\d\d)", name)
+        return Clip(name, match[1], match[2]) if match else None
 
     @classmethod
     def expected_clips(cls) -> dict[str, list[str]]:

@@ -123,9 +123,9 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPho
     Raises:
         MissingExtraError: if espeak-ng is not installed.
     """
-    from facediff.synthetic.speech import Voice, speak
+    from facediff.synthetic.speech import EspeakVoice, speak
 
-    said = speak(" ".join(text.split()), Voice("en-us", rate=165, pitch=50, pitch_range=50))
+    said = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
     return said.samples, [TimedPhoneme(each.start, each.end, each.ipa) for each in said.phonemes if each.ipa]
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.face import EYE_CENTRE, build_face
-from facediff.synthetic.geometry import Array, Mesh, bump, rise
+from facediff.synthetic.geometry import Array, HeadMesh, bump, rise
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig, jaw_share, lip_side, soft_parts
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.utils.files import atomic_folder
@@ -78,7 +78,7 @@ def puppet_shapes(speaker: str | None = None) -> tuple[Array, npt.NDArray[np.int
     return neutral, np.asarray(mesh.faces, np.int64), shapes
 
 
-def _moves(mesh: Mesh) -> dict[str, Array]:
+def _moves(mesh: HeadMesh) -> dict[str, Array]:
     """Displacements (V, 3) in metres of the neutral head for the shapes that the puppet's speech never uses."""
     canonical = 1000.0 * mesh.vertices
     x, y = canonical[:, 0], canonical[:, 1]
@@ -119,7 +119,7 @@ def _moves(mesh: Mesh) -> dict[str, Array]:
     return moves
 
 
-def _look(mesh: Mesh, canonical: Array, sign: float, sideways: float, up: float) -> Array:
+def _look(mesh: HeadMesh, canonical: Array, sign: float, sideways: float, up: float) -> Array:
     """One eyeball turned about its centre, to the face's left and up in degrees: displacements (V, 3) in mm."""
     half = np.concatenate([at for name, at in mesh.groups.items() if name.startswith("eyeball") or name == "pupil"])
     ball = half if sign > 0 else mesh.mirror[half]

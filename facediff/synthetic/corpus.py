@@ -18,7 +18,7 @@ from facediff.synthetic.geometry import Array
 from facediff.synthetic.motion import FRAME_RATE, analyse, generate_weights, segments_of, visemes_of
 from facediff.synthetic.rig import Rig, build_rig, eyelid_pairs, lip_pairs
 from facediff.synthetic.speakers import MOST_DRAWN, SPEAKERS, drawn_names, speaker_of
-from facediff.synthetic.speech import SENTENCES, Phoneme, speak
+from facediff.synthetic.speech import SENTENCES, SpokenPhoneme, speak
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder
@@ -48,7 +48,7 @@ REFERENCE_SENTENCES = tuple(range(1, 25))
 
 
 @dataclass(frozen=True)
-class Clip:
+class SyntheticClip:
     """One clip of the corpus."""
 
     identity: str  # Who speaks
@@ -66,7 +66,7 @@ class Clip:
         return f"{self.identity}_{self.sentence}"
 
 
-def clips(drawn: int = 0) -> tuple[Clip, ...]:
+def clips(drawn: int = 0) -> tuple[SyntheticClip, ...]:
     """All clips, speaker by speaker.
 
     Moods take turns, shifted by one from speaker to speaker, so that every speaker has every mood equally
@@ -80,7 +80,7 @@ def clips(drawn: int = 0) -> tuple[Clip, ...]:
     plan += [(identity, (*REFERENCE_SENTENCES, *TEST_SENTENCES)) for identity in UNSEEN_IDENTITIES]
     plan += [(identity, TRAIN_SENTENCES) for identity in drawn_names(drawn)]
     return tuple(
-        Clip(identity, number, MOODS[(number + turn) % len(MOODS)])
+        SyntheticClip(identity, number, MOODS[(number + turn) % len(MOODS)])
         for turn, (identity, numbers) in enumerate(plan)
         for number in numbers
     )
@@ -140,7 +140,7 @@ def is_complete(root: Path, *, seed: int = 0, drawn: int = 0) -> bool:
     return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
-def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, tuple[Phoneme, ...]]:
+def generate_clip(clip: SyntheticClip, seed: int = 0) -> tuple[NDArray[np.int16], Array, tuple[SpokenPhoneme, ...]]:
     """One clip's waveform (640 T,) at 16 kHz, rig weights (T, controls), and phonemes in time."""
     speaker = speaker_of(clip.identity)
     spoken = speak(SENTENCES[clip.number - 1], speaker.voice)
@@ -160,14 +160,14 @@ def generate_clip(clip: Clip, seed: int = 0) -> tuple[NDArray[np.int16], Array, 
     return np.rint(samples * 32767.0).astype(np.int16), weights, phonemes
 
 
-def _in_quiet(phonemes: tuple[Phoneme, ...], before: float, end: float) -> tuple[Phoneme, ...]:
+def _in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) -> tuple[SpokenPhoneme, ...]:
     """Shift phonemes by the quiet before speech and fill up with pauses to the end of the clip."""
-    moved = [Phoneme(p.start + before, min(p.end + before, end), p.ipa) for p in phonemes]
+    moved = [SpokenPhoneme(p.start + before, min(p.end + before, end), p.ipa) for p in phonemes]
     moved = [p for p in moved if p.end > p.start]
     if moved[0].start > 0.0:
-        moved.insert(0, Phoneme(0.0, moved[0].start, ""))
+        moved.insert(0, SpokenPhoneme(0.0, moved[0].start, ""))
     if moved[-1].end < end:
-        moved.append(Phoneme(moved[-1].end, end, ""))
+        moved.append(SpokenPhoneme(moved[-1].end, end, ""))
     return tuple(moved)
 
 
@@ -195,15 +195,15 @@ def _facts(seed: int, count: int, drawn: int) -> dict[str, int | str]:
     return {**facts, "clips": count, **({"drawn": drawn} if drawn else {})}
 
 
-def _chosen(only: Sequence[str] | None, drawn: int) -> tuple[Clip, ...]:
+def _chosen(only: Sequence[str] | None, drawn: int) -> tuple[SyntheticClip, ...]:
     everything = clips(drawn)
     if only is None:
         return everything
-    known = {clip.name: clip for clip in everything}
-    unknown = [name for name in only if name not in known]
+    clips_by_name = {clip.name: clip for clip in everything}
+    unknown = [name for name in only if name not in clips_by_name]
     if unknown:
         raise FaceDiffError(f"the built-in corpus has no clip {unknown[0]!r}; clips are named like 'F1_e01'")
-    return tuple(known[name] for name in only)
+    return tuple(clips_by_name[name] for name in only)
 
 
 def _refuse_foreign(root: Path) -> None:
@@ -214,7 +214,7 @@ def _refuse_foreign(root: Path) -> None:
         )
 
 
-def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
+def _write_common(folder: Path, chosen: Sequence[SyntheticClip]) -> None:
     """Write everything that is not a clip."""
     for name in ("wav", "vertices_npy", "phonemes", "regions"):
         (folder / name).mkdir()
@@ -238,7 +238,7 @@ def _write_common(folder: Path, chosen: Sequence[Clip]) -> None:
 
 
 def _write_clips(
-    folder: Path, chosen: Sequence[Clip], seed: int, workers: int | None, scheduler: str | None, progress: bool
+    folder: Path, chosen: Sequence[SyntheticClip], seed: int, workers: int | None, scheduler: str | None, progress: bool
 ) -> int:
     """Write all clips and return how many frames they have together."""
     total = 0
@@ -258,7 +258,7 @@ def _write_clips(
     return total
 
 
-def _write_clip(folder: Path, clip: Clip, seed: int) -> int:
+def _write_clip(folder: Path, clip: SyntheticClip, seed: int) -> int:
     """Write sound, motion and phonemes of a clip and return its number of frames."""
     import soundfile
 

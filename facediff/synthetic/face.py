@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from facediff.synthetic.geometry import Array, HalfMesh, Mesh, bump, delaunay, rise, through
+from facediff.synthetic.geometry import Array, HalfMesh, HeadMesh, bump, delaunay, rise, through
 
 N_VERTICES = 1008
 
@@ -33,7 +33,7 @@ BROW_COLUMNS = np.array([13.0, 19.5, 27.0, 34.5, 42.0, 48.5])
 
 
 @lru_cache(maxsize=1)
-def build_face() -> Mesh:
+def build_face() -> HeadMesh:
     """Build the neutral head, in metres; speakers' heads have the same faces and other vertices."""
     half = HalfMesh()
     _add_skin(half)
@@ -43,7 +43,7 @@ def build_face() -> Mesh:
     _add_eyeball(half)
     _add_ear(half)
     mesh = half.mirrored()
-    return Mesh(mesh.vertices / 1000.0, mesh.faces, mesh.colours, mesh.mirror, mesh.groups)
+    return HeadMesh(mesh.vertices / 1000.0, mesh.faces, mesh.colours, mesh.mirror, mesh.groups)
 
 
 def _add_skin(half: HalfMesh) -> None:
@@ -342,21 +342,21 @@ def _fill(points: Array) -> list[tuple[float, float]]:
     holes = [to_plane(mouth_ring(0.0)), to_plane(eye_ring(0.0))]
     pitch = 2.5
     taken = points
-    wanted = spacing(taken[:, 0] / radius(taken[:, 1]), taken[:, 1])
+    spacings = spacing(taken[:, 0] / radius(taken[:, 1]), taken[:, 1])
     new: list[tuple[float, float]] = []
     for row, level in enumerate(np.arange(LOWEST_LEVEL + 6, HIGHEST_LEVEL - 3, pitch)):
         limit = float(np.pi * radius(level))
         for length in np.arange(4.0 + 0.5 * pitch * (row % 2), limit, pitch):
             own = float(spacing(np.array(length / radius(level)), np.array(level)))
             far = np.hypot(taken[:, 0] - length, taken[:, 1] - level)
-            nearest = (far / np.minimum(0.5 * (wanted + own), own)).min()
+            nearest = (far / np.minimum(0.5 * (spacings + own), own)).min()
             if nearest < 0.88 or limit - length < 0.5 * own or length < 0.6 * own:
                 continue
             if any(_inside(hole, np.array([[length, level]]))[0] for hole in holes):
                 continue
             new.append((float(length), float(level)))
             taken = np.concatenate([taken, [[length, level]]])
-            wanted = np.append(wanted, own)
+            spacings = np.append(spacings, own)
     return new
 
 

@@ -46,8 +46,10 @@ _PEAK = 0.6
 def further_speech(number: int, identities: Sequence[str]) -> NDArray[np.float32]:
     """Five to eight words by one of some speakers, (S,) at 16 kHz; the same number gives the same speech."""
     random = np.random.default_rng([number, len(WORDS)])
-    words = random.choice(WORDS, size=random.integers(5, 9))
-    said = speak(" ".join(words), speaker_of(identities[int(random.integers(len(identities)))]).voice).samples
+    text = random.choice(WORDS, size=random.integers(5, 9))
+    said = speak(" ".join(text), speaker_of(identities[int(random.integers(len(identities)))]).voice).samples
     before, after = round(_QUIET_BEFORE * SAMPLE_RATE), round(_QUIET_AFTER * SAMPLE_RATE)
-    made: NDArray[np.float32] = np.pad(said * np.float32(_PEAK / max(float(np.abs(said).max()), 1e-6)), (before, after))
-    return made
+    padded: NDArray[np.float32] = np.pad(
+        said * np.float32(_PEAK / max(float(np.abs(said).max()), 1e-6)), (before, after)
+    )
+    return padded

@@ -12,7 +12,7 @@ Faces = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Mesh:
+class HeadMesh:
     """A triangle mesh with named vertices."""
 
     vertices: Array  # Positions, shape (V, 3)
@@ -59,7 +59,7 @@ class HalfMesh:
         """Join a closed clockwise ring to a point."""
         self.faces.append(np.stack([ring, np.full_like(ring, centre), np.roll(ring, -1)], axis=1))
 
-    def mirrored(self) -> Mesh:
+    def mirrored(self) -> HeadMesh:
         """Both halves as one mesh: the left half's points, then the mirror images of all off the midline."""
         points, colours = np.concatenate(self.points), np.concatenate(self.colours)
         faces = np.concatenate(self.faces)
@@ -69,7 +69,7 @@ class HalfMesh:
         mirror[off] = self.count + np.arange(len(off))
         other = mirror[faces][:, ::-1]
         double = np.concatenate([points, points[off] * np.array([-1.0, 1.0, 1.0])])
-        return Mesh(
+        return HeadMesh(
             vertices=double,
             faces=np.concatenate([faces, other]),
             colours=np.clip(np.rint(np.concatenate([colours, colours[off]])), 0, 255).astype(np.uint8),

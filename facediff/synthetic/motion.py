@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.rig import CONTROLS
-from facediff.synthetic.speech import Phoneme
+from facediff.synthetic.speech import SpokenPhoneme
 
 #: Rig controls that speech drives, in the order used by `facediff.synthetic.motion`.
 SPEECH_CONTROLS = (
@@ -84,7 +84,7 @@ _GAINS = {
 
 def generate_weights(
     segments: list[Segment],
-    prosody: Prosody,
+    prosody: ProsodyContours,
     frames: int,
     style: SpeakingStyle,
     mood: str,
@@ -138,7 +138,7 @@ def _speech(
 
 def _upper_face(
     tracks: dict[str, Array],
-    prosody: Prosody,
+    prosody: ProsodyContours,
     times: Array,
     style: SpeakingStyle,
     effect: Mood,
@@ -316,7 +316,7 @@ class Segment:
     stress: float  # How much of its target is reached, about 1
 
 
-def segments_of(phonemes: tuple[Phoneme, ...]) -> list[Segment]:
+def segments_of(phonemes: tuple[SpokenPhoneme, ...]) -> list[Segment]:
     """Split phonemes into segments of one mouth shape each; a diphthong spends more time on its first."""
     segments: list[Segment] = []
     for phoneme in phonemes:
@@ -387,7 +387,7 @@ _LOWEST_PITCH, _HIGHEST_PITCH = 65.0, 420.0
 
 
 @dataclass(frozen=True)
-class Prosody:
+class ProsodyContours:
     """Slow contours of a clip, each about -1 to 2 with mean 0 over its voiced part."""
 
     times: Array  # Middles of the analysis windows, in seconds, shape (n,)
@@ -396,7 +396,7 @@ class Prosody:
     pitch: Array
 
 
-def analyse(samples: NDArray[np.float32], rate: int) -> Prosody:
+def analyse(samples: NDArray[np.float32], rate: int) -> ProsodyContours:
     """Contours of a mono waveform (samples,), smoothed over about a syllable; ``rate`` is in samples a second."""
     hop, window = int(_HOP * rate), int(_WINDOW * rate)
     padded = np.pad(np.asarray(samples, dtype=np.float64), window)
@@ -408,12 +408,12 @@ def analyse(samples: NDArray[np.float32], rate: int) -> Prosody:
     voiced &= level > level.max() - 30.0
     times = (starts - window + 0.5 * window) / rate
     if voiced.sum() < 3:
-        return Prosody(times, np.zeros_like(times), np.zeros_like(times))
+        return ProsodyContours(times, np.zeros_like(times), np.zeros_like(times))
     melody = np.interp(times, times[voiced], np.log(pitch[voiced]))
     loud = np.maximum(level, level[voiced].mean() - 20.0)
     # The melody fades out where there has been no voice for a while.
     gate = np.clip(1.6 * _blur(voiced.astype(np.float64), 0.12), 0.0, 1.0)
-    return Prosody(times, _contour(loud, voiced, 0.08), _contour(melody, voiced, 0.09) * gate)
+    return ProsodyContours(times, _contour(loud, voiced, 0.08), _contour(melody, voiced, 0.09) * gate)
 
 
 def _pitch(frames: Array, rate: int) -> tuple[NDArray[np.bool_], Array]:

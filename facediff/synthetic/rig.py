@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.synthetic.face import EYE_CENTRE, LIP_COLUMNS, MOUTH_HALF_WIDTH, MOUTH_Y, build_face, contact_line
-from facediff.synthetic.geometry import Array, Mesh, bump, rise
+from facediff.synthetic.geometry import Array, HeadMesh, bump, rise
 
 LINEAR_FIELDS = (
     "jaw_open",
@@ -93,21 +93,21 @@ def build_rig(shape: Shape, asymmetry: float = 0.0) -> Rig:
     return Rig(neutral, np.stack(posed), upper, lower, _contact(mesh, canonical, upper))
 
 
-def lip_pairs(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def lip_pairs(mesh: HeadMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Facing vertices of the lips' inner borders, (upper, lower), from right to left without the corners."""
     chain = mesh.groups["lip_inner"]
     top, bottom = chain[:7], chain[:7:-1]
     return np.concatenate([mesh.mirror[top[:0:-1]], top]), np.concatenate([mesh.mirror[bottom[:0:-1]], bottom])
 
 
-def eyelid_pairs(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def eyelid_pairs(mesh: HeadMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Facing vertices of the lids' edges, (upper, lower), of both eyes without the corners."""
     ring = mesh.groups["eye_0"]  # from the inner corner over the upper lid to the outer one, and back below
     upper, lower = ring[1:8], ring[:8:-1]
     return np.concatenate([upper, mesh.mirror[upper]]), np.concatenate([lower, mesh.mirror[lower]])
 
 
-def lip_side(mesh: Mesh, canonical: Array) -> Array:
+def lip_side(mesh: HeadMesh, canonical: Array) -> Array:
     """How far each vertex belongs to the jaw's side of the mouth: 0 upper lip, 1 lower lip, shape (V,)."""
     x, y = np.abs(canonical[:, 0]), canonical[:, 1]
     soft = 2.0 + 22.0 * rise(x, 5.0, 42.0)
@@ -123,7 +123,7 @@ def lip_side(mesh: Mesh, canonical: Array) -> Array:
     return below
 
 
-def soft_parts(mesh: Mesh, canonical: Array) -> tuple[Array, Array]:
+def soft_parts(mesh: HeadMesh, canonical: Array) -> tuple[Array, Array]:
     """How far each vertex is skin at the front of the face, and how far it follows inside the mouth; both (V,)."""
     skin = np.ones(len(canonical))
     rigid = ["pupil", *(n for n in mesh.groups if n.startswith(("eyeball", "teeth", "ear")))]
@@ -135,7 +135,7 @@ def soft_parts(mesh: Mesh, canonical: Array) -> tuple[Array, Array]:
     return skin, inside
 
 
-def _fields(mesh: Mesh, canonical: Array) -> dict[str, Array]:
+def _fields(mesh: HeadMesh, canonical: Array) -> dict[str, Array]:
     """Displacements of the neutral head in mm, each of shape (V, 3)."""
     x, y = np.abs(canonical[:, 0]), canonical[:, 1]
     sign = np.sign(canonical[:, 0])
@@ -186,7 +186,7 @@ def _fields(mesh: Mesh, canonical: Array) -> dict[str, Array]:
     }
 
 
-def jaw_share(mesh: Mesh, canonical: Array, below: Array) -> Array:
+def jaw_share(mesh: HeadMesh, canonical: Array, below: Array) -> Array:
     """How far each vertex follows the lower jaw, (V,)."""
     y, z = canonical[:, 1], canonical[:, 2]
     weight = below * rise(z, -12.0, 30.0) * rise(y, -128.0, -96.0) * rise(y, 8.0, -22.0)
@@ -198,7 +198,7 @@ def jaw_share(mesh: Mesh, canonical: Array, below: Array) -> Array:
     return np.asarray(weight)
 
 
-def _jaw(mesh: Mesh, canonical: Array, below: Array) -> Array:
+def _jaw(mesh: HeadMesh, canonical: Array, below: Array) -> Array:
     """Turn of the lower jaw about an axis through the ears."""
     y, z = canonical[:, 1], canonical[:, 2]
     weight = jaw_share(mesh, canonical, below)
@@ -209,7 +209,7 @@ def _jaw(mesh: Mesh, canonical: Array, below: Array) -> Array:
     return np.stack([np.zeros_like(y), weight * dy, weight * dz], axis=-1)
 
 
-def _lids(mesh: Mesh, canonical: Array) -> tuple[Array, Array, Array]:
+def _lids(mesh: HeadMesh, canonical: Array) -> tuple[Array, Array, Array]:
     """Closing, widening and squinting: each upper lid vertex travels towards the lower one below it."""
     close, wide, squint = (np.zeros_like(canonical) for _ in range(3))
     follow = {"eye_0": 1.0, "lid_inner": 1.0, "eye_1": 0.62, "eye_2": 0.12}
@@ -233,7 +233,7 @@ def _lids(mesh: Mesh, canonical: Array) -> tuple[Array, Array, Array]:
     return close, wide, squint
 
 
-def _contact(mesh: Mesh, canonical: Array, upper: NDArray[np.int64]) -> Array:
+def _contact(mesh: HeadMesh, canonical: Array, upper: NDArray[np.int64]) -> Array:
     """How every vertex follows the columns of the lips when they close, shape (V, C)."""
     x, y = canonical[:, 0], canonical[:, 1]
     columns = canonical[upper, 0]

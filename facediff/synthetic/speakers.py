@@ -15,7 +15,7 @@ import numpy as np
 
 from facediff.synthetic.motion import SpeakingStyle
 from facediff.synthetic.rig import Shape
-from facediff.synthetic.speech import Voice
+from facediff.synthetic.speech import EspeakVoice
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Speaker:
     """One of the corpus's speakers."""
 
     name: str  # Identity, such as `"F1"`
-    voice: Voice  # How espeak-ng speaks for them
+    voice: EspeakVoice  # How espeak-ng speaks for them
     shape: Shape  # How their head differs from the neutral one
     style: SpeakingStyle  # How their face moves
 
@@ -33,7 +33,7 @@ def _read_speakers() -> dict[str, Speaker]:
     tables: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(text)
     # The constructors refuse a number that they do not know, so a misspelt name cannot go unnoticed.
     return {
-        name: Speaker(name, Voice(**table["voice"]), Shape(**table["shape"]), SpeakingStyle(**table["style"]))
+        name: Speaker(name, EspeakVoice(**table["voice"]), Shape(**table["shape"]), SpeakingStyle(**table["style"]))
         for name, table in tables.items()
     }
 
@@ -65,19 +65,19 @@ def drawn_speaker(number: int) -> Speaker:
     have no part in it. Half of the numbers of the face are 0, as theirs are.
     """
     random = np.random.default_rng([number, len(SPEAKERS)])
-    known = [speaker for name, speaker in SPEAKERS.items() if name not in ("F4", "M4")]
+    trained = [speaker for name, speaker in SPEAKERS.items() if name not in ("F4", "M4")]
 
     def between(values: list[float]) -> float:
         wider = 0.1 * (max(values) - min(values))
         drawn = float(random.uniform(min(values) - wider, max(values) + wider))
         return drawn if min(values) < 0 else max(0.0, drawn)
 
-    style = {f.name: between([getattr(each.style, f.name) for each in known]) for f in fields(SpeakingStyle)}
+    style = {f.name: between([getattr(speaker.style, f.name) for speaker in trained]) for f in fields(SpeakingStyle)}
     shape = {f.name: float(random.uniform(-1.0, 1.0)) * int(random.integers(2)) for f in fields(Shape)}
-    numbers = {key: round(between([getattr(each.voice, key) for each in known])) for key in ("rate", "pitch")}
-    voice = Voice(
+    numbers = {key: round(between([getattr(speaker.voice, key) for speaker in trained])) for key in ("rate", "pitch")}
+    voice = EspeakVoice(
         f"{random.choice(_VOICES)}+{random.choice(_VARIANTS)}",
         **numbers,
-        pitch_range=round(between([each.voice.pitch_range for each in known])),
+        pitch_range=round(between([speaker.voice.pitch_range for speaker in trained])),
     )
     return Speaker(f"{DRAWN}{number:02d}", voice, Shape(**shape), SpeakingStyle(**style))

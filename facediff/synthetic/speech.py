@@ -76,7 +76,7 @@ _CLOSURE = 0.045
 
 
 @dataclass(frozen=True)
-class Voice:
+class EspeakVoice:
     """The settings of espeak-ng for a speaker."""
 
     name: str  # Voice and variant, such as `"en-us+f2"`
@@ -86,7 +86,7 @@ class Voice:
 
 
 @dataclass(frozen=True)
-class Phoneme:
+class SpokenPhoneme:
     """One phoneme of an utterance."""
 
     start: float  # Where it starts, in seconds
@@ -99,7 +99,7 @@ class Utterance:
     """A spoken sentence."""
 
     samples: NDArray[np.float32]  # Waveform at 16 kHz, shape (samples,), float32 in [-1, 1]
-    phonemes: tuple[Phoneme, ...]  # The phonemes in order, without gaps
+    phonemes: tuple[SpokenPhoneme, ...]  # The phonemes in order, without gaps
 
 
 class _EventId(ctypes.Union):
@@ -122,7 +122,7 @@ class _Event(ctypes.Structure):
 _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_short), ctypes.c_int, ctypes.POINTER(_Event))
 
 
-def speak(text: str, voice: Voice) -> Utterance:
+def speak(text: str, voice: EspeakVoice) -> Utterance:
     """Speak a sentence; the same text and voice give the same samples every time.
 
     Args:
@@ -168,7 +168,7 @@ def _unload(library: ctypes.CDLL) -> None:
         close(library._handle)
 
 
-def _speak_here(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, str]]]:
+def _speak_here(text: str, voice: EspeakVoice) -> tuple[int, bytes, list[tuple[int, str]]]:
     """Sample rate, 16-bit samples, and (sample index, IPA) of each phoneme, from a freshly loaded library."""
     path, data = _paths()
     library = ctypes.CDLL(path)
@@ -211,7 +211,7 @@ def _speak_here(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, st
     return int(rate), b"".join(chunks), events
 
 
-def _speak_elsewhere(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[int, str]]]:
+def _speak_elsewhere(text: str, voice: EspeakVoice) -> tuple[int, bytes, list[tuple[int, str]]]:
     """Speak in a new interpreter."""
     request = json.dumps([text, voice.name, voice.rate, voice.pitch, voice.pitch_range])
     done = subprocess.run(  # noqa: S603 - this very interpreter, no outside input
@@ -231,7 +231,7 @@ def _speak_elsewhere(text: str, voice: Voice) -> tuple[int, bytes, list[tuple[in
 def _serve() -> None:
     """Answer one request of `_speak_elsewhere`: JSON in, a JSON line and the samples out."""
     text, name, rate, pitch, pitch_range = json.loads(sys.stdin.buffer.read())
-    answer = _speak_here(text, Voice(name, rate, pitch, pitch_range))
+    answer = _speak_here(text, EspeakVoice(name, rate, pitch, pitch_range))
     sys.stdout.buffer.write(json.dumps([answer[0], answer[2]]).encode() + b"\n" + answer[1])
 
 
@@ -246,26 +246,26 @@ def _finish(rate: int, pcm: bytes, events: list[tuple[int, str]]) -> Utterance:
     end = native.size / rate
     starts = [min(sample / rate, end) for sample, _ in events]
     phonemes = [
-        Phoneme(start, stop, ipa)
+        SpokenPhoneme(start, stop, ipa)
         for start, stop, (_, ipa) in zip(starts, [*starts[1:], end], events, strict=True)
         if stop > start
     ]
     return Utterance(samples, tuple(_with_closures(phonemes)))
 
 
-def _with_closures(phonemes: list[Phoneme]) -> list[Phoneme]:
+def _with_closures(phonemes: list[SpokenPhoneme]) -> list[SpokenPhoneme]:
     """Give voiceless plosives their silent closure.
 
     In espeak-ng p, t, k and ch start at the burst. The silence before it, in which the lips or the tongue are shut
     already, belongs to the previous sound there.
     """
-    result: list[Phoneme] = []
+    result: list[SpokenPhoneme] = []
     for phoneme in phonemes:
         if result and result[-1].ipa and phoneme.ipa[:1] in _VOICELESS_PLOSIVES:
             before = result[-1]
             start = phoneme.start - min(_CLOSURE, 0.35 * (before.end - before.start))
-            result[-1] = Phoneme(before.start, start, before.ipa)
-            phoneme = Phoneme(start, phoneme.end, phoneme.ipa)
+            result[-1] = SpokenPhoneme(before.start, start, before.ipa)
+            phoneme = SpokenPhoneme(start, phoneme.end, phoneme.ipa)
         result.append(phoneme)
     return result
 

@@ -10,7 +10,7 @@ from torch import Tensor
 import facediff.metrics as fm
 from facediff.metrics.eyes import count_blinks
 from facediff.synthetic import motion as puppet
-from facediff.synthetic.corpus import Clip, generate_clip, rig_of
+from facediff.synthetic.corpus import SyntheticClip, generate_clip, rig_of
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import eyelid_pairs
 
@@ -119,7 +119,7 @@ def test_the_built_in_corpus_blinks_as_often_as_was_drawn(monkeypatch: pytest.Mo
     assert pairs.shape == (14, 2)
     found = []
     for number, mood in ((28, "lively"), (29, "flat"), (31, "neutral")):
-        _, weights, _ = generate_clip(Clip("F1", number, mood))
+        _, weights, _ = generate_clip(SyntheticClip("F1", number, mood))
         motion = torch.from_numpy(rig_of("F1").pose(weights))
         metric = fm.BlinkRate(pairs.tolist(), frames_per_second=25)
         metric.update(motion, motion)

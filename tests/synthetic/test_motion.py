@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.synthetic.corpus import MOODS, Clip, generate_clip, rig_of
+from facediff.synthetic.corpus import MOODS, SyntheticClip, generate_clip, rig_of
 from facediff.synthetic.motion import FRAME_RATE, SPEECH_CONTROLS, articulate, close_lips, segments_of
 from facediff.synthetic.rig import CONTROLS
-from facediff.synthetic.speech import Phoneme
+from facediff.synthetic.speech import SpokenPhoneme
 
 pytest.importorskip("espeakng_loader")
 
@@ -65,7 +65,12 @@ def test_nothing_jitters(corpus: Path) -> None:
 def test_trajectories_have_no_corners() -> None:
     """Sampled ten times finer, the largest change of slope falls in proportion: the slope is continuous."""
     segments = segments_of(
-        (Phoneme(0.0, 0.1, ""), Phoneme(0.1, 0.2, "m"), Phoneme(0.2, 0.4, "ˈɑː"), Phoneme(0.4, 0.5, "b"))
+        (
+            SpokenPhoneme(0.0, 0.1, ""),
+            SpokenPhoneme(0.1, 0.2, "m"),
+            SpokenPhoneme(0.2, 0.4, "ˈɑː"),
+            SpokenPhoneme(0.4, 0.5, "b"),
+        )
     )
 
     def kink(step: float) -> float:
@@ -77,7 +82,7 @@ def test_trajectories_have_no_corners() -> None:
 
 
 def test_dominance_respects_neighbours_and_rounding_spreads() -> None:
-    segments = segments_of((Phoneme(0.0, 0.1, "t"), Phoneme(0.1, 0.3, "uː"), Phoneme(0.3, 0.4, "t")))
+    segments = segments_of((SpokenPhoneme(0.0, 0.1, "t"), SpokenPhoneme(0.1, 0.3, "uː"), SpokenPhoneme(0.3, 0.4, "t")))
     weights = articulate(segments, np.array([0.05, 0.2]))
     pucker = SPEECH_CONTROLS.index("pucker")
     assert weights[1, pucker] > 0.7
@@ -87,7 +92,7 @@ def test_dominance_respects_neighbours_and_rounding_spreads() -> None:
 def test_moods_differ_in_articulation_and_brows_on_one_speech() -> None:
     peak, brows, waves = [], [], []
     for mood in MOODS:
-        wave, weights, _ = generate_clip(Clip("M1", 2, mood))
+        wave, weights, _ = generate_clip(SyntheticClip("M1", 2, mood))
         peak.append(np.quantile(opening(rig_of("M1").pose(weights), "M1").max(axis=1), 0.9))
         brows.append(weights[:, CONTROLS.index("outer_brow_up")].max())
         waves.append(wave)
@@ -99,7 +104,7 @@ def test_moods_differ_in_articulation_and_brows_on_one_speech() -> None:
 
 def test_chance_moves_the_upper_face_and_hardly_the_lips() -> None:
     rig = rig_of("F3")
-    takes = [rig.pose(generate_clip(Clip("F3", 5, "neutral"), seed)[1]) for seed in (0, 1)]
+    takes = [rig.pose(generate_clip(SyntheticClip("F3", 5, "neutral"), seed)[1]) for seed in (0, 1)]
     lips = [opening(animation, "F3").max(axis=1) for animation in takes]
     assert np.abs(lips[0] - lips[1]).max() < 0.15 * np.ptp(lips[0])
     upper = np.linalg.norm(takes[0] - takes[1], axis=2).max()
@@ -108,5 +113,5 @@ def test_chance_moves_the_upper_face_and_hardly_the_lips() -> None:
 
 def test_a_lively_speaker_opens_by_one_and_a_half_to_three_centimetres() -> None:
     for identity in ("F1", "M3"):
-        _, weights, _ = generate_clip(Clip(identity, 1, "lively"))
+        _, weights, _ = generate_clip(SyntheticClip(identity, 1, "lively"))
         assert 0.015 < opening(rig_of(identity).pose(weights), identity).max() < 0.03

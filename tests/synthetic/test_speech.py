@@ -84,7 +84,7 @@ def test_sentences_use_every_mouth_shape_and_are_all_different() -> None:
 
 def test_unknown_voice_and_missing_package_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FaceDiffError, match="no voice 'nobody'"):
-        speech.speak("Hello.", speech.Voice("nobody", 150, 50, 50))
+        speech.speak("Hello.", speech.EspeakVoice("nobody", 150, 50, 50))
     monkeypatch.setitem(__import__("sys").modules, "espeakng_loader", None)
     with pytest.raises(FaceDiffError, match=r"facediff\[puppet\]"):
         speech.speak("Hello.", VOICE)

@@ -1,6 +1,6 @@
 """What a corpus folder is, and whether it is sound: ``facediff data check``."""
 
 from facediff.data.check.check import check
-from facediff.data.check.report import Finding, Report, text
+from facediff.data.check.report import CheckReport, Finding, text
 
-__all__ = ["Finding", "Report", "check", "text"]
+__all__ = ["Finding", "CheckReport", "check", "text"]

@@ -15,7 +15,7 @@ from facediff.data.check.layouts import (
     MANIFEST,
     SPLITS,
     STATE,
-    Folder,
+    CorpusFolder,
     View,
     facexhubert_names,
     identify,
@@ -25,7 +25,7 @@ from facediff.data.check.layouts import (
     read_record,
 )
 from facediff.data.check.packed import check_packed, examine_packed
-from facediff.data.check.report import FEW, Findings, Report, counted, few, number
+from facediff.data.check.report import FEW, CheckReport, Findings, counted, few, number
 from facediff.data.check.shared import (
     check_account,
     check_areas,
@@ -67,7 +67,7 @@ def check(
     workers: int | None = None,
     scheduler: str | None = "",
     progress: bool = False,
-) -> Report:
+) -> CheckReport:
     """Check a corpus folder; nothing in it is changed, trusted or run.
 
     Args:
@@ -96,7 +96,7 @@ def check(
         raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
     from facediff.data.corpus import MOTION_FOLDERS
 
-    report = Report(source, quick)
+    report = CheckReport(source, quick)
     manifest = read_record(root, MANIFEST, report.findings)
     state = read_record(root, STATE, report.findings)
     folder = list_folder(root, MOTION_FOLDERS) if packed is None else list_packed(packed)
@@ -123,11 +123,11 @@ def check(
 
 
 def _check_corpus(
-    report: Report,
+    report: CheckReport,
     view: View,
-    folder: Folder,
+    folder: CorpusFolder,
     manifest: dict[str, Any],
-    examine_all: Callable[[Rules, View, Folder], list[ClipFacts]],
+    examine_all: Callable[[Rules, View, CorpusFolder], list[ClipFacts]],
 ) -> None:
     from facediff.data.corpus import Corpus
 
@@ -189,7 +189,7 @@ def _check_corpus(
     report.subjects = _count_subjects(view, clips, frames, templates)
 
 
-def _clips(opened: Corpus | None, view: View, folder: Folder, findings: Findings) -> dict[str, Clip]:
+def _clips(opened: Corpus | None, view: View, folder: CorpusFolder, findings: Findings) -> dict[str, Clip]:
     """The clips that training would read; by their names alone if the folder cannot be opened."""
     names = [name for name in folder.names if name in folder.motions and name in folder.sounds]
     clips = {name: clip for name in names if (clip := view.parse(name)) is not None}
@@ -201,7 +201,7 @@ def _clips(opened: Corpus | None, view: View, folder: Folder, findings: Findings
 
 
 def _examine_all(
-    rules: Rules, view: View, folder: Folder, *, workers: int | None, scheduler: str | None, progress: bool
+    rules: Rules, view: View, folder: CorpusFolder, *, workers: int | None, scheduler: str | None, progress: bool
 ) -> list[ClipFacts]:
     try:
         import soundfile  # noqa: F401
@@ -235,7 +235,7 @@ def _examine_all(
 # Findings about names and pairs of files.
 
 
-def _check_names(view: View, folder: Folder, clips: Mapping[str, Clip], findings: Findings) -> None:
+def _check_names(view: View, folder: CorpusFolder, clips: Mapping[str, Clip], findings: Findings) -> None:
     """Names that are none of the corpus's, subjects that no split knows, files that nothing reads."""
     unknown = [name for name in folder.names if view.parse(name) is None]
     hubert = facexhubert_names(unknown) if view.corpus == "biwi" else []
@@ -268,15 +268,15 @@ def _check_names(view: View, folder: Folder, clips: Mapping[str, Clip], findings
 
 def _without_split(view: View, clips: Mapping[str, Clip]) -> list[str]:
     """Clips of subjects that none of the corpus's splits knows."""
-    known = set(view.identities)
-    known |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
+    identities = set(view.identities)
+    identities |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
     for clip in clips.values():
         if any(split_of(clip) is not None for split_of in view.split_of.values()):
-            known.add(clip.identity)
-    return [name for name, clip in clips.items() if clip.identity not in known]
+            identities.add(clip.identity)
+    return [name for name, clip in clips.items() if clip.identity not in identities]
 
 
-def _check_both_files(view: View, folder: Folder, findings: Findings) -> None:
+def _check_both_files(view: View, folder: CorpusFolder, findings: Findings) -> None:
     for files, others, what, kind in (
         (folder.sounds, folder.motions, "speech without motion", "motion_missing"),
         (folder.motions, folder.sounds, "motion without speech", "sound_missing"),
@@ -323,8 +323,8 @@ def _check_frame_rate(
     """Whether the lengths of the speech agree with the frame rate; one finding if most clips disagree."""
     rates = [clip.frames / clip.seconds for clip in facts if clip.frames is not None and clip.seconds]
     # Only twice and half the rate are recognised: other ratios come from clips that are cut differently.
-    found = median(rates) if rates else stored
-    other = next((factor * stored for factor in (2.0, 0.5) if is_about(found, factor * stored)), None)
+    measured = median(rates) if rates else stored
+    other = next((factor * stored for factor in (2.0, 0.5) if is_about(measured, factor * stored)), None)
     if other is None:
         return True
     readable = other >= view.frame_rate and (other / view.frame_rate).is_integer()
@@ -420,13 +420,13 @@ def _compare_check_figure(view: View, rows: Iterable[Mapping[str, Any]], finding
         return f"{counted(clips, 'sequence')} and {counted(frames, 'frame')}"
 
     row = next((row for row in rows if row["split"] == split), {"present": 0, "frames": 0})
-    where, found, published = f"split {split}", words(row["present"], row["frames"]), words(*figure)
-    if found == published:
+    where, counts, published = f"split {split}", words(row["present"], row["frames"]), words(*figure)
+    if counts == published:
         message = f"agrees with the check figure of published work, {published}"
         findings.note("check_figure_agrees", where, message)
     else:
         message = (
-            f"differs from the check figure of published work: {found} instead of {published}; "
+            f"differs from the check figure of published work: {counts} instead of {published}; "
             f"scores on it are not comparable with published ones until clips are complete and cut alike"
         )
         findings.warning("check_figure_differs", where, message)

@@ -112,9 +112,9 @@ def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> N
         findings.error("motion_dtype", where, message)
         return
     if facts.n_vertices != expected:
-        found = "which is no number of vertices" if facts.n_vertices is None else f"{facts.n_vertices} vertices"
+        topology = "which is no number of vertices" if facts.n_vertices is None else f"{facts.n_vertices} vertices"
         message = (
-            f"has shape {array.shape}, {found}; expected (frames, {3 * expected}), {expected} vertices: it belongs to "
+            f"has shape {array.shape}, {topology}; expected (frames, {3 * expected}), {expected} vertices: it has "
             f"another topology or is no motion"
         )
         findings.error("motion_shape", where, message)

@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin, get_type_hints
 
-from facediff.data.check.report import Findings, Report, few, number
+from facediff.data.check.report import CheckReport, Findings, few, number
 from facediff.data.manifest import load_manifest
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.arrays import open_array, vertices_of
@@ -52,7 +52,7 @@ BASES = 100  # folders in the raw folder that are searched: an archive may have 
 
 
 @dataclass(frozen=True)
-class Folder:
+class CorpusFolder:
     """Files of clips by name, files that a killed program left half-written, and files that nothing reads."""
 
     root: Path
@@ -74,11 +74,11 @@ class Folder:
         counts: Counter[int] = Counter()
         for path in islice(self.motions.values(), PROBED):
             try:
-                found = vertices_of(open_array(path).shape)
+                vertices = vertices_of(open_array(path).shape)
             except Exception:  # reported when the clips are checked
-                found = None
-            if found is not None:
-                counts[found] += 1
+                vertices = None
+            if vertices is not None:
+                counts[vertices] += 1
         return counts.most_common(1)[0][0] if counts else None
 
 
@@ -103,7 +103,12 @@ class View:
 
 
 def identify(
-    report: Report, folder: Folder, recorded: object, corpus: str | None, split: str | None, manifest: dict[str, Any]
+    report: CheckReport,
+    folder: CorpusFolder,
+    recorded: object,
+    corpus: str | None,
+    split: str | None,
+    manifest: dict[str, Any],
 ) -> View | None:
     """The corpus that a folder holds; None, with a finding, if it holds none or is not recognised.
 
@@ -163,7 +168,7 @@ def view_of(root: Path, corpus: str | None) -> View:
         raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
     if (root / STATE).is_file() and not (root / MANIFEST).is_file():
         raise FaceDiffError(f"{root}: its preparation was interrupted; run the same `facediff data prepare` again")
-    manifest, report = read_manifest(root), Report(root)
+    manifest, report = read_manifest(root), CheckReport(root)
     view = identify(report, list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, None, manifest)
     if view is None:
         raise FaceDiffError(f"{root}: {report.findings[0].message}")
@@ -173,9 +178,9 @@ def view_of(root: Path, corpus: str | None) -> View:
 # What lies in the folder.
 
 
-def list_folder(root: Path, motion_folders: tuple[str, ...]) -> Folder:
+def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
     """List the files of clips in a corpus folder; ``motion_folders`` are in the order of preference."""
-    folder = Folder(root)
+    folder = CorpusFolder(root)
     motions = [(name, ".npy", folder.motions) for name in motion_folders]
     for name, suffix, files in [*motions, ("wav", ".wav", folder.sounds)]:
         try:
@@ -195,11 +200,11 @@ def list_folder(root: Path, motion_folders: tuple[str, ...]) -> Folder:
     return folder
 
 
-def list_packed(packed: PackedCorpus) -> Folder:
+def list_packed(packed: PackedCorpus) -> CorpusFolder:
     """The clips of a packed corpus, named as the files that they would be."""
     motions = {name: Path(f"vertices_npy/{name}.npy") for name in packed.names()}
     sounds = {name: Path(f"wav/{name}.wav") for name in packed.names()}
-    return Folder(packed.folder, motions, sounds, packed=packed)
+    return CorpusFolder(packed.folder, motions, sounds, packed=packed)
 
 
 def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
@@ -221,8 +226,8 @@ def _raw_distribution(root: Path) -> tuple[str, str] | None:
         for corpus, patterns in RAW_FILES.items():
             for pattern in patterns:
                 with suppress(OSError):
-                    for found in base.glob(pattern):
-                        return corpus, found.relative_to(root).as_posix()
+                    for file in base.glob(pattern):
+                        return corpus, file.relative_to(root).as_posix()
     return None
 
 
@@ -246,7 +251,7 @@ def by_name(name: str, n_vertices: int | None) -> Module:
     return next((module for module in fitting if module.n_vertices == n_vertices), fitting[0])
 
 
-def recognise(folder: Folder, recorded: object, n_vertices: int | None) -> Module | None:
+def recognise(folder: CorpusFolder, recorded: object, n_vertices: int | None) -> Module | None:
     """The data module that reads a folder; None if that cannot be found out.
 
     ``manifest.json`` decides; else most of the clips' names together with the vertex count; else names of a form of
@@ -268,8 +273,8 @@ def recognise(folder: Folder, recorded: object, n_vertices: int | None) -> Modul
 
 def facexhubert_names(names: Sequence[str]) -> list[str]:
     """Names as FaceXHuBERT forms them, if numbers above 40, which stand for emotional sequences, are among them."""
-    found = {name: int(match[1]) for name in names if (match := FACEXHUBERT.fullmatch(name))}
-    return list(found) if any(number > 40 for number in found.values()) else []
+    numbers = {name: int(match[1]) for name in names if (match := FACEXHUBERT.fullmatch(name))}
+    return list(numbers) if any(number > 40 for number in numbers.values()) else []
 
 
 def _known() -> list[Module]:
@@ -285,8 +290,8 @@ def _known() -> list[Module]:
             yield from below(child)
 
     modules = dict.fromkeys(below(SpeechMotionDataModule))
-    found = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
-    return sorted(found, key=lambda module: not module.__module__.startswith("facediff."))
+    concrete = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
+    return sorted(concrete, key=lambda module: not module.__module__.startswith("facediff."))
 
 
 def _import(path: str) -> Module:
@@ -329,10 +334,10 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> View:
     hint: Any = None if parameter is None else get_type_hints(module.__init__).get("split")
     ways: list[str | None] = list(get_args(hint)) if get_origin(hint) is Literal else [None]
     if split is not None and split not in ways:
-        known = [way for way in ways if way is not None]
+        names = [way for way in ways if way is not None]
         raise FaceDiffError(
-            f'--split: {module.corpus_name} has no split "{split}": {choices(split, known)}'
-            if known
+            f'--split: {module.corpus_name} has no split "{split}": {choices(split, names)}'
+            if names
             else f"--split: {module.corpus_name} is split in one way only; omit the option"
         )
     return View(

@@ -65,7 +65,7 @@ class Findings(list[Finding]):
 
 
 @dataclass
-class Report:
+class CheckReport:
     """What a folder is and what is wrong in it."""
 
     root: Path | str  # an address of a packed corpus is a text
@@ -117,9 +117,9 @@ def relative(path: Path, root: Path) -> str:
 
 def few(names: Iterable[object]) -> str:
     """The first few names of a list, and how many more there are."""
-    words = [str(name) for name in names]
-    more = f" and {number(len(words) - FEW)} more" if len(words) > FEW else ""
-    return ", ".join(words[:FEW]) + more
+    texts = [str(name) for name in names]
+    more = f" and {number(len(texts) - FEW)} more" if len(texts) > FEW else ""
+    return ", ".join(texts[:FEW]) + more
 
 
 def number(value: int) -> str:
@@ -143,7 +143,7 @@ def counted(value: int, one: str, many: str | None = None) -> str:
 # The report as text.
 
 
-def text(report: Report) -> str:
+def text(report: CheckReport) -> str:
     """The report as text for a terminal; characters that could control it are escaped."""
     blocks = [_heading(report)]
     if report.splits:
@@ -161,7 +161,7 @@ def text(report: Report) -> str:
     return "\n".join(printable(line) for line in "\n\n".join(blocks).split("\n"))
 
 
-def _heading(report: Report) -> str:
+def _heading(report: CheckReport) -> str:
     if report.corpus is None:
         return f"{report.root}: {f'raw distribution of {report.raw}' if report.raw else 'not recognised'}"
     module = f", data module {report.data_module}" if report.data_module else ""
@@ -172,7 +172,7 @@ def _heading(report: Report) -> str:
     return f"{report.root}: {report.corpus}{module}\n{number(report.n_vertices or 0)} vertices, {rate}; {read} read"
 
 
-def _splits(report: Report) -> str:
+def _splits(report: CheckReport) -> str:
     ways = ["way"] if any(row["way"] is not None for row in report.splits) else []
     counts = ["expected", "present", "missing", "frames", "seconds"]
     rows = [
@@ -186,7 +186,7 @@ def _splits(report: Report) -> str:
     return format_table([*ways, "split", *counts], rows, left=1 + len(ways))
 
 
-def _subjects(report: Report) -> str:
+def _subjects(report: CheckReport) -> str:
     rows = [
         [
             printable(row["subject"]),
@@ -199,15 +199,15 @@ def _subjects(report: Report) -> str:
     return format_table(["subject", "clips", "frames", "seconds", "template", "trained on"], rows)
 
 
-def _shared_files(report: Report) -> str:
+def _shared_files(report: CheckReport) -> str:
     rows = [["templates", _templates(report.templates)], ["mesh", report.mesh or "none"]]
     for name, region in report.regions.items():
-        words = "none that can be used"
+        description = "none that can be used"
         if region is not None:
-            words = f"{region['source']}, {counted(region['count'], 'vertex', 'vertices')}, hash {region['hash']}"
+            description = f"{region['source']}, {counted(region['count'], 'vertex', 'vertices')}, hash {region['hash']}"
             if region["count"] == region["circulating_count"]:
-                words += ", as many as the list that circulates has"
-        rows.append([name.replace("_", " "), words])
+                description += ", as many as the list that circulates has"
+        rows.append([name.replace("_", " "), description])
     rows.append(["manifest", _manifest(report.manifest)])
     return format_table([], [[printable(cell) for cell in row] for row in rows], left=2)
 
@@ -215,10 +215,12 @@ def _shared_files(report: Report) -> str:
 def _templates(templates: Mapping[str, Any]) -> str:
     if not templates["file"]:
         return "none that can be read"
-    words = f"templates.pkl, {counted(len(templates['subjects']), 'subject')}, git blob {str(templates['blob'])[:8]}"
-    words += f" ({templates['origin']})" if templates["origin"] else ""
+    description = (
+        f"templates.pkl, {counted(len(templates['subjects']), 'subject')}, git blob {str(templates['blob'])[:8]}"
+    )
+    description += f" ({templates['origin']})" if templates["origin"] else ""
     areas = list((templates["areas"] or {}).values())
-    return words + (f", surface areas {min(areas):.6g} to {max(areas):.6g}" if areas else "")
+    return description + (f", surface areas {min(areas):.6g} to {max(areas):.6g}" if areas else "")
 
 
 def _manifest(manifest: Mapping[str, Any]) -> str:
@@ -241,12 +243,12 @@ def _remark(group: Sequence[Finding]) -> list[str]:
     ]
 
 
-def _verdict(report: Report) -> str:
+def _verdict(report: CheckReport) -> str:
     counts = {s: sum(finding.severity == s for finding in report.findings) for s in ("error", "warning")}
-    words = ", ".join(counted(count, severity) for severity, count in counts.items() if count)
-    if report.sound and not words:
+    summary = ", ".join(counted(count, severity) for severity, count in counts.items() if count)
+    if report.sound and not summary:
         return "sound: nothing is wrong with this copy"
-    return f"{'sound' if report.sound else 'not sound'}{f': {words}' if words else ''}"
+    return f"{'sound' if report.sound else 'not sound'}{f': {summary}' if summary else ''}"
 
 
 def _figure(value: float | None) -> str | None:

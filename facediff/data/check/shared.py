@@ -72,7 +72,7 @@ def check_files(
     recorded: ``changed`` and ``missing``.
     """
     files = manifest.get("files")
-    found: dict[str, list[str]] = {"changed": [], "missing": []}
+    differing: dict[str, list[str]] = {"changed": [], "missing": []}
     for name, recorded in files.items() if isinstance(files, dict) else ():
         path = root / name
         if not isinstance(recorded, dict) or not _is_below(root, path):
@@ -81,16 +81,16 @@ def check_files(
             continue
         with findings.guard("file_unreadable", path, root):
             if not path.is_file():
-                found["missing"].append(name)
+                differing["missing"].append(name)
                 message = "is in manifest.json but not there; prepare the folder again"
                 findings.error("file_missing", name, message)
             elif path.stat().st_size != recorded.get("bytes") or not (
                 quick or (hashes.get(name) or sha256(path)) == recorded.get("sha256")
             ):
-                found["changed"].append(name)
+                differing["changed"].append(name)
                 message = "is not what was written (manifest.json): changed since, or damaged; prepare the folder again"
                 findings.error("file_changed", name, message)
-    return found
+    return differing
 
 
 def _is_below(root: Path, path: Path) -> bool:

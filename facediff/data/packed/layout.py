@@ -58,7 +58,7 @@ DAMAGED = "the packed corpus is damaged, " + REMEDY
 
 
 @dataclass(frozen=True)
-class Sound:
+class PackedSound:
     """Where the speech of a clip lies.
 
     Attributes:
@@ -100,7 +100,7 @@ class PackedClip:
     dtype: str
     first: int
     frames: int
-    sound: Sound
+    sound: PackedSound
 
 
 @dataclass(frozen=True)
@@ -173,9 +173,9 @@ class Record:
 
     def state(self) -> dict[str, Any]:
         """Plain data for the attribute."""
-        plain = {each.name: getattr(self, each.name) for each in fields(self)}
+        plain = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
         for name in ("clips", "files"):
-            plain[name] = [asdict(each) for each in plain[name].values()]
+            plain[name] = [asdict(entry) for entry in plain[name].values()]
         plain["arrays"] = {name: asdict(facts) for name, facts in self.arrays.items()}
         return {"format": FORMAT, **plain}
 
@@ -215,21 +215,21 @@ class _Checks:
         """A number in a range."""
         return check_number(self.source, name, plain[name], low, high, remedy=REMEDY)
 
-    def text(self, plain: Mapping[str, Any], name: str, known: Sequence[str] = ()) -> str:
+    def text(self, plain: Mapping[str, Any], name: str, allowed: Sequence[str] = ()) -> str:
         """A short text that can be printed, one of the known ones if there are any."""
-        found = plain[name]
-        fits = isinstance(found, str) and found.isprintable() and len(found) <= LONGEST
-        if not fits or (known and found not in known):
-            wanted = f"one of {', '.join(known)}" if known else "a short text"
-            raise FaceDiffError(f"{self.source}: {name} is {quoted(found)}; expected {wanted}; {REMEDY}")
-        return str(found)
+        text = plain[name]
+        fits = isinstance(text, str) and text.isprintable() and len(text) <= LONGEST
+        if not fits or (allowed and text not in allowed):
+            expected = f"one of {', '.join(allowed)}" if allowed else "a short text"
+            raise FaceDiffError(f"{self.source}: {name} is {quoted(text)}; expected {expected}; {REMEDY}")
+        return str(text)
 
     def items(self, plain: Mapping[str, Any], name: str) -> list[Any]:
         """A list."""
-        found = plain[name]
-        if not isinstance(found, list):
-            raise FaceDiffError(f"{self.source}: {name} is {quoted(found)}; expected a list; {REMEDY}")
-        return found
+        entries = plain[name]
+        if not isinstance(entries, list):
+            raise FaceDiffError(f"{self.source}: {name} is {quoted(entries)}; expected a list; {REMEDY}")
+        return entries
 
     def refuse(self, what: str) -> FaceDiffError:
         """The error of a record that contradicts itself."""
@@ -244,18 +244,18 @@ def _record(plain: dict[str, Any], checks: _Checks) -> Record:
     for name, facts in plain["arrays"].items():
         arrays[name] = _array(name, facts, checks, 3 * n_vertices)
     clips = {}
-    for each in checks.items(plain, "clips"):
-        clip = _clip(each, checks, arrays)
+    for entry in checks.items(plain, "clips"):
+        clip = _clip(entry, checks, arrays)
         if clip.name in clips:
             raise checks.refuse(f"has two clips {quoted(clip.name)}")
         clips[clip.name] = clip
     files = {}
-    for each in checks.items(plain, "files"):
+    for entry in checks.items(plain, "files"):
         file = PackedFile(
-            _relative(checks.text(each, "path"), checks),
-            checks.whole(each, "first"),
-            checks.whole(each, "bytes"),
-            checks.text(each, "sha256"),
+            _relative(checks.text(entry, "path"), checks),
+            checks.whole(entry, "first"),
+            checks.whole(entry, "bytes"),
+            checks.text(entry, "sha256"),
         )
         if file.path in files or file.first + file.bytes > _rows(arrays, "files"):
             raise checks.refuse(f"its file {quoted(file.path)} lies beyond the array, or is there twice")
@@ -285,8 +285,8 @@ def _rows(arrays: Mapping[str, ArrayFacts], name: str) -> int:
 
 def _array(name: str, plain: Mapping[str, Any], checks: _Checks, coordinates: int) -> ArrayFacts:
     coding = name.removeprefix("motion_")
-    known = {"templates": "float32", "speech": "uint8", "files": "uint8"}
-    dtype = CODINGS[coding].name if name != coding and coding in CODINGS else known.get(name)
+    dtypes = {"templates": "float32", "speech": "uint8", "files": "uint8"}
+    dtype = CODINGS[coding].name if name != coding and coding in CODINGS else dtypes.get(name)
     if dtype is None:
         raise checks.refuse(f"has an array {quoted(name)}, which is none of a packed corpus")
     width = 0 if dtype == "uint8" else coordinates
@@ -311,7 +311,7 @@ def _clip(plain: Mapping[str, Any], checks: _Checks, arrays: Mapping[str, ArrayF
     sound = plain["sound"]
     pieces = checks.items(sound, "pieces")
     samples = checks.whole(sound, "samples", 1)
-    heard = Sound(
+    heard = PackedSound(
         first=checks.whole(sound, "first"),
         pieces=tuple(checks.whole({"piece": size}, "piece", 1) for size in pieces),
         form=checks.text(sound, "form", ["flac", "wav"]),
@@ -367,14 +367,14 @@ def check_array_metadata(text: bytes, name: str, facts: ArrayFacts) -> None:
     try:
         (codec,) = content["codecs"]
         inner = codec["configuration"]
-        found = {
+        declared = {
             "shape": content["shape"],
             "data_type": content["data_type"],
             "chunk_grid": content["chunk_grid"]["configuration"]["chunk_shape"],
             "chunk_shape": inner["chunk_shape"],
             "index_location": inner.get("index_location", "end"),
-            "codecs": [codec["name"], *(each["name"] for each in inner["codecs"])],
-            "index_codecs": [each["name"] for each in inner["index_codecs"]],
+            "codecs": [codec["name"], *(inner_codec["name"] for inner_codec in inner["codecs"])],
+            "index_codecs": [inner_codec["name"] for inner_codec in inner["index_codecs"]],
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FaceDiffError(f"{name}: describes no sharded array; {REMEDY}") from error
@@ -388,7 +388,7 @@ def check_array_metadata(text: bytes, name: str, facts: ArrayFacts) -> None:
         "index_codecs": ["bytes", "crc32c"],
     }
     for field_name, value in expected.items():
-        if found[field_name] != value:
+        if declared[field_name] != value:
             raise FaceDiffError(
-                f"{name}: {field_name} is {quoted(found[field_name])}; expected {quoted(value)}; {REMEDY}"
+                f"{name}: {field_name} is {quoted(declared[field_name])}; expected {quoted(value)}; {REMEDY}"
             )

@@ -34,8 +34,8 @@ from facediff.data.packed.layout import (
     ArrayFacts,
     PackedClip,
     PackedFile,
+    PackedSound,
     Record,
-    Sound,
     read_record,
 )
 from facediff.data.packed.shards import shard_key
@@ -74,7 +74,7 @@ REMEDY = "run `facediff data check` on the folder, and correct or remove the cli
 
 
 @dataclass(frozen=True)
-class Report:
+class PackingReport:
     """What packing did.
 
     Attributes:
@@ -153,7 +153,7 @@ def pack(
     workers: int | None = None,
     scheduler: str | None = "",
     quiet: bool = True,
-) -> Report:
+) -> PackingReport:
     """Pack a corpus folder.
 
     A run that was killed is resumed: shards that are there are kept. The record that makes a Zarr group of the folder
@@ -192,7 +192,7 @@ def pack(
     require_zarr("packing a corpus")
     if exact not in get_args(Exact):
         raise FaceDiffError(f"--exact {exact}: unknown; expected one of {', '.join(get_args(Exact))}")
-    plan = Plan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact)
+    plan = PackingPlan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact)
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data pack"):
         return _carry_out(plan, out, workers, scheduler, quiet)
@@ -211,7 +211,7 @@ def require_zarr(purpose: str) -> None:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PackingPlan:
     """What is packed, found by a look at every file's header.
 
     Attributes:
@@ -233,7 +233,7 @@ class Plan:
     @classmethod
     def of(
         cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float, exact: Exact
-    ) -> Plan:
+    ) -> PackingPlan:
         """Look through a corpus folder.
 
         Raises:
@@ -268,7 +268,7 @@ class Plan:
         for name in sorted({*sounds, *motions}):
             clip = view.parse(name) if name in sounds and name in motions else None
             if clip is None:
-                left_out += [str(each[name].relative_to(root)) for each in (sounds, motions) if name in each]
+                left_out += [str(paths[name].relative_to(root)) for paths in (sounds, motions) if name in paths]
                 continue
             path = motion_path(root, name)
             vertices = open_vertices(path, view.n_vertices)
@@ -279,13 +279,13 @@ class Plan:
                     f"{root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {name}; {REMEDY}"
                 )
             own = coding if tolerance and name not in kept else vertices.dtype.name
-            nothing = Sound(0, (), "flac", 16_000, 1, 1, 16)
+            nothing = PackedSound(0, (), "flac", 16_000, 1, 1, 16)
             clips[name] = PackedClip(name, clip.identity, own, vertices.dtype.name, rows[own], len(vertices), nothing)
             rows[own] += -(-len(vertices) // chunk) * chunk
-            for each in (path, sounds[name]):
-                facts = each.stat()
+            for file in (path, sounds[name]):
+                facts = file.stat()
                 size += facts.st_size
-                seen.update(f"{each.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+                seen.update(f"{file.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
         if not clips:
             raise FaceDiffError(f"{root}: no clip with both wav/<clip>.wav and vertices_npy/<clip>.npy; {REMEDY}")
         width = 3 * view.n_vertices
@@ -323,17 +323,20 @@ class Plan:
     def tasks(self) -> Iterator[Task]:
         """A task for every shard of motion, and for every clip's speech."""
         for name, facts in self.record.arrays.items():
-            each = facts.chunk * facts.chunks
+            shard_rows = facts.chunk * facts.chunks
             parts: dict[int, list[Part]] = {}
             for clip in self.record.clips.values():
                 if name != f"motion_{clip.coding}":
                     continue
                 path = motion_path(self.root, clip.name)
-                for shard in range(clip.first // each, -(-(clip.first + clip.frames) // each)):
-                    low, high = max(clip.first, shard * each), min(clip.first + clip.frames, (shard + 1) * each)
-                    part = Part(path, clip.identity, low - shard * each, low - clip.first, high - clip.first)
+                for shard in range(clip.first // shard_rows, -(-(clip.first + clip.frames) // shard_rows)):
+                    low, high = (
+                        max(clip.first, shard * shard_rows),
+                        min(clip.first + clip.frames, (shard + 1) * shard_rows),
+                    )
+                    part = Part(path, clip.identity, low - shard * shard_rows, low - clip.first, high - clip.first)
                     parts.setdefault(shard, []).append(part)
-            for shard in range(-(-facts.rows // each)):
+            for shard in range(-(-facts.rows // shard_rows)):
                 yield Task(
                     f"{name}/{shard_key(shard, facts.width)}",
                     name.removeprefix("motion_"),
@@ -347,31 +350,31 @@ def scored_clips(root: Path, view: View) -> frozenset[str]:
     """Clips that scores are computed from: those of the test splits, and the style reference of each."""
     from facediff.data.check.layouts import by_name, instance
 
-    found: set[str] = set()
+    scored: set[str] = set()
     if view.data_module is None:  # a person's folder, which is read next to a corpus and never packed with one
         return frozenset()
     for way in view.split_of:
         data = instance(by_name(view.data_module, view.n_vertices), root, way)
         policy = data.reference_policy()
         for clip in (clip for split in data.test_splits for clip in data.clips(split)):
-            found.add(clip.name)
+            scored.add(clip.name)
             with suppress(FaceDiffError):  # without a reference it cannot be scored
-                found.add(policy.evaluated(clip).name)
-    return frozenset(found)
+                scored.add(policy.evaluated(clip).name)
+    return frozenset(scored)
 
 
 def _other_files(root: Path) -> tuple[str, ...]:
     """Every file of a corpus folder but motion, speech and hidden ones, by path below it."""
-    found, size = [], 0
+    paths, size = [], 0
     for path in sorted(root.rglob("*")):
         place = path.relative_to(root)
         if place.parts[0] in (*MOTION_FOLDERS, "wav") or any(part.startswith(".") for part in place.parts):
             continue
         if path.is_file():
-            found.append(place.as_posix())
+            paths.append(place.as_posix())
             size += path.stat().st_size
     LIMITS.check("bytes", size, f"{root}: its other files")
-    return tuple(found)
+    return tuple(paths)
 
 
 def _version() -> str:
@@ -380,7 +383,7 @@ def _version() -> str:
     return version()
 
 
-def _carry_out(plan: Plan, out: Path, workers: int | None, scheduler: str | None, quiet: bool) -> Report:
+def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str | None, quiet: bool) -> PackingReport:
     if (out / METADATA).is_file():
         return _finished(plan, out)
     begun = {"recipe": plan.recipe, "sources": plan.sources}
@@ -391,9 +394,9 @@ def _carry_out(plan: Plan, out: Path, workers: int | None, scheduler: str | None
                 f"folder"
             )
     else:
-        found = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
-        if found:
-            raise FaceDiffError(f"{out}: holds other files ({', '.join(found[:3])}); choose a new folder")
+        others = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
+        if others:
+            raise FaceDiffError(f"{out}: holds other files ({', '.join(others[:3])}); choose a new folder")
         write_json(out / STATE, begun)
     remove_partial(out, recursive=True)
     tasks = [task for task in plan.tasks() if not (out / task.target).is_file()]
@@ -417,7 +420,7 @@ def _carry_out(plan: Plan, out: Path, workers: int | None, scheduler: str | None
     return _report(plan, record, out, sum(bool(task.coding) for task in tasks))
 
 
-def _finished(plan: Plan, out: Path) -> Report:
+def _finished(plan: PackingPlan, out: Path) -> PackingReport:
     record = read_record((out / METADATA).read_bytes(), str(out))
     if replace(plan, record=record).recipe != plan.recipe:
         raise FaceDiffError(f"{out}: holds a corpus that was packed otherwise; choose a new folder, or remove this one")
@@ -432,25 +435,25 @@ def _check_written(folder: Path, facts: ArrayFacts) -> None:
     sizes = {folder / shard_key(number, facts.width): size for number, size in enumerate(facts.shards)}
     sizes[folder / METADATA] = len(encoded(facts, None))
     for path, size in sizes.items():
-        found = path.stat().st_size if path.is_file() else 0
-        if found != size:
+        actual = path.stat().st_size if path.is_file() else 0
+        if actual != size:
             raise FaceDiffError(
-                f"{path}: has {found} bytes instead of {size}; remove the packed corpus, and pack it again"
+                f"{path}: has {actual} bytes instead of {size}; remove the packed corpus, and pack it again"
             )
 
 
-def _report(plan: Plan, record: Record, out: Path, written: int) -> Report:
+def _report(plan: PackingPlan, record: Record, out: Path, written: int) -> PackingReport:
     seconds = sum(clip.frames for clip in record.clips.values()) / record.frame_rate
     after = sum(size for facts in record.arrays.values() for size in facts.shards)
-    return Report(out, len(record.clips), seconds, plan.bytes, after, written, plan.left_out)
+    return PackingReport(out, len(record.clips), seconds, plan.bytes, after, written, plan.left_out)
 
 
-def _finish(plan: Plan, out: Path) -> Record:
+def _finish(plan: PackingPlan, out: Path) -> Record:
     """Write speech, files and templates from what is there, and the record last."""
     clips, place = {}, 0
     for name, clip in plan.record.clips.items():
         with (out / PARTS / name).open("rb") as stream:
-            sound = Sound(**{**parse_json(stream.readline(), out / STATE), "first": place})
+            sound = PackedSound(**{**parse_json(stream.readline(), out / STATE), "first": place})
         clips[name] = replace(clip, sound=replace(sound, pieces=tuple(sound.pieces)))
         place += sum(sound.pieces)
     speech = ((out / PARTS / name).read_bytes().partition(b"\n")[2] for name in clips)
@@ -578,14 +581,14 @@ def encode_speech(path: Path) -> bytes:
             bits, form = 0, "wav"
             pieces.append(path.read_bytes())
         for first in range(0, samples if bits else 0, PIECE_SECONDS * rate):
-            wanted = min(PIECE_SECONDS * rate, samples - first)
-            block = file.read(wanted, dtype="int32", always_2d=True)
-            if len(block) != wanted:
+            length = min(PIECE_SECONDS * rate, samples - first)
+            block = file.read(length, dtype="int32", always_2d=True)
+            if len(block) != length:
                 raise FaceDiffError(f"{path}: is cut short: {first + len(block)} of {samples} samples; copy it again")
             stream = io.BytesIO()
             soundfile.write(stream, block, rate, format="FLAC", subtype=f"PCM_{bits}")
             pieces.append(stream.getvalue())
-    sound = Sound(0, tuple(map(len, pieces)), form, rate, channels, samples, bits)
+    sound = PackedSound(0, tuple(map(len, pieces)), form, rate, channels, samples, bits)
     return json.dumps(asdict(sound), allow_nan=False).encode() + b"\n" + b"".join(pieces)
 
 
@@ -603,13 +606,13 @@ def write_blob(out: Path, name: str, size: int, contents: Iterable[bytes]) -> Ar
     """
     chunks = max(1, min(BLOB_SHARD, size + BLOB_CHUNK - 1) // BLOB_CHUNK)
     facts = ArrayFacts("uint8", size, 0, BLOB_CHUNK, chunks, ())
-    each, waiting, shard = BLOB_CHUNK * chunks, bytearray(), 0
+    shard_bytes, waiting, shard = BLOB_CHUNK * chunks, bytearray(), 0
     for content in chain(contents, [b""]):
         waiting += content
-        while len(waiting) >= each or (not content and waiting):
+        while len(waiting) >= shard_bytes or (not content and waiting):
             with atomic(out / name / shard_key(shard, 0)) as temporary:
-                temporary.write_bytes(encoded(facts, np.frombuffer(bytes(waiting[:each]), np.uint8)))
-            del waiting[:each]
+                temporary.write_bytes(encoded(facts, np.frombuffer(bytes(waiting[:shard_bytes]), np.uint8)))
+            del waiting[:shard_bytes]
             shard += 1
     return facts
 
@@ -620,14 +623,14 @@ def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
     from zarr.codecs import BloscCodec, Crc32cCodec
     from zarr.storage import MemoryStore
 
-    each = facts.chunk * facts.chunks
+    shard_rows = facts.chunk * facts.chunks
     width = (facts.width,) if facts.width else ()
     files: dict[str, Any] = {}
     itemsize = np.dtype(facts.dtype).itemsize
     array: Any = zarr.create_array(
         store=MemoryStore(files),
-        shape=(facts.rows if rows is None else each, *width),
-        shards=(each, *width),
+        shape=(facts.rows if rows is None else shard_rows, *width),
+        shards=(shard_rows, *width),
         chunks=(facts.chunk, *width),
         dtype=facts.dtype,
         compressors=[
@@ -649,7 +652,7 @@ def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
     )
     if rows is None:
         return bytes(files[METADATA].to_bytes())
-    whole = np.zeros((each, *width), facts.dtype)
+    whole = np.zeros((shard_rows, *width), facts.dtype)
     whole[: len(rows)] = rows
     array[...] = whole
     return bytes(files[shard_key(0, facts.width)].to_bytes())

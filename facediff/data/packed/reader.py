@@ -27,7 +27,7 @@ from facediff.data.packed.layout import (
     read_record,
 )
 from facediff.data.packed.shards import ShardedArray, chunks_of
-from facediff.data.packed.stores import Folder, Store, address_of, open_store
+from facediff.data.packed.stores import ByteStore, LocalStore, address_of, open_store
 from facediff.data.storage import refuse_out_of_range, within
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
@@ -55,7 +55,7 @@ class PackedCorpus:
 
     def __init__(self, source: str | Path) -> None:
         store = open_store(source)
-        if isinstance(store, Folder) and not (store.root / METADATA).is_file():
+        if isinstance(store, LocalStore) and not (store.root / METADATA).is_file():
             what = (
                 f"its packing was interrupted ({STATE} is there, {METADATA} is not); run the same `facediff data pack` "
                 f"again to continue it"
@@ -67,7 +67,7 @@ class PackedCorpus:
         self.source = store.source
         self.record: Record = read_record(text, self.source)
         self.identity = hashlib.sha256(text).hexdigest()[:40]
-        self.store: Store = open_store(source, self.identity)
+        self.store: ByteStore = open_store(source, self.identity)
         self._arrays = {name: ShardedArray(self.store, name, facts) for name, facts in self.record.arrays.items()}
 
     @property
@@ -87,8 +87,8 @@ class PackedCorpus:
         place = cache_dir() / "packed" / self.identity / "corpus"
         if not place.is_dir():
             try:
-                with atomic_folder(place) as made:
-                    self.write_files(made)
+                with atomic_folder(place) as temporary:
+                    self.write_files(temporary)
             except FaceDiffError:
                 if not place.is_dir():  # else another process was quicker
                     raise
@@ -164,17 +164,17 @@ class PackedCorpus:
             FaceDiffError: if a stream is damaged, or not what the record says.
         """
         sound = self.record.clips[name].sound
-        each = PIECE_SECONDS * sound.rate
+        piece_samples = PIECE_SECONDS * sound.rate
         places = np.cumsum([sound.first, *sound.pieces])
-        found = np.empty((stop - first, sound.channels), np.int32)
-        for number in range(first // each, -(-stop // each)):
+        samples = np.empty((stop - first, sound.channels), np.int32)
+        for number in range(first // piece_samples, -(-stop // piece_samples)):
             encoded = self._arrays["speech"].read(int(places[number]), int(places[number + 1])).tobytes()
-            expected = min(each, sound.samples - number * each)
-            low, high = max(first, number * each), min(stop, number * each + expected)
-            found[low - first : high - first] = self._decoded(
-                encoded, name, expected, low - number * each, high - number * each
+            expected = min(piece_samples, sound.samples - number * piece_samples)
+            low, high = max(first, number * piece_samples), min(stop, number * piece_samples + expected)
+            samples[low - first : high - first] = self._decoded(
+                encoded, name, expected, low - number * piece_samples, high - number * piece_samples
             )
-        return found >> (32 - sound.bits)
+        return samples >> (32 - sound.bits)
 
     def recording(self, name: str) -> bytes:
         """The file of a recording that was kept as it was."""
@@ -186,8 +186,8 @@ class PackedCorpus:
         sound = self.record.clips[name].sound
         with open_sound(io.BytesIO(encoded), self._speech_of(name)) as file:
             declared = (file.format, file.frames, file.channels, file.samplerate)
-            wanted = ("FLAC", expected, sound.channels, sound.rate)
-            if declared == wanted:
+            required = ("FLAC", expected, sound.channels, sound.rate)
+            if declared == required:
                 if low:
                     file.seek(low)
                 piece: npt.NDArray[np.int32] = file.read(high - low, dtype="int32", always_2d=True)
@@ -228,16 +228,16 @@ class PackedMotion:
         """
         picks = within(picks, self.frames)
         motion = np.empty((len(picks), self.array.facts.width), np.float32)
-        wanted = chunks_of(picks, self.array.facts.chunk)
+        rows_by_chunk = chunks_of(picks, self.array.facts.chunk)
         begin = self.clip.first // self.array.facts.chunk
         tasks: list[tuple[int, memoryview]] = []
         try:
-            for run in _neighbours(sorted(wanted)):
+            for run in _neighbours(sorted(rows_by_chunk)):
                 fetched = self.array.fetch(begin + run[0], begin + run[-1] + 1)
                 tasks += zip(run, fetched, strict=True)
 
             def decode(task: tuple[int, memoryview]) -> None:
-                self._decode(begin + task[0], task[1], wanted[task[0]], motion)
+                self._decode(begin + task[0], task[1], rows_by_chunk[task[0]], motion)
 
             threads = min(len(tasks), _threads())
             if threads > 1:
@@ -253,13 +253,13 @@ class PackedMotion:
             offsets -= template
         return offsets
 
-    def _decode(self, number: int, encoded: memoryview, wanted: list[tuple[int, int]], motion: Floats) -> None:
+    def _decode(self, number: int, encoded: memoryview, row_places: list[tuple[int, int]], motion: Floats) -> None:
         """Decode a chunk, and write the rows that are wanted to their places."""
         chunk = self.array.decode(number, encoded)
         exact = np.dtype(self.clip.coding) if self.clip.coding in EXACT else None
         step = np.float32(self.record.step)
         places: dict[int, list[int]] = {}
-        for row, place in wanted:
+        for row, place in row_places:
             places.setdefault(row, []).append(place)
         row = chunk[0]  # summed up in place: whole numbers that wrap around, so that nothing is ever lost
         for inner in range(max(places) + 1):
@@ -289,13 +289,13 @@ class PackedMotion:
 
 def _neighbours(numbers: Sequence[int]) -> list[list[int]]:
     """Numbers in groups of which each is one more than the one before."""
-    found: list[list[int]] = []
+    groups: list[list[int]] = []
     for number in numbers:
-        if found and found[-1][-1] == number - 1:
-            found[-1].append(number)
+        if groups and groups[-1][-1] == number - 1:
+            groups[-1].append(number)
         else:
-            found.append([number])
-    return found
+            groups.append([number])
+    return groups
 
 
 def _threads() -> int:

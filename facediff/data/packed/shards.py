@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.packed.layout import DAMAGED, METADATA, ArrayFacts, check_array_metadata
-from facediff.data.packed.stores import Range, Store
+from facediff.data.packed.stores import ByteStore, Range
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.limits import LIMITS, brief
 
@@ -36,7 +36,7 @@ class ShardedArray:
         facts: what the record says of it.
     """
 
-    def __init__(self, store: Store, name: str, facts: ArrayFacts) -> None:
+    def __init__(self, store: ByteStore, name: str, facts: ArrayFacts) -> None:
         self.store = store
         self.name = name
         self.facts = facts
@@ -79,20 +79,20 @@ class ShardedArray:
                 self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.facts
             )
             self._checked = True
-        found: list[memoryview] = []
-        each = self.facts.chunks
-        for shard in range(first // each, -(-stop // each)):
-            low, high = max(first - shard * each, 0), min(stop - shard * each, each)
+        encoded: list[memoryview] = []
+        per_shard = self.facts.chunks
+        for shard in range(first // per_shard, -(-stop // per_shard)):
+            low, high = max(first - shard * per_shard, 0), min(stop - shard * per_shard, per_shard)
             index = self._index(shard)
-            wanted: list[Range] = []
+            byte_ranges: list[Range] = []
             for number in range(low, high):
                 start, size = (int(value) for value in index[number])
                 if MISSING in (start, size) or start + size > self.facts.shards[shard]:
-                    raise self._damaged(shard * each + number, "is not there")
-                LIMITS.check("bytes", size, self._place(shard * each + number))
-                wanted.append((start, size))
-            found += self.store.ranges(self._key(shard), wanted)
-        return found
+                    raise self._damaged(shard * per_shard + number, "is not there")
+                LIMITS.check("bytes", size, self._place(shard * per_shard + number))
+                byte_ranges.append((start, size))
+            encoded += self.store.ranges(self._key(shard), byte_ranges)
+        return encoded
 
     def decode(self, number: int, encoded: memoryview) -> npt.NDArray[Any]:
         """A chunk (rows, width), or (rows,), in memory that the thread's next chunk overwrites.
@@ -135,9 +135,9 @@ class ShardedArray:
     def _index(self, shard: int) -> npt.NDArray[np.uint64]:
         """Offset and size of every chunk of a shard (chunks, 2), read once."""
         with self._lock:
-            known = self._indices.get(shard)
-        if known is not None:
-            return known
+            cached = self._indices.get(shard)
+        if cached is not None:
+            return cached
         size, length = self.facts.shards[shard], 16 * self.facts.chunks + CHECKSUM
         if size < length:
             raise FaceDiffError(f"{self.store.source}/{self._key(shard)}: is shorter than its own index; {DAMAGED}")
@@ -175,8 +175,8 @@ def chunks_of(rows: Sequence[int], chunk: int) -> dict[int, list[tuple[int, int]
         >>> chunks_of(range(24, 27), 25)
         {0: [(24, 0)], 1: [(0, 1), (1, 2)]}
     """
-    found: dict[int, list[tuple[int, int]]] = {}
+    places_by_chunk: dict[int, list[tuple[int, int]]] = {}
     for place, row in enumerate(rows):
         number, inner = divmod(row, chunk)
-        found.setdefault(number, []).append((inner, place))
-    return found
+        places_by_chunk.setdefault(number, []).append((inner, place))
+    return places_by_chunk

@@ -49,7 +49,7 @@ def is_packed(source: str | Path) -> bool:
     return (folder / METADATA).is_file() or (folder / STATE).is_file()
 
 
-class Store(Protocol):
+class ByteStore(Protocol):
     """Bytes by key."""
 
     source: str
@@ -57,11 +57,11 @@ class Store(Protocol):
     def whole(self, key: str) -> bytes:
         """All bytes of a small object."""
 
-    def ranges(self, key: str, wanted: Sequence[Range]) -> list[memoryview]:
+    def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
         """Some ranges of an object."""
 
 
-def open_store(source: str | Path, identity: str = "") -> Store:
+def open_store(source: str | Path, identity: str = "") -> ByteStore:
     """The store of a packed corpus.
 
     Args:
@@ -70,11 +70,11 @@ def open_store(source: str | Path, identity: str = "") -> Store:
     """
     address = address_of(source)
     if address is not None:
-        return Remote(address, None if not identity else ChunkCache(cache_dir() / "packed", identity))
-    return Folder(Path(source).expanduser())
+        return RemoteStore(address, None if not identity else ChunkCache(cache_dir() / "packed", identity))
+    return LocalStore(Path(source).expanduser())
 
 
-class Folder:
+class LocalStore:
     """A packed corpus on a disk.
 
     Args:
@@ -93,21 +93,21 @@ class Folder:
         except OSError as error:
             raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {DAMAGED}") from error
 
-    def ranges(self, key: str, wanted: Sequence[Range]) -> list[memoryview]:
+    def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
         """Ranges of a file, those that follow one another in one read."""
         path = self.root / key
-        found: list[memoryview] = []
+        parts: list[memoryview] = []
         try:
             with path.open("rb", buffering=0) as stream:
-                for run in runs(wanted):
+                for run in runs(byte_ranges):
                     stream.seek(run[0][0])
-                    found += split(stream.read(sum(size for _, size in run)), run, path)
+                    parts += split(stream.read(sum(size for _, size in run)), run, path)
         except OSError as error:
             raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {DAMAGED}") from error
-        return found
+        return parts
 
 
-class Remote:
+class RemoteStore:
     """A packed corpus at an address; what was read once is read from the disk afterwards.
 
     Args:
@@ -131,29 +131,31 @@ class Remote:
         """All bytes of an object."""
         return bytes(self._fetch(key, None, None))
 
-    def ranges(self, key: str, wanted: Sequence[Range]) -> list[memoryview]:
+    def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
         """Ranges of an object: kept ones from the disk, the others fetched, neighbours in one request."""
-        found: dict[Range, memoryview] = {}
-        for each in dict.fromkeys(wanted):
-            kept = None if self.cache is None else self.cache.get(key, each)
+        parts: dict[Range, memoryview] = {}
+        for byte_range in dict.fromkeys(byte_ranges):
+            kept = None if self.cache is None else self.cache.get(key, byte_range)
             if kept is not None:
-                found[each] = kept
-        for run in runs([each for each in dict.fromkeys(wanted) if each not in found]):
+                parts[byte_range] = kept
+        for run in runs([byte_range for byte_range in dict.fromkeys(byte_ranges) if byte_range not in parts]):
             start, end = run[0][0], run[-1][0] + run[-1][1]
-            for each, part in zip(run, split(self._fetch(key, start, end), run, f"{self.source}/{key}"), strict=True):
-                found[each] = part
+            for byte_range, part in zip(
+                run, split(self._fetch(key, start, end), run, f"{self.source}/{key}"), strict=True
+            ):
+                parts[byte_range] = part
                 if self.cache is not None:
-                    self.cache.put(key, each, part)
-        return [found[each] for each in wanted]
+                    self.cache.put(key, byte_range, part)
+        return [parts[byte_range] for byte_range in byte_ranges]
 
     def _fetch(self, key: str, start: int | None, end: int | None) -> bytes | bytearray:
         where = f"{self.source}/{key}"
         try:
-            found = None if self._web is None else self._web.get(key, start, end)
+            answer = None if self._web is None else self._web.get(key, start, end)
         except FileNotFoundError as error:
             raise FaceDiffError(f"{where}: there is no such object; check the address") from error
-        if found is not None:
-            return found
+        if answer is not None:
+            return answer
         system = self._connected()
         try:
             content: bytes = system.cat_file(f"{self._base}/{key}", start=start, end=end)
@@ -183,20 +185,20 @@ class Remote:
         return self._system
 
 
-def runs(wanted: Sequence[Range]) -> list[list[Range]]:
+def runs(byte_ranges: Sequence[Range]) -> list[list[Range]]:
     """Ranges in groups of which each follows the one before without a gap.
 
     Example:
         >>> runs([(0, 4), (4, 2), (9, 1)])
         [[(0, 4), (4, 2)], [(9, 1)]]
     """
-    found: list[list[Range]] = []
-    for each in wanted:
-        if found and sum(found[-1][-1]) == each[0]:
-            found[-1].append(each)
+    groups: list[list[Range]] = []
+    for byte_range in byte_ranges:
+        if groups and sum(groups[-1][-1]) == byte_range[0]:
+            groups[-1].append(byte_range)
         else:
-            found.append([each])
-    return found
+            groups.append([byte_range])
+    return groups
 
 
 def split(content: bytes | bytearray, run: Sequence[Range], source: object) -> list[memoryview]:
@@ -231,28 +233,28 @@ class ChunkCache:
         # Looking through the folder costs time: it is done at first, and whenever a tenth of the limit was added.
         self._unseen = self.limit
 
-    def _path(self, key: str, wanted: Range) -> Path:
-        return self.folder / self.identity / "chunks" / key.replace("/", ".") / f"{wanted[0]}-{wanted[1]}"
+    def _path(self, key: str, byte_range: Range) -> Path:
+        return self.folder / self.identity / "chunks" / key.replace("/", ".") / f"{byte_range[0]}-{byte_range[1]}"
 
-    def get(self, key: str, wanted: Range) -> memoryview | None:
+    def get(self, key: str, byte_range: Range) -> memoryview | None:
         """The bytes of a range; None if they are not kept."""
         if not self.limit:
             return None
-        path = self._path(key, wanted)
+        path = self._path(key, byte_range)
         try:
             content = path.read_bytes()
             if time.time() - path.stat().st_mtime > TOUCHED:
                 os.utime(path)
         except OSError:
             return None
-        return memoryview(content) if len(content) == wanted[1] else None
+        return memoryview(content) if len(content) == byte_range[1] else None
 
-    def put(self, key: str, wanted: Range, content: memoryview) -> None:
+    def put(self, key: str, byte_range: Range, content: memoryview) -> None:
         """Keep the bytes of a range, if the disk takes them."""
         if not self.limit:
             return
         try:
-            with atomic(self._path(key, wanted)) as temporary:
+            with atomic(self._path(key, byte_range)) as temporary:
                 temporary.write_bytes(content)
         except FaceDiffError:  # a full or protected disk: reading goes on without
             self.limit = 0.0

@@ -44,8 +44,8 @@ class WebServer:
 
     def close(self) -> None:
         """Close what every thread has opened."""
-        for each in self._all:
-            each.close()
+        for connection in self._all:
+            connection.close()
 
     def __del__(self) -> None:
         """Close."""
@@ -111,27 +111,27 @@ class WebServer:
         if self._process != os.getpid():
             self.close()  # closes no more than this process's own hold of those that it was forked with
             self._reset()
-        found: http.client.HTTPConnection | None = getattr(self._open, "connection", None)
-        if found is None or fresh:
+        connection: http.client.HTTPConnection | None = getattr(self._open, "connection", None)
+        if connection is None or fresh:
             host = parts.hostname or ""
-            found = (
+            connection = (
                 http.client.HTTPSConnection(host, parts.port, timeout=SECONDS, context=ssl.create_default_context())
                 if parts.scheme == "https"
                 else http.client.HTTPConnection(host, parts.port, timeout=SECONDS)
             )
-            self._open.connection = found
-            self._all.append(found)
-            found.connect()
+            self._open.connection = connection
+            self._all.append(connection)
+            connection.connect()
             # Requests are small, and nothing is gained by waiting for more to send.
-            found.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return found
+            connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return connection
 
     def _forget(self) -> None:
-        found = getattr(self._open, "connection", None)
+        connection = getattr(self._open, "connection", None)
         self._open.connection = None
-        if found is not None:
-            found.close()
-            self._all.remove(found)
+        if connection is not None:
+            connection.close()
+            self._all.remove(connection)
 
 
 def _hurry(connection: http.client.HTTPConnection) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.corpus import MOTION_FOLDERS, find_region, read_manifest, read_templates
-from facediff.data.person.motion import MESHES, Array, Faces, Motion, differing_faces, scratch_array, spans
+from facediff.data.person.motion import MESHES, Array, Faces, FaceSequence, differing_faces, scratch_array, spans
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
 from facediff.mesh.alignment import Indices, chunks
@@ -37,7 +37,7 @@ NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
 
 
 @dataclass(frozen=True)
-class Auxiliary:
+class TargetCorpus:
     """What a new speaker must match in a corpus: mean (V, 3) of its templates, triangles (F, 3), rate, unit."""
 
     root: Path
@@ -52,7 +52,7 @@ class Auxiliary:
         return len(self.mean)
 
 
-def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxiliary:
+def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> TargetCorpus:
     """Read what a new speaker must match; ``frame_rate`` is needed where ``manifest.json`` does not record it.
 
     Raises:
@@ -68,7 +68,7 @@ def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxili
     manifest = read_manifest(root)
     unit = manifest.get("unit")
     mean: Array = np.stack([template.numpy() for template in templates.values()]).astype(np.float64).mean(axis=0)
-    return Auxiliary(
+    return TargetCorpus(
         root,
         mean,
         _corpus_faces(root, len(mean)),
@@ -77,13 +77,15 @@ def read_auxiliary(root: Path, *, name: str, frame_rate: float | None) -> Auxili
     )
 
 
-def _frame_rate(root: Path, stored: object, given: float | None) -> float:
-    known = float(stored) if isinstance(stored, int | float) and math.isfinite(stored) and stored > 0 else None
-    if known is None and given is None:
+def _frame_rate(root: Path, stored: object, option: float | None) -> float:
+    recorded = float(stored) if isinstance(stored, int | float) and math.isfinite(stored) and stored > 0 else None
+    if recorded is None and option is None:
         raise FaceDiffError(f"{root}: has no manifest.json with its frame rate; add --corpus-frame-rate")
-    if known is not None and given is not None and abs(known - given) > 1e-6:
-        raise FaceDiffError(f"--corpus-frame-rate {given:g}: {root / 'manifest.json'} has {known:g}; omit the option")
-    return known if known is not None else float(given or 0)
+    if recorded is not None and option is not None and abs(recorded - option) > 1e-6:
+        raise FaceDiffError(
+            f"--corpus-frame-rate {option:g}: {root / 'manifest.json'} has {recorded:g}; omit the option"
+        )
+    return recorded if recorded is not None else float(option or 0)
 
 
 def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
@@ -97,34 +99,34 @@ def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
     return None
 
 
-def check_faces(path: Path, faces: Faces | None, corpus: Auxiliary) -> bool:
+def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
     """Whether faces could be compared with the corpus's.
 
     Raises:
         FaceDiffError: if they could, and are others.
     """
-    if faces is None or corpus.faces is None:
+    if faces is None or target.faces is None:
         return False
-    differing = differing_faces(faces, corpus.faces)
+    differing = differing_faces(faces, target.faces)
     if differing:
         raise FaceDiffError(
-            f"{path}: {differing} triangles are not those of the mesh in {corpus.root}, so the topology differs; if "
+            f"{path}: {differing} triangles are not those of the mesh in {target.root}, so the topology differs; if "
             f"only polygons were triangulated differently, give the motion as a .npy array, which has no faces"
         )
     return True
 
 
-def lay_onto_corpus(path: Path, face: Array, corpus: Auxiliary) -> tuple[Similarity, float]:
+def lay_onto_corpus(path: Path, face: Array, target: TargetCorpus) -> tuple[Similarity, float]:
     """The similarity from a face to the corpus's mean face, and what is left as a share of the face's size.
 
     Raises:
         FaceDiffError: naming ``path``, if so much is left that the vertices cannot be in the corpus's order.
     """
-    map_ = robust_align(face, corpus.mean, scale=True)
-    residual = relative_residual(map_.apply(face), corpus.mean)
+    map_ = robust_align(face, target.mean, scale=True)
+    residual = relative_residual(map_.apply(face), target.mean)
     if not residual < RESIDUAL_LIMIT:
         raise FaceDiffError(
-            f"{path}: its face does not lie on those of {corpus.root} (residual {residual:.2f} of its size, expected "
+            f"{path}: its face does not lie on those of {target.root} (residual {residual:.2f} of its size, expected "
             f"less than {RESIDUAL_LIMIT}), so its topology or the order of its vertices differs, or it is mirrored"
         )
     return map_, residual
@@ -135,7 +137,7 @@ def relative_residual(face: Array, target: Array) -> float:
     return float(np.sqrt(np.square(face - target).sum(axis=-1).mean())) / face_size(target)
 
 
-def into_coordinates(face: Array, best: Similarity, given: float | None) -> Similarity:
+def into_coordinates(face: Array, best: Similarity, fixed_scale: float | None) -> Similarity:
     """The similarity that takes a speaker into the corpus's coordinates.
 
     Its scale changes the unit and keeps the speaker's size: where the measured scale is near a power of ten
@@ -145,7 +147,7 @@ def into_coordinates(face: Array, best: Similarity, given: float | None) -> Simi
     """
     power = round(math.log10(best.scale))
     is_unit = abs(math.log10(best.scale) - power) < math.log10(SAME_UNIT)
-    scale = given if given is not None else 10.0**power if is_unit else best.scale
+    scale = fixed_scale if fixed_scale is not None else 10.0**power if is_unit else best.scale
     centre = face.mean(axis=0)
     return Similarity(best.rotation, best.apply(centre) - scale * best.rotation @ centre, scale)
 
@@ -179,7 +181,7 @@ def read_stable(source: str, n_vertices: int) -> Indices:
     return np.array(region.indices, np.int64)
 
 
-def stabilise(motion: Motion, face: Array, stable: Indices, scratch: Path) -> Stabilised:
+def stabilise(motion: FaceSequence, face: Array, stable: Indices, scratch: Path) -> Stabilised:
     """Align every frame with the median face (V, 3); parameters without head motion stay as they are.
 
     Raises:
@@ -200,7 +202,7 @@ def stabilise(motion: Motion, face: Array, stable: Indices, scratch: Path) -> St
     return Stabilised(frames, face, stable, turns, shifts, float(np.sqrt(np.square(residuals).mean())), speed)
 
 
-def middle_face(motion: Motion, stable: Indices) -> Array:
+def middle_face(motion: FaceSequence, stable: Indices) -> Array:
     """The median face of a motion; of parameters without head motion, in the coordinates that they have."""
     if motion.has_head_motion:
         return median_face(motion.frames, stable)
@@ -259,47 +261,51 @@ class Neutral:
 
 
 def choose_neutral(
-    motion: Motion, made: Stabilised, given: Template | None, speech: npt.NDArray[np.float32], frame_rate: float
+    motion: FaceSequence,
+    stabilised: Stabilised,
+    template: Template | None,
+    speech: npt.NDArray[np.float32],
+    frame_rate: float,
 ) -> Neutral:
     """The neutral face that was given, else the source's own, else one found in the frames without head motion."""
-    if given is not None:
-        return Neutral(given.vertices, _onto_template(made, given), str(given.path))
+    if template is not None:
+        return Neutral(template.vertices, _onto_template(stabilised, template), str(template.path))
     unmoved = Similarity(np.eye(3), np.zeros(3))
     if motion.template is not None:
         return Neutral(motion.template, unmoved, "the model's shape without expression")
-    covered = max(1, min(len(made.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
-    chosen = neutral_frames(loudness(speech, covered, frame_rate), made.speed[:covered]).tolist()
-    face = np.median(made.frames[chosen], axis=0).astype(np.float64)
+    covered = max(1, min(len(stabilised.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
+    chosen = neutral_frames(loudness(speech, covered, frame_rate), stabilised.speed[:covered]).tolist()
+    face = np.median(stabilised.frames[chosen], axis=0).astype(np.float64)
     source = f"median of {len(chosen)} silent and still frames (counted from 0): {spans(chosen)}"
     return Neutral(face, unmoved, source, chosen)
 
 
-def _onto_template(made: Stabilised, given: Template) -> Similarity:
+def _onto_template(stabilised: Stabilised, template: Template) -> Similarity:
     """The rigid motion from the stabilised frames to a template, by the stable vertices."""
-    face, template = made.face[made.stable], given.vertices[made.stable]
-    ratio = robust_align(face, template, scale=True).scale
-    rigid = robust_align(face, template)
-    residual = relative_residual(rigid.apply(made.face), given.vertices)
+    face, target = stabilised.face[stabilised.stable], template.vertices[stabilised.stable]
+    ratio = robust_align(face, target, scale=True).scale
+    rigid = robust_align(face, target)
+    residual = relative_residual(rigid.apply(stabilised.face), template.vertices)
     if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE):
         raise FaceDiffError(
-            f"{given.path}: is {ratio:.4g} times as large as the faces of the motion; expected the speaker's neutral "
-            f"face in the motion's own unit and vertex order"
+            f"{template.path}: is {ratio:.4g} times as large as the faces of the motion; expected the speaker's "
+            f"neutral face in the motion's own unit and vertex order"
         )
     if not residual < RESIDUAL_LIMIT:
         raise FaceDiffError(
-            f"{given.path}: does not lie on the faces of the motion (residual {residual:.2f} of its size, expected "
+            f"{template.path}: does not lie on the faces of the motion (residual {residual:.2f} of its size, expected "
             f"less than {RESIDUAL_LIMIT}); expected the speaker's neutral face in the motion's own vertex order"
         )
     return rigid
 
 
-def read_template(path: Path, corpus: Auxiliary) -> Template:
+def read_template(path: Path, target: TargetCorpus) -> Template:
     """A neutral face from .obj, .ply or .npy.
 
     Raises:
         FaceDiffError: if it is none of these, damaged, of another topology than the corpus, or holds NaN.
     """
-    suffix, faces, count = path.suffix.lower(), None, corpus.n_vertices
+    suffix, faces, count = path.suffix.lower(), None, target.n_vertices
     vertices: Array
     if suffix == ".npy":
         array = open_array(path, kinds="f")
@@ -317,7 +323,7 @@ def read_template(path: Path, corpus: Auxiliary) -> Template:
         raise FaceDiffError(f"{path}: unknown form of template; expected .obj, .ply or .npy")
     if not np.isfinite(vertices).all():
         raise FaceDiffError(f"{path}: holds NaN or infinity; expected a neutral face")
-    check_faces(path, faces, corpus)
+    check_faces(path, faces, target)
     return Template(path, vertices)
 
 

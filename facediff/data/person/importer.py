@@ -14,22 +14,22 @@ import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT
 from facediff.data.person.fitting import (
-    Auxiliary,
     Neutral,
     Speech,
     Stabilised,
+    TargetCorpus,
     check_faces,
     choose_neutral,
     into_coordinates,
     lay_onto_corpus,
     loudness,
     middle_face,
-    read_auxiliary,
     read_stable,
+    read_target_corpus,
     read_template,
     stabilise,
 )
-from facediff.data.person.motion import Array, Motion, read_motion, scratch_array
+from facediff.data.person.motion import Array, FaceSequence, read_motion, scratch_array
 from facediff.data.prepare.motion import resample_frames, resampled_length
 from facediff.data.prepare.runner import MANIFEST, version, write_clip, write_templates
 from facediff.errors import FaceDiffError
@@ -64,7 +64,7 @@ def import_person(
     scale: ranges.Factor | None = None,
     clip_seconds: ranges.ClipLength = 8.0,
     progress: bool = False,
-) -> Report:
+) -> ImportReport:
     """Turn the reconstruction of one speaker's video into a corpus entry that fits an existing corpus.
 
     Args:
@@ -92,33 +92,33 @@ def import_person(
     if not NAME.fullmatch(name):
         raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
     _check_output(output)
-    known = read_auxiliary(corpus, name=name, frame_rate=corpus_frame_rate)
+    target = read_target_corpus(corpus, name=name, frame_rate=corpus_frame_rate)
     speech = read_speech(audio)
     if float(np.abs(speech).max()) < SILENCE:
         raise FaceDiffError(f"{audio}: holds only silence; expected the speech of the video")
     with scratch_folder(output) as scratch:
         read = read_motion(
             motion,
-            n_vertices=known.n_vertices,
+            n_vertices=target.n_vertices,
             frame_rate=frame_rate,
             scratch=scratch / "read.npy",
             flame=flame,
             progress=progress,
         )
         warnings = _check_lengths(motion, audio, len(speech), len(read.frames), frame_rate)
-        fitted = _fit(motion, read, known, speech, frame_rate, scratch, template=template, stable=stable, scale=scale)
-        frames, way = fitted.made.frames, fitted.neutral.placing.then(fitted.place)
+        fitted = _fit(motion, read, target, speech, frame_rate, scratch, template=template, stable=stable, scale=scale)
+        frames, way = fitted.stabilised.frames, fitted.neutral.placing.then(fitted.place)
         for part, chunk in chunks(frames):
             frames[part] = way.apply(chunk)
-        if frame_rate != known.frame_rate:
-            length = resampled_length(len(frames), frame_rate, known.frame_rate)
+        if frame_rate != target.frame_rate:
+            length = resampled_length(len(frames), frame_rate, target.frame_rate)
             resampled = scratch_array(scratch / "rate.npy", (length, *frames.shape[1:]))
-            frames = resample_frames(frames, frame_rate, known.frame_rate, out=resampled)
-        clips = _cut(name, speech, len(frames), known.frame_rate, clip_seconds)
+            frames = resample_frames(frames, frame_rate, target.frame_rate, out=resampled)
+        clips = _cut(name, speech, len(frames), target.frame_rate, clip_seconds)
         mismatch = len(speech) / SAMPLE_RATE - len(read.frames) / frame_rate
-        report = _report(name, read, known, fitted, clips, frame_rate, stable, mismatch, warnings)
+        report = _report(name, read, target, fitted, clips, frame_rate, stable, mismatch, warnings)
         entry = scratch / output.name
-        _write_entry(entry, known, clips, frames, speech, fitted.place.apply(fitted.neutral.face), report)
+        _write_entry(entry, target, clips, frames, speech, fitted.place.apply(fitted.neutral.face), report)
         put_in_place(entry, output, replace=False)
     return report
 
@@ -127,7 +127,7 @@ def import_person(
 class Fitted:
     """A speaker's frames on the way into the corpus."""
 
-    made: Stabilised  # frames without head motion, still in the motion's coordinates
+    stabilised: Stabilised  # frames without head motion, still in the motion's coordinates
     neutral: Neutral
     place: Similarity  # from the neutral face's coordinates to the corpus's
     measured_scale: float  # scale of the best similarity between the neutral face and the corpus's mean face
@@ -137,8 +137,8 @@ class Fitted:
 
 def _fit(
     motion: Path,
-    read: Motion,
-    known: Auxiliary,
+    read: FaceSequence,
+    target: TargetCorpus,
     speech: Speech,
     frame_rate: float,
     scratch: Path,
@@ -148,22 +148,22 @@ def _fit(
     scale: float | None,
 ) -> Fitted:
     """Remove the head's motion, find the neutral face, and find the way into the corpus's coordinates."""
-    given = None if template is None else read_template(template, known)
-    chosen = None if stable is None else read_stable(stable, known.n_vertices)
-    compared = check_faces(motion, read.faces, known)
+    own_template = None if template is None else read_template(template, target)
+    chosen = None if stable is None else read_stable(stable, target.n_vertices)
+    compared = check_faces(motion, read.faces, target)
     with _naming(motion):
         for _ in chunks(read.frames):
             pass  # refuses frames that are not finite
         still = stable_vertices(read.frames) if chosen is None else chosen
         face = middle_face(read, still)
-        lay_onto_corpus(motion, face, known)  # another topology is refused before the long work
-        made = stabilise(read, face, still, scratch / "stable.npy")
+        lay_onto_corpus(motion, face, target)  # another topology is refused before the long work
+        stabilised = stabilise(read, face, still, scratch / "stable.npy")
     source = template or motion
     with _naming(source):
-        neutral = choose_neutral(read, made, given, speech, frame_rate)
-        best, residual = lay_onto_corpus(source, neutral.face, known)
+        neutral = choose_neutral(read, stabilised, own_template, speech, frame_rate)
+        best, residual = lay_onto_corpus(source, neutral.face, target)
     place = into_coordinates(neutral.face, best, scale)
-    return Fitted(made, neutral, place, best.scale, residual, compared)
+    return Fitted(stabilised, neutral, place, best.scale, residual, compared)
 
 
 def _check_output(path: Path) -> None:
@@ -256,7 +256,7 @@ def splits(clips: int) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Report:
+class ImportReport:
     """What an import did. Lengths are in the unit of the corpus unless said otherwise."""
 
     name: str
@@ -322,30 +322,30 @@ class Report:
 
 def _report(
     name: str,
-    read: Motion,
-    known: Auxiliary,
+    read: FaceSequence,
+    target: TargetCorpus,
     fitted: Fitted,
     clips: list[EntryClip],
     frame_rate: float,
     stable: str | None,
     mismatch: float,
     warnings: list[str],
-) -> Report:
-    made, scale = fitted.made, fitted.place.scale
-    return Report(
+) -> ImportReport:
+    stabilised, scale = fitted.stabilised, fitted.place.scale
+    return ImportReport(
         name=name,
         frames=len(read.frames),
         seconds=len(read.frames) / frame_rate,
         frame_rate=frame_rate,
-        corpus_frame_rate=known.frame_rate,
+        corpus_frame_rate=target.frame_rate,
         has_head_motion=read.has_head_motion,
-        rotation_max=float(np.degrees(made.turns.max())),
-        rotation_rms=float(np.degrees(_rms(made.turns))),
-        translation_max=scale * float(made.shifts.max()),
-        translation_rms=scale * _rms(made.shifts),
-        stable_vertices=len(made.stable),
+        rotation_max=float(np.degrees(stabilised.turns.max())),
+        rotation_rms=float(np.degrees(_rms(stabilised.turns))),
+        translation_max=scale * float(stabilised.shifts.max()),
+        translation_rms=scale * _rms(stabilised.shifts),
+        stable_vertices=len(stabilised.stable),
         stable_source="found to move least" if stable is None else f"of {stable}",
-        jitter=scale * made.jitter,
+        jitter=scale * stabilised.jitter,
         scale=scale,
         measured_scale=fitted.measured_scale,
         topology_residual=fitted.residual,
@@ -370,19 +370,19 @@ def _rms(values: Array) -> float:
 
 def _write_entry(
     folder: Path,
-    known: Auxiliary,
+    target: TargetCorpus,
     clips: Sequence[EntryClip],
     frames: npt.NDArray[np.floating],
     speech: Speech,
     template: Array,
-    report: Report,
+    report: ImportReport,
 ) -> None:
     """Write clips, template and manifest in the layout that every corpus has."""
     # 16-bit sound ends at full scale: a recording that goes beyond is turned down as a whole.
     speech = speech / max(1.0, float(np.abs(speech).max(initial=0.0)))
     for clip in clips:
-        first = samples_for(clip.start, known.frame_rate)
-        part = fit_length(speech[first:], samples_for(clip.stop, known.frame_rate) - first)
+        first = samples_for(clip.start, target.frame_rate)
+        part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
         write_clip(folder, clip.name, frames[clip.start : clip.stop], part)
     write_templates(folder / "templates.pkl", {report.name: template.astype(np.float32)})
     rows = [
@@ -390,7 +390,7 @@ def _write_entry(
         for clip in clips
     ]
     write_rows(folder / "clips.csv", rows, line_end="\n")
-    facts = {"frame_rate": known.frame_rate, "n_vertices": known.n_vertices, "unit": known.unit}
+    facts = {"frame_rate": target.frame_rate, "n_vertices": target.n_vertices, "unit": target.unit}
     about = {
         "facediff": version(),
         "format": FORMAT,

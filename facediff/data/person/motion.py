@@ -25,7 +25,7 @@ FLAME_FRAMES = 64  # frames that the FLAME layer works on at a time
 
 
 @dataclass(frozen=True)
-class Motion:
+class FaceSequence:
     """A sequence of faces as read."""
 
     frames: npt.NDArray[np.floating]  # (T, V, 3), usually memory-mapped
@@ -37,7 +37,7 @@ class Motion:
 
 def read_motion(
     path: Path, *, n_vertices: int, frame_rate: float, scratch: Path, flame: Path | None = None, progress: bool = False
-) -> Motion:
+) -> FaceSequence:
     """Read a folder of OBJ or PLY files, a .npy array of vertices, or FLAME parameters.
 
     ``flame`` is the FLAME model file, needed for parameters and only for them; ``scratch`` is a temporary file for
@@ -51,7 +51,7 @@ def read_motion(
         array = open_array(path, kinds="f")
         fits = vertices_of(array.shape) == n_vertices
         if fits and flame is None:
-            return Motion(array.reshape(len(array), n_vertices, 3))
+            return FaceSequence(array.reshape(len(array), n_vertices, 3))
         parameters = array.shape[-1] == FLAME_WIDTH
         if not parameters and not fits:
             raise FaceDiffError(
@@ -63,7 +63,7 @@ def read_motion(
             frames, faces, notes = read_frames(
                 path, n_vertices=n_vertices, frame_rate=frame_rate, scratch=scratch, progress=progress
             )
-            return Motion(frames, faces, notes=notes)
+            return FaceSequence(frames, faces, notes=notes)
     elif not path.is_file():
         raise FaceDiffError(f"{path}: no such file or folder; expected the reconstructed motion")
     if not parameters:
@@ -76,7 +76,7 @@ def read_motion(
     return _read_flame(path, flame, n_vertices, scratch)
 
 
-def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Motion:
+def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> FaceSequence:
     """Vertices of FLAME parameters without head pose; the neutral face is the shape without expression."""
     parameters, layer = read_parameters(path), Flame.read(model)
     shape, expression, jaw = parameters.shape, parameters.expression, parameters.jaw
@@ -90,7 +90,7 @@ def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> Moti
         part = slice(first, first + FLAME_FRAMES)
         frames[part] = layer.vertices(shape, expression[part], jaw[part])
     faces = np.asarray(layer.faces, np.int64)
-    return Motion(frames, faces, np.asarray(template, np.float64), has_head_motion=False)
+    return FaceSequence(frames, faces, np.asarray(template, np.float64), has_head_motion=False)
 
 
 # A folder with one mesh file for each frame.
@@ -241,5 +241,5 @@ def spans(places: list[int]) -> str:
             parts[-1][1] = place
         else:
             parts.append([place, place])
-    words = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
-    return ", ".join(words if len(words) <= 10 else [*words[:10], "…"])
+    texts = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
+    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "…"])

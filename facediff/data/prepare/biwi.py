@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from facediff.data.prepare.runner import (
     Job,
-    Plan,
     Precision,
+    PreparationPlan,
     bases,
     choose_subjects,
     copy_files,
@@ -68,7 +68,7 @@ def plan(
     dtype: Precision = "float32",
     subjects: Sequence[str] | None = None,
     regions: Path | None = None,
-) -> Plan:
+) -> PreparationPlan:
     """Scan a raw folder of BIWI.
 
     Args:
@@ -110,7 +110,7 @@ def plan(
                 jobs.append(Job(name, work, _count_frames(name, folder, notes)))
     if not jobs:
         raise nothing_to_prepare(raw, "BIWI", missing)
-    return Plan(
+    return PreparationPlan(
         corpus="biwi",
         frame_rate=FRAME_RATE,
         unit=UNITS[normalise],
@@ -200,30 +200,30 @@ def _write_shared(
 
 def _find_sequences(raw: Path, chosen: Sequence[str], notes: list[str]) -> dict[str, dict[str, Path]]:
     """Folder of every emotional sequence, by subject and sentence."""
-    found: dict[str, dict[str, Path]] = {subject: {} for subject in chosen}
+    sequences: dict[str, dict[str, Path]] = {subject: {} for subject in chosen}
     neutral = 0
     for base in bases(raw):
         for subject in chosen:
             folder = base / "faces" / subject
             for path in folders_in(folder) if folder.is_dir() else ():
                 if path.name in SENTENCES and _frame_numbers(path):
-                    found[subject].setdefault(path.name, path)
+                    sequences[subject].setdefault(path.name, path)
                 neutral += f"e{path.name}" in SENTENCES
     if neutral:
         notes.append(f"{neutral} neutral sequences (01 to 40 without an e) are left out, as in all published work")
-    return found
+    return sequences
 
 
 def _find_templates(raw: Path, subjects: Sequence[str], missing: dict[str, str]) -> dict[str, Path]:
-    found = {}
+    templates = {}
     for subject in subjects:
         path = find_file(raw, f"rigid_scans/{subject}.obj")
         if path is None:
             expected = raw / "rigid_scans" / f"{subject}.obj"
             missing[f"template of {subject}"] = f"expected {expected}; no clip of {subject} is written without it"
         else:
-            found[subject] = path
-    return found
+            templates[subject] = path
+    return templates
 
 
 def _find_sounds(raw: Path) -> dict[str, Path]:
@@ -282,7 +282,7 @@ def frame_files(folder: Path) -> dict[int, Path]:
     Raises:
         FaceDiffError: if the folder cannot be read, or two files claim the same number.
     """
-    found: dict[int, Path] = {}
+    files: dict[int, Path] = {}
     try:
         names = os.listdir(folder)
     except OSError as error:
@@ -290,10 +290,10 @@ def frame_files(folder: Path) -> dict[int, Path]:
     for name in names:
         if match := FRAME_NAME.fullmatch(name):
             number, path = int(match[1]), folder / name
-            if number in found:
-                raise FaceDiffError(f"{path}: has the same frame number as {found[number].name}; remove one of them")
-            found[number] = path
-    return dict(sorted(found.items()))
+            if number in files:
+                raise FaceDiffError(f"{path}: has the same frame number as {files[number].name}; remove one of them")
+            files[number] = path
+    return dict(sorted(files.items()))
 
 
 def gaps(numbers: list[int]) -> list[str]:

@@ -21,8 +21,8 @@ import numpy.typing as npt
 from facediff.data.prepare.motion import read_parameters
 from facediff.data.prepare.runner import (
     Job,
-    Plan,
     Precision,
+    PreparationPlan,
     choose_subjects,
     copy_files,
     find_file,
@@ -67,7 +67,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, order=True)
-class Recording:
+class MeadRecording:
     """The parameters of a clip, e.g. ``M003_001_0_0``: speaker, sequence, index of emotion, index of intensity."""
 
     name: str
@@ -109,7 +109,7 @@ def plan(
     subjects: Sequence[str] | None = None,
     regions: Path | None = None,
     quiet: bool = True,
-) -> Plan:
+) -> PreparationPlan:
     """Scan a raw folder of 3DMEAD. Every clip's parameters are read once, for the speakers' mean shapes.
 
     Args:
@@ -128,11 +128,11 @@ def plan(
     """
     model = load_flame(flame)
     region_files = find_regions(raw, regions)
-    found = find_recordings(raw)
-    speakers = sorted({recording.subject for recording in found.recordings})
+    distribution = find_recordings(raw)
+    speakers = sorted({recording.subject for recording in distribution.recordings})
     chosen = choose_subjects(subjects, speakers, "the raw folder")
-    recordings = [recording for recording in found.recordings if recording.subject in chosen]
-    missing = {name: text for name, text in found.missing.items() if name[:4] in chosen}
+    recordings = [recording for recording in distribution.recordings if recording.subject in chosen]
+    missing = {name: text for name, text in distribution.missing.items() if name[:4] in chosen}
     sounds = find_sounds(raw if audio is None else audio)
     frames, shapes, problems = _survey(recordings, quiet)
     jobs = []
@@ -157,7 +157,7 @@ def plan(
         missing |= {f"regions/{name}": MISSING_REGION for name in REGION_FILES if name not in there}
         missing[MASKS_FILE] = MISSING_MASKS
     digest = f"a model with SHA-256 {sha256(flame)[:16]}"
-    return Plan(
+    return PreparationPlan(
         corpus="mead3d",
         frame_rate=FRAME_RATE,
         unit="m",
@@ -166,7 +166,7 @@ def plan(
         jobs=jobs,
         shared=partial(_write_shared, flame, recordings, shapes, masks, region_files),
         missing=missing,
-        notes=_compare_speakers(speakers, found.base, missing) if subjects is None else [],
+        notes=_compare_speakers(speakers, distribution.base, missing) if subjects is None else [],
     )
 
 
@@ -197,7 +197,9 @@ def load_flame(path: Path) -> Flame:
     return Flame.read(path)
 
 
-def _survey(recordings: Sequence[Recording], quiet: bool) -> tuple[dict[str, int], dict[str, Array], dict[str, str]]:
+def _survey(
+    recordings: Sequence[MeadRecording], quiet: bool
+) -> tuple[dict[str, int], dict[str, Array], dict[str, str]]:
     """Frames of every clip, every speaker's mean shape over all frames, and why clips cannot be read."""
     lengths: dict[str, int] = {}
     problems: dict[str, str] = {}
@@ -230,7 +232,7 @@ def _compare_speakers(speakers: list[str], base: Path, missing: dict[str, str]) 
 
 def _write_shared(
     model: Path,
-    recordings: Sequence[Recording],
+    recordings: Sequence[MeadRecording],
     shapes: dict[str, Array],
     masks: Sequence[Path],
     region_files: Sequence[Path],
@@ -275,15 +277,15 @@ def _refuse_other_templates(templates: dict[str, Array], out: Path) -> None:
 
 
 @dataclass
-class Found:
+class RawDistribution:
     """What a raw folder holds: clips, those that lack parameters, and the folder above the speakers or ``param/``."""
 
     base: Path
-    recordings: list[Recording] = field(default_factory=list)
+    recordings: list[MeadRecording] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
 
 
-def find_recordings(raw: Path) -> Found:
+def find_recordings(raw: Path) -> RawDistribution:
     """Every clip of a raw folder, which holds EMOTE's distribution or ProbTalk3D's; the folder's layout says which.
 
     Raises:
@@ -304,20 +306,20 @@ def find_recordings(raw: Path) -> Found:
         raise FaceDiffError(
             f"{raw}: holds reconstructions in {bases[0]} and in {bases[1]}; give one of these folders instead"
         )
-    found = Found(bases[0])
-    if _is_probtalk3d(found.base):
-        files = (path for path in found.base.glob("param/*.npy") if CLIP.fullmatch(path.stem) and path.is_file())
-        found.recordings = [Recording(path.stem, path) for path in files]
+    distribution = RawDistribution(bases[0])
+    if _is_probtalk3d(distribution.base):
+        files = (path for path in distribution.base.glob("param/*.npy") if CLIP.fullmatch(path.stem) and path.is_file())
+        distribution.recordings = [MeadRecording(path.stem, path) for path in files]
     else:
-        for speaker in _speakers(found.base):
+        for speaker in _speakers(distribution.base):
             for name, folder in _numbered(speaker / "front", speaker.name):
                 file = folder / RECONSTRUCTION
                 if file.is_file():
-                    found.recordings.append(Recording(name, file))
+                    distribution.recordings.append(MeadRecording(name, file))
                 elif folder.is_dir():
-                    found.missing[name] = f"expected {file}"
-    found.recordings = sorted({recording.name: recording for recording in found.recordings}.values())
-    return found
+                    distribution.missing[name] = f"expected {file}"
+    distribution.recordings = sorted({recording.name: recording for recording in distribution.recordings}.values())
+    return distribution
 
 
 def find_sounds(root: Path) -> dict[str, Path]:

@@ -69,7 +69,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PreparationPlan:
     """What is to be written, found by a quick scan of the raw folder."""
 
     corpus: str  # biwi, vocaset or mead3d
@@ -99,7 +99,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Report:
+class PreparationReport:
     """What preparation did."""
 
     out: Path
@@ -117,14 +117,14 @@ class Report:
 
 
 def prepare(
-    plan: Plan,
+    plan: PreparationPlan,
     out: Path,
     *,
     workers: int | None = None,
     scheduler: str | None = "",
     reads: Sequence[Path] = (),
     quiet: bool = False,
-) -> Report:
+) -> PreparationReport:
     """Write a corpus folder.
 
     A run that was killed is resumed: clips whose two files are there are kept. A second run over a complete folder
@@ -168,14 +168,14 @@ def prepare(
 
 
 def _write_all(
-    plan: Plan,
+    plan: PreparationPlan,
     pending: list[Job],
     finished: dict[str, int],
     out: Path,
     workers: int | None,
     places: Mapping[str, Any],
     quiet: bool,
-) -> Report:
+) -> PreparationReport:
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
     bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
@@ -200,7 +200,7 @@ def _write_all(
 
 
 def _manifest(
-    plan: Plan, clips: dict[str, int], failed: dict[str, str], files: dict[str, dict[str, int | str]]
+    plan: PreparationPlan, clips: dict[str, int], failed: dict[str, str], files: dict[str, dict[str, int | str]]
 ) -> dict[str, Any]:
     """The final record. Nothing in it depends on the time or the order in which the files were made."""
     frames = sum(clips.values())
@@ -223,8 +223,10 @@ def _manifest(
     }
 
 
-def _report(plan: Plan, out: Path, manifest: dict[str, Any], written: int) -> Report:
-    return Report(out, manifest["clips"], written, manifest["failed"], plan.missing, plan.notes, manifest["totals"])
+def _report(plan: PreparationPlan, out: Path, manifest: dict[str, Any], written: int) -> PreparationReport:
+    return PreparationReport(
+        out, manifest["clips"], written, manifest["failed"], plan.missing, plan.notes, manifest["totals"]
+    )
 
 
 def version() -> str:
@@ -238,7 +240,7 @@ def version() -> str:
 # What an earlier run has left in the folder.
 
 
-def finished_frames(plan: Plan, job: Job, out: Path, recorded: Mapping[str, Any]) -> int | None:
+def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mapping[str, Any]) -> int | None:
     """Frames of a clip whose motion and speech are both there and whole; None for any other.
 
     Files that an earlier manifest records have the sizes that it records.
@@ -257,7 +259,7 @@ def finished_frames(plan: Plan, job: Job, out: Path, recorded: Mapping[str, Any]
     return len(array) if whole else None
 
 
-def _is_complete(plan: Plan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
+def _is_complete(plan: PreparationPlan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
     """Whether the manifest records just this plan, carried out without a failure, and all its files are there."""
     expected = {name: value for name, value in plan.recipe.items() if name not in ("facediff", "format")}
     expected |= {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
@@ -279,7 +281,7 @@ def _read_record(path: Path) -> dict[str, Any] | None:
     return record
 
 
-def _refuse_other_recipe(plan: Plan, out: Path, record: dict[str, Any]) -> None:
+def _refuse_other_recipe(plan: PreparationPlan, out: Path, record: dict[str, Any]) -> None:
     """Refuse to mix what was written with other options, or by another version, with what this plan writes."""
 
     def settings(recipe: Mapping[str, Any]) -> dict[str, Any]:
@@ -299,15 +301,15 @@ def _refuse_other_recipe(plan: Plan, out: Path, record: dict[str, Any]) -> None:
 
 
 def _refuse_foreign(out: Path) -> None:
-    found = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
-    if found:
+    others = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
+    if others:
         raise FaceDiffError(
-            f"{out}: holds other files ({', '.join(found[:3])}{' …' if len(found) > 3 else ''}) and was not begun by "
+            f"{out}: holds other files ({', '.join(others[:3])}{' …' if len(others) > 3 else ''}) and was not begun by "
             f"`facediff data prepare`; choose a new folder"
         )
 
 
-def _refuse_strays(plan: Plan, out: Path) -> None:
+def _refuse_strays(plan: PreparationPlan, out: Path) -> None:
     """A clip that the raw folder no longer has would be read as part of the corpus without being in the manifest."""
     names = {job.name for job in plan.jobs}
     for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
@@ -317,11 +319,11 @@ def _refuse_strays(plan: Plan, out: Path) -> None:
             )
 
 
-def _check_space(plan: Plan, pending: list[Job], out: Path) -> None:
-    known = [job.frames for job in pending if job.frames is not None]
-    if not known:
+def _check_space(plan: PreparationPlan, pending: list[Job], out: Path) -> None:
+    frame_counts = [job.frames for job in pending if job.frames is not None]
+    if not frame_counts:
         return
-    frames = sum(known) / len(known) * len(pending)
+    frames = sum(frame_counts) / len(frame_counts) * len(pending)
     need = frames * (3 * plan.n_vertices * plan.dtype.itemsize + 2 * 16_000 / plan.frame_rate)
     free = shutil.disk_usage(out).free
     if need > free:
@@ -459,27 +461,27 @@ def find_file(raw: Path, name: str) -> Path | None:
     return next((path for base in bases(raw) if (path := base / name).is_file()), None)
 
 
-def find_regions(raw: Path, given: Path | None) -> list[Path]:
+def find_regions(raw: Path, chosen: Path | None) -> list[Path]:
     """The lists of vertices in the folder given, else in ``regions/`` of the raw folder if there is one.
 
     Raises:
         FaceDiffError: if the folder given holds no list.
     """
-    folder = given or next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
+    folder = chosen or next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
     files = [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
-    if given is not None and not files:
-        raise FaceDiffError(f"{given}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
+    if chosen is not None and not files:
+        raise FaceDiffError(f"{chosen}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
     return files
 
 
-def choose_subjects(subjects: Sequence[str] | None, known: Sequence[str], holder: str) -> list[str]:
+def choose_subjects(subjects: Sequence[str] | None, available: Sequence[str], holder: str) -> list[str]:
     """The subjects that ``--subjects`` names, in the order in which they are known; all if None."""
     if subjects is not None and not subjects:
-        raise FaceDiffError(f"--subjects: names nobody; expected e.g. {','.join(known[:2])}")
+        raise FaceDiffError(f"--subjects: names nobody; expected e.g. {','.join(available[:2])}")
     for subject in subjects or ():
-        if subject not in known:
-            raise FaceDiffError(f'--subjects: {holder} has no "{subject}": {choices(subject, known)}')
-    return [subject for subject in known if subjects is None or subject in subjects]
+        if subject not in available:
+            raise FaceDiffError(f'--subjects: {holder} has no "{subject}": {choices(subject, available)}')
+    return [subject for subject in available if subjects is None or subject in subjects]
 
 
 def nothing_to_prepare(raw: Path, corpus: str, missing: Mapping[str, str]) -> FaceDiffError:

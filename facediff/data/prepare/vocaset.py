@@ -19,8 +19,8 @@ import numpy.typing as npt
 from facediff.data.prepare.motion import resample_frames
 from facediff.data.prepare.runner import (
     Job,
-    Plan,
     Precision,
+    PreparationPlan,
     copy_files,
     find_file,
     find_regions,
@@ -48,7 +48,7 @@ Decimation = Literal["every_second", "filtered"]
 Array = npt.NDArray[np.float64]
 
 
-class Recording(NamedTuple):
+class VocasetRecording(NamedTuple):
     """One clip: row of every frame in ``data_verts.npy``, entry of ``raw_audio_fixed.pkl``, how errors call it."""
 
     rows: npt.NDArray[np.int64]
@@ -63,7 +63,7 @@ def plan(
     decimate: Decimation = "every_second",
     dtype: Precision = "float32",
     regions: Path | None = None,
-) -> Plan:
+) -> PreparationPlan:
     """Scan a raw folder of VOCASET. The sound of all clips is read into memory, once.
 
     Args:
@@ -99,7 +99,9 @@ def plan(
             if lacking:
                 missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
                 continue
-            recording = Recording(_rows(rows_of[sentence], name, notes), sound_of[sentence], f"{subject} {sentence}")
+            recording = VocasetRecording(
+                _rows(rows_of[sentence], name, notes), sound_of[sentence], f"{subject} {sentence}"
+            )
             frames = len(recording.rows) if frame_rate == RAW_RATE else -(-len(recording.rows) // 2)
             work = partial(prepare_clip, name, recording, vertices, frame_rate, decimate, dtype)
             jobs.append(Job(name, work, frames))
@@ -107,7 +109,7 @@ def plan(
         notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
     if not jobs:
         raise nothing_to_prepare(raw, "VOCASET", missing)
-    return Plan(
+    return PreparationPlan(
         corpus="vocaset",
         frame_rate=float(frame_rate),
         unit="m",
@@ -121,7 +123,13 @@ def plan(
 
 
 def prepare_clip(
-    name: str, recording: Recording, vertices: Path, frame_rate: int, decimate: Decimation, dtype: Precision, out: Path
+    name: str,
+    recording: VocasetRecording,
+    vertices: Path,
+    frame_rate: int,
+    decimate: Decimation,
+    dtype: Precision,
+    out: Path,
 ) -> int:
     """Write one clip and return its number of frames.
 
@@ -248,8 +256,8 @@ def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
     return np.array([row for _, row in pairs], np.int64)
 
 
-def _missing_extras(found: Sequence[Path]) -> dict[str, str]:
-    there = {path.name for path in found}
+def _missing_extras(files: Sequence[Path]) -> dict[str, str]:
+    there = {path.name for path in files}
     missing = {name: f"no such file in the raw folder: {text}" for name, text in OPTIONAL.items() if name not in there}
     if "FLAME_masks.pkl" not in there:
         lists = (name for name in ("lve.txt", "fdd.txt") if name not in there)

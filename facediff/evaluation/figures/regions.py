@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.check import Report
+from facediff.data.check import CheckReport
 from facediff.data.check.layouts import MANIFEST, View, identify, list_folder, read_record
 from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
 from facediff.errors import FaceDiffError
@@ -72,7 +72,7 @@ def find_view(root: Path, corpus: str | None) -> View:
     """What a folder is, as ``facediff data check`` recognises it."""
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
-    report = Report(root, quick=True)
+    report = CheckReport(root, quick=True)
     manifest = read_record(root, MANIFEST, report.findings)
     folder = list_folder(root, MOTION_FOLDERS)
     view = identify(report, folder, manifest.get("corpus"), corpus, None, manifest)

@@ -9,7 +9,7 @@ import numpy as np
 import soundfile
 
 from facediff.data import Biwi, Mead3D, Vocaset
-from facediff.data.check import Report
+from facediff.data.check import CheckReport
 from tests.fakes import biwi, vocaset
 
 BIWI, VOCASET, MEAD = (f"tests.data.check.small.{name}" for name in ("SmallBiwi", "SmallVocaset", "SmallMead"))
@@ -74,15 +74,15 @@ def write_small_mead(root: Path) -> Path:
     return root
 
 
-def kinds(report: Report, severity: str = "error") -> list[str]:
+def kinds(report: CheckReport, severity: str = "error") -> list[str]:
     return [finding.kind for finding in report.findings if finding.severity == severity]
 
 
-def message(report: Report, kind: str) -> str:
+def message(report: CheckReport, kind: str) -> str:
     return next(finding.message for finding in report.findings if finding.kind == kind)
 
 
-def rows(report: Report) -> dict[tuple[str | None, str], tuple[object, ...]]:
+def rows(report: CheckReport) -> dict[tuple[str | None, str], tuple[object, ...]]:
     return {
         (row["way"], row["split"]): tuple(row[key] for key in ("expected", "present", "missing", "frames", "seconds"))
         for row in report.splits

@@ -15,7 +15,7 @@ import soundfile
 
 from facediff.data.prepare import biwi
 from facediff.data.prepare.biwi import check_sizes, codetalker, gaps, read_vl
-from facediff.data.prepare.runner import Report, prepare
+from facediff.data.prepare.runner import PreparationReport, prepare
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
 from facediff.mesh.mesh import surface_area
@@ -41,7 +41,7 @@ def raw(tmp_path: Path) -> Path:
     return write_raw_biwi(tmp_path / "raw", subjects=["F2"], sentences=["e01"], frames=6)
 
 
-def prepared(raw: Path, **options: object) -> tuple[Path, Report]:
+def prepared(raw: Path, **options: object) -> tuple[Path, PreparationReport]:
     out = raw.parent / "out"
     return out, prepare(biwi.plan(raw, **options), out, workers=1)  # type: ignore[arg-type]
 

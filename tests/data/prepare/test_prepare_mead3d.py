@@ -16,7 +16,7 @@ from facediff.data import Mead3D
 from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_recordings, find_sounds
 from facediff.data.prepare.motion import read_parameters
-from facediff.data.prepare.runner import Report, prepare
+from facediff.data.prepare.runner import PreparationReport, prepare
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import Flame
@@ -58,7 +58,7 @@ def raw(tmp_path: Path) -> Path:
     return write_raw_emote(tmp_path / "raw", clips=PAIR, audio="wav")
 
 
-def prepared(raw: Path, flame: Path, out: str = "out", **options: object) -> tuple[Path, Report]:
+def prepared(raw: Path, flame: Path, out: str = "out", **options: object) -> tuple[Path, PreparationReport]:
     target = raw.parent / out
     return target, prepare(mead3d.plan(raw, flame=flame, **options), target, workers=1)  # type: ignore[arg-type]
 

@@ -29,7 +29,7 @@ from facediff.cli.app import main, run
 from facediff.cli.data import CORPORA, grouped, options_of, plan_options, read_prepare
 from facediff.cli.parsing import Parameter
 from facediff.data.prepare import biwi, runner
-from facediff.data.prepare.runner import Job, Plan, prepare, write_motion, write_speech, write_templates
+from facediff.data.prepare.runner import Job, PreparationPlan, prepare, write_motion, write_speech, write_templates
 from facediff.errors import FaceDiffError, MissingExtraError
 from tests.fakes.biwi import vl_bytes, write_raw_biwi
 
@@ -59,10 +59,10 @@ def write_toy_templates(out: Path) -> list[str]:
 
 def toy_plan(
     works: dict[str, Callable[[Path], int]] | None = None, options: dict[str, object] | None = None, **facts: object
-) -> Plan:
+) -> PreparationPlan:
     works = works or {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
     jobs = [Job(name, work, 3) for name, work in works.items()]
-    return Plan("toy", 25.0, "m", 2, options or {"dtype": "float32"}, jobs, write_toy_templates, **facts)  # type: ignore[arg-type]
+    return PreparationPlan("toy", 25.0, "m", 2, options or {"dtype": "float32"}, jobs, write_toy_templates, **facts)  # type: ignore[arg-type]
 
 
 def test_the_manifest_says_what_is_there(tmp_path: Path) -> None:
@@ -426,9 +426,9 @@ def test_options_are_read_by_their_type(tmp_path: Path, monkeypatch: pytest.Monk
     assert seen == {"raw": Path("r"), **expected}
 
 
-def with_signature_of(plan: Callable[..., Plan], seen: dict[str, object]) -> Callable[..., Plan]:
+def with_signature_of(plan: Callable[..., PreparationPlan], seen: dict[str, object]) -> Callable[..., PreparationPlan]:
     @functools.wraps(plan)
-    def record(raw: Path, **options: object) -> Plan:
+    def record(raw: Path, **options: object) -> PreparationPlan:
         seen.update(raw=raw, **options)
         return toy_plan()
 

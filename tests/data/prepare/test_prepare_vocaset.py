@@ -12,7 +12,7 @@ import soundfile
 
 from facediff.cli.app import run
 from facediff.data.prepare import vocaset
-from facediff.data.prepare.runner import Report, prepare
+from facediff.data.prepare.runner import PreparationReport, prepare
 from facediff.data.prepare.vocaset import halved, read_samples
 from facediff.errors import FaceDiffError
 from facediff.utils.pickles import load_pickle
@@ -40,7 +40,7 @@ def raw(tmp_path: Path) -> Path:
     return write_raw_vocaset(tmp_path / "raw", clips={TRAIN: ["sentence01"]}, frames=25)
 
 
-def prepared(raw: Path, **options: object) -> tuple[Path, Report]:
+def prepared(raw: Path, **options: object) -> tuple[Path, PreparationReport]:
     out = raw.parent / "out"
     return out, prepare(vocaset.plan(raw, **options), out, workers=1)  # type: ignore[arg-type]
 
