@@ -8,12 +8,12 @@ x_{n−1} = a x_n + c x̂₀ + s z, can be followed through E: y_n = E x_n obeys
 Nothing in it has as many dimensions as x, and nothing is approximated. A step of ``ddpm`` on a mesh of 23 370 vertices
 takes 47 ms instead of 398 ms (tools/benchmarks/RESULTS.md).
 
-A sampler sees a :class:`Space`, made once for each run by a network's ``prepare_for_inference``.
+:class:`VertexSpace` and :class:`FoldedSpace` are the two spaces, for every method whose ends are linear. A sampler of
+the dual-path model sees a :class:`ConditionalDenoiser`, made once for each run by ``prepare_for_inference``.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
@@ -49,14 +49,97 @@ def unchanged(features: Tensor) -> Tensor:
     return features
 
 
-def each_step(step: Step, rows: Tensor) -> Int[Tensor, " batch"]:
+def step_of_rows(step: Step, rows: Tensor) -> Int[Tensor, " batch"]:
     """The step of each row."""
     return step if isinstance(step, Tensor) else torch.full((len(rows),), step, device=rows.device)
 
 
+# The two spaces.
+
+
+class VertexSpace:
+    """Motion itself.
+
+    Args:
+        embed: the network's first map, from noisy motion to its width.
+        unembed: the network's last map, from features to clean motion.
+        coordinates: numbers in a frame of motion, 3V.
+        rest: added to every prediction, such as the template of absolute vertices; nothing if None.
+    """
+
+    def __init__(
+        self,
+        embed: Callable[[Tensor], Tensor],
+        unembed: Callable[[Tensor], Tensor],
+        coordinates: int,
+        rest: Tensor | None = None,
+    ) -> None:
+        self._embed, self._unembed, self._rest = embed, unembed, rest
+        self.width = coordinates
+
+    def project(self, motion: ScaledMotion) -> State:
+        """Motion as a state."""
+        return motion
+
+    def noise(self, unit: State) -> State:
+        """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
+        return unit
+
+    def embed(self, state: State) -> Frames:
+        """Noisy motion as the network sees it."""
+        return self._embed(state)
+
+    def clean(self, features: Frames) -> State:
+        """Predicted clean motion as a state, from the network's last features."""
+        motion = self._unembed(features)
+        return motion if self._rest is None else motion + self._rest
+
+
+class FoldedSpace:
+    """y = E x, the noisy motion as the network sees it, without its bias; the same samples at the width's cost.
+
+    Args:
+        embed: the network's first map.
+        fold: the products of both maps.
+        rest: as :class:`VertexSpace` takes it, on the vertices.
+    """
+
+    def __init__(self, embed: nn.Linear, fold: Fold, rest: Tensor | None = None) -> None:
+        self._embed, self._fold = embed, fold
+        self.width = embed.out_features
+        self._offset = None if rest is None else fold.offset + self.project(rest)
+
+    def project(self, motion: ScaledMotion) -> State:
+        """E x: the bias e is no part of y, which would not obey the recursion with it."""
+        with torch.autocast(motion.device.type, enabled=False):
+            return nn.functional.linear(motion.to(self._embed.weight), self._embed.weight)
+
+    def noise(self, unit: State) -> State:
+        """Noise with the covariance E Eᵀ, independent over frames; zero where ``unit`` is."""
+        assert self._fold.root is not None, "folded without noise"  # noqa: S101 - a mistake of a model's author
+        with torch.autocast(unit.device.type, enabled=False):
+            return unit @ self._fold.root
+
+    def embed(self, state: State) -> Frames:
+        """E x + e."""
+        return state if self._embed.bias is None else state + self._embed.bias
+
+    def clean(self, features: Frames) -> State:
+        """E U h + E b."""
+        fold = self._fold
+        # In the weights' own precision: errors of the state add up over the steps.
+        with torch.autocast(features.device.type, enabled=False):
+            if self._offset is None:
+                return nn.functional.linear(features.to(fold.product), fold.product, fold.offset)
+            return nn.functional.linear(features.to(fold.product), fold.product) + self._offset
+
+
+# What a sampler sees of a network.
+
+
 @runtime_checkable
-class Network(Protocol):
-    """What a space needs of a denoising network.
+class DenoisingNetwork(Protocol):
+    """What a denoiser needs of a network.
 
     Attributes:
         coordinates: numbers in a frame of motion, 3V.
@@ -82,37 +165,43 @@ class Network(Protocol):
         ...
 
 
-class Space(ABC):
-    """A linear image of motion in which a sampler runs without knowing which; made for one run.
+class ConditionalDenoiser:
+    """A network under conditions, in a space in which a sampler runs without knowing which; made for one run.
 
     Args:
         network: predicts clean motion.
         conditions: what it is conditioned on, with everything else that is constant over the denoising steps. Under
             guidance, all clips with their conditions, then all clips with some of them hidden, and so on.
-        width: numbers in a frame of the image.
+        fold: the products of the network's ends, to run in their width; None to run on the vertices.
         blend: changes the features that the network gives in every step.
         shares: what each of these predictions contributes to the guided one; they add up to one.
     """
 
     def __init__(
         self,
-        network: Network,
+        network: DenoisingNetwork,
         conditions: object,
-        width: int,
+        fold: Fold | None = None,
         blend: Blend = unchanged,
         shares: Sequence[float] = (1.0,),
     ) -> None:
         self.network = network
         self.conditions = conditions
-        self.width = width
+        self.space: VertexSpace | FoldedSpace
+        if fold is None:
+            self.space = VertexSpace(network.embed, network.clean_motion, network.coordinates)
+        else:
+            self.space = FoldedSpace(network.embed, fold)
+        self.width = self.space.width
         self.blend = blend
         self.shares = shares
+        self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step, if folded
 
     def features(self, embedded: Frames, step: Step) -> Frames:
         """The network's last features of embedded noisy motion, guided, at a step counted from 0."""
         views = len(self.shares)
         rows = embedded if views == 1 else embedded.repeat(views, 1, 1)
-        steps = each_step(step, rows)
+        steps = step_of_rows(step, rows)
         features = self.network.core(rows, steps, self.conditions)
         if views == 1:
             return features
@@ -121,85 +210,26 @@ class Space(ABC):
         wide = features.to(torch.promote_types(features.dtype, torch.float32))
         return torch.stack([share * part for share, part in zip(self.shares, wide.chunk(views), strict=True)]).sum(0)
 
-    @abstractmethod
     def noise(self, unit: State) -> State:
         """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
-
-    @abstractmethod
-    def denoise(self, state: State, step: Step) -> State:
-        """The image of the predicted clean motion."""
-
-    @abstractmethod
-    def motion(self, sample: State, first: int = 0) -> WantedMotion:
-        """Scaled motion of the sampler's result, from a first frame on."""
-
-
-class VertexSpace(Space):
-    """Motion itself; needs nothing of the network or the sampler."""
-
-    def __init__(
-        self, network: Network, conditions: object, blend: Blend = unchanged, shares: Sequence[float] = (1.0,)
-    ) -> None:
-        super().__init__(network, conditions, network.coordinates, blend, shares)
-
-    def noise(self, unit: State) -> State:
-        """Unit noise as it is."""
-        return unit
+        return self.space.noise(unit)
 
     def denoise(self, state: State, step: Step) -> State:
-        """M̂⁰."""
-        return self.network.clean_motion(self.blend(self.features(self.network.embed(state), step)))
-
-    def motion(self, sample: State, first: int = 0) -> WantedMotion:
-        """The sample as it is."""
-        return sample[:, first:]
-
-
-class FoldedSpace(Space):
-    """y = E x, the noisy motion as the network sees it, without its bias; the same samples at the width's cost.
-
-    Args:
-        network: a network whose ``embed`` and ``unembed`` are linear.
-        conditions: as :class:`Space` takes them.
-        fold: the products of both maps.
-        blend: as :class:`Space` takes it.
-        shares: as :class:`Space` takes them.
-    """
-
-    def __init__(
-        self,
-        network: Network,
-        conditions: object,
-        fold: Fold,
-        blend: Blend = unchanged,
-        shares: Sequence[float] = (1.0,),
-    ) -> None:
-        super().__init__(network, conditions, len(fold.offset), blend, shares)
-        self.fold = fold
-        self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step
-
-    def noise(self, unit: State) -> State:
-        """Noise with the covariance E Eᵀ, independent over frames; zero where ``unit`` is."""
-        with torch.autocast(unit.device.type, enabled=False):
-            return unit @ self.fold.root
-
-    def denoise(self, state: State, step: Step) -> State:
-        """E M̂⁰ = E U h + E b."""
-        # The bias e of the first map is no part of y, which would not obey the recursion with it.
-        bias = self.network.embed.bias
-        features = self.blend(self.features(state if bias is None else state + bias, step))
-        # In the weights' own precision: errors of the state add up over the steps.
-        with torch.autocast(features.device.type, enabled=False):
-            prediction = nn.functional.linear(features.to(state.dtype), self.fold.product, self.fold.offset)
-        self._last = features, prediction
+        """The image of the predicted clean motion M̂⁰."""
+        features = self.blend(self.features(self.space.embed(state), step))
+        prediction = self.space.clean(features)
+        if isinstance(self.space, FoldedSpace):
+            self._last = features, prediction
         return prediction
 
     def motion(self, sample: State, first: int = 0) -> WantedMotion:
-        """U h + b, the only step over the vertices.
+        """Scaled motion of the sampler's result, from a first frame on; where folded, the only map to the vertices.
 
         Raises:
             FaceDiffError: if the sampler did not end at the last prediction.
         """
+        if not isinstance(self.space, FoldedSpace):
+            return sample[:, first:]
         # y alone does not say where the vertices are. But the last step of a linear sampler returns the last prediction
         # E M̂⁰, and M̂⁰ = U h + b of the features h that the network gave for it, which were kept.
         if self._last is None or not torch.allclose(sample, self._last[1], rtol=1e-3, atol=1e-4, equal_nan=True):
@@ -210,43 +240,38 @@ class FoldedSpace(Space):
         return self.network.clean_motion(self._last[0][:, first:])
 
 
-class PreconditionedSpace(Space):
+class PreconditionedDenoiser(ConditionalDenoiser):
     """Coordinates of motion with known variances; the network predicts what the noisy motion leaves open.
 
     Args:
         network: predicts that.
-        conditions: as :class:`Space` takes them.
+        conditions: as :class:`ConditionalDenoiser` takes them.
         preconditioning: the scales around the network.
         blend: changes the predictions of every step.
-        shares: as :class:`Space` takes them.
+        shares: as :class:`ConditionalDenoiser` takes them.
     """
 
     def __init__(
         self,
-        network: Network,
+        network: DenoisingNetwork,
         conditions: object,
         preconditioning: Preconditioning,
         blend: Blend = unchanged,
         shares: Sequence[float] = (1.0,),
     ) -> None:
-        super().__init__(network, conditions, network.coordinates, blend, shares)
+        super().__init__(network, conditions, None, blend, shares)
         self.preconditioning = preconditioning
-
-    def noise(self, unit: State) -> State:
-        """Unit noise as it is."""
-        return unit
 
     def denoise(self, state: State, step: Step) -> State:
         """M̂⁰."""
-        steps = each_step(step, state)
+        steps = step_of_rows(step, state)
         scaled = self.preconditioning.into[steps][:, None] * state
         features = self.features(self.network.embed(scaled), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
         return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps))
 
-    def motion(self, sample: State, first: int = 0) -> WantedMotion:
-        """The sample as it is."""
-        return sample[:, first:]
+
+# The products of the two maps.
 
 
 CHUNK = 8192
@@ -260,18 +285,21 @@ class Fold:
     Attributes:
         product: E U, from the last features to the folded prediction.
         offset: E b.
-        root: the symmetric square root S of E Eᵀ: S ξ with unit Gaussian ξ is distributed like E z.
+        root: the symmetric square root S of E Eᵀ: S ξ with unit Gaussian ξ is distributed like E z; None where noise
+            is drawn on the vertices.
     """
 
-    product: Float[Tensor, "dim dim"]
+    product: Float[Tensor, "dim features"]
     offset: Float[Tensor, " dim"]
-    root: Float[Tensor, "dim dim"]
+    root: Float[Tensor, "dim dim"] | None
 
 
 def fold(
     first: Float[Tensor, "dim coordinates"],
-    last: Float[Tensor, "coordinates dim"],
+    last: Float[Tensor, "coordinates features"],
     bias: Float[Tensor, " coordinates"] | None,
+    *,
+    noise: bool = True,
 ) -> Fold:
     """Multiply the two maps out, in float64; the result has the type and the device of ``first``.
 
@@ -279,52 +307,33 @@ def fold(
         first: E.
         last: U.
         bias: b; zero if None.
+        noise: whether the noise's covariance is needed.
     """
-    product, offset = fold_maps(first, last, bias)
-    return Fold(product, offset, fold_noise(first))
-
-
-def fold_maps(
-    first: Float[Tensor, "dim coordinates"],
-    last: Float[Tensor, "coordinates features"],
-    bias: Float[Tensor, " coordinates"] | None,
-) -> tuple[Float[Tensor, "dim features"], Float[Tensor, " dim"]]:
-    """E U and E b, in float64; the arguments are those of :func:`fold`."""
-    device = fold_device(first)
-    product = torch.zeros(first.shape[0], last.shape[1], dtype=torch.float64, device=device)
-    offset = product.new_zeros(len(first))
-    for part in fold_parts(first):
+    # Not every accelerator knows float64.
+    device = torch.device("cpu") if first.device.type == "mps" else first.device
+    dim, coordinates = first.shape
+    product = torch.zeros(dim, last.shape[1], dtype=torch.float64, device=device)
+    offset = product.new_zeros(dim)
+    covariance = product.new_zeros(dim, dim)
+    # In float64, since products over 70 000 coordinates lose digits in float32; by chunks, since both maps in float64
+    # would double the memory of the model.
+    for part in (slice(begin, begin + CHUNK) for begin in range(0, coordinates, CHUNK)):
         e = first[:, part].to(device, torch.float64)
         product.addmm_(e, last[part].to(device, torch.float64))
         if bias is not None:
             offset.addmv_(e, bias[part].to(device, torch.float64))
-    return product.to(first), offset.to(first)
+        if noise:
+            covariance.addmm_(e, e.T)
+    return Fold(product.to(first), offset.to(first), symmetric_root(covariance).to(first) if noise else None)
 
 
-def fold_noise(first: Float[Tensor, "dim coordinates"]) -> Float[Tensor, "dim dim"]:
-    """The symmetric square root of E Eᵀ, in float64."""
-    device = fold_device(first)
-    covariance = torch.zeros(len(first), len(first), dtype=torch.float64, device=device)
-    for part in fold_parts(first):
-        e = first[:, part].to(device, torch.float64)
-        covariance.addmm_(e, e.T)
-    # By eigenvectors, so that E may have any rank. The symmetric root is unique: it does not depend on the signs and
-    # the order of eigenvectors, which libraries choose as they like, so that equal seeds give comparable motion.
+def symmetric_root(covariance: Float[Tensor, "dim dim"]) -> Float[Tensor, "dim dim"]:
+    """The symmetric square root of a covariance of any rank."""
+    # The symmetric root is unique: it does not depend on the signs and the order of eigenvectors, which libraries
+    # choose as they like, so that equal seeds give comparable motion. A Cholesky factor would need full rank.
     values, vectors = torch.linalg.eigh(covariance)
     # A covariance has no negative eigenvalues; those that appear are rounding.
-    return ((vectors * values.clamp_min(0).sqrt()) @ vectors.T).to(first)
-
-
-def fold_parts(first: Tensor) -> list[slice]:
-    """The coordinates by chunks."""
-    # In float64, since products over 70 000 coordinates lose digits in float32; by chunks, since both maps in float64
-    # would double the memory of the model.
-    return [slice(begin, begin + CHUNK) for begin in range(0, first.shape[1], CHUNK)]
-
-
-def fold_device(first: Tensor) -> torch.device:
-    """Where float64 is known; not every accelerator knows it."""
-    return torch.device("cpu") if first.device.type == "mps" else first.device
+    return (vectors * values.clamp_min(0).sqrt()) @ vectors.T
 
 
 T = TypeVar("T")

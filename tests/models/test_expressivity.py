@@ -86,7 +86,7 @@ def test_mean_is_the_average_prediction_from_noise_and_its_negative(
         ends = [model.network(sign * start, last, model.conditions(batch)) for sign in (1, -1)]
     expected = (sum(ends) / 2 / model.scale).view_as(batch.motion)
     monkeypatch.setattr(VertexSpace, "noise", lambda space, unit: start)
-    monkeypatch.setattr(FoldedSpace, "noise", lambda space, unit: start @ space.network.embed.weight.T)
+    monkeypatch.setattr(FoldedSpace, "noise", lambda space, unit: start @ space._embed.weight.T)
     for space in ("vertices", "folded"):
         model.sampling_space = space
         found = model.generate(batch, expressivity=0.0)

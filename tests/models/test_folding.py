@@ -16,7 +16,7 @@ from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, folding
 from facediff.models.dual_path import network
-from facediff.models.folding import Fold, FoldedSpace, Space, VertexSpace, WeightCache, fold
+from facediff.models.folding import ConditionalDenoiser, Fold, FoldedSpace, VertexSpace, WeightCache, fold
 from tests.fakes.tiny import Tiny
 
 
@@ -144,22 +144,22 @@ def cast(batch: Batch, dtype: torch.dtype) -> Batch:
     return replace(batch, **{name: v.to(dtype) for name, v in tensors.items() if v.is_floating_point()})
 
 
-def run(model: DualPathDiffusion, space: Space, noise: Callable[[], Tensor]) -> Tensor:
-    """The sampler in a space, with its noise given."""
-    return space.motion(model.sampler.run(space.denoise, noise(), noise=lambda _: noise()))
+def run(model: DualPathDiffusion, denoiser: ConditionalDenoiser, noise: Callable[[], Tensor]) -> Tensor:
+    """The sampler with its noise given."""
+    return denoiser.motion(model.sampler.run(denoiser.denoise, noise(), noise=lambda _: noise()))
 
 
-def vertices(model: DualPathDiffusion, batch: Batch) -> Space:
+def vertices(model: DualPathDiffusion, batch: Batch) -> ConditionalDenoiser:
     """On vertices, with everything computed again in every step."""
-    return VertexSpace(model.network, model.conditions(batch))
+    return ConditionalDenoiser(model.network, model.conditions(batch))
 
 
-def choose(model: DualPathDiffusion, batch: Batch) -> Space:
-    """The space that the model samples in."""
-    made: list[Space] = []
+def choose(model: DualPathDiffusion, batch: Batch) -> ConditionalDenoiser:
+    """The denoiser that the model samples with."""
+    made: list[ConditionalDenoiser] = []
     prepare = model.network.prepare_for_inference
 
-    def watched(*given: Any, **named: Any) -> Space:  # noqa: ANN401
+    def watched(*given: Any, **named: Any) -> ConditionalDenoiser:  # noqa: ANN401
         made.append(prepare(*given, **named))
         return made[-1]
 
@@ -177,8 +177,8 @@ def test_folded_sampling_gives_the_same_motion_for_the_same_noise(
     model = ready(sampler=partial(registry.sampler.get(name), **options)).to(dtype)
     batch = cast(batch, dtype)
     network = model.network
-    space = choose(model, batch)
-    assert isinstance(space, FoldedSpace)
+    denoiser = choose(model, batch)
+    assert isinstance(denoiser.space, FoldedSpace)
     shape = (*batch.motion.shape[:2], network.coordinates)
 
     def draws(seed: int) -> Callable[[], Tensor]:
@@ -188,7 +188,7 @@ def test_folded_sampling_gives_the_same_motion_for_the_same_noise(
     drawn = draws(1)
     with torch.no_grad():
         plain = run(model, vertices(model, batch), draws(1))
-        folded = run(model, space, lambda: drawn() @ network.embed.weight.T)
+        folded = run(model, denoiser, lambda: drawn() @ network.embed.weight.T)
     assert plain[batch.mask].std() > 0.5
     torch.testing.assert_close(folded[batch.mask], plain[batch.mask], rtol=0, atol=tolerance)
     with torch.no_grad():
@@ -232,8 +232,8 @@ def test_folded_sampling_gives_the_same_mean_and_covariance_for_new_noise(ready:
 def test_sampling_space_is_folded_by_default(ready: Make, batch: Batch) -> None:
     folded, plain = ready(), ready(sampling_space="vertices")
     assert folded.hparams["sampling_space"] == "folded"
-    assert isinstance(choose(folded, batch), FoldedSpace)
-    assert isinstance(choose(plain, batch), VertexSpace)
+    assert isinstance(choose(folded, batch).space, FoldedSpace)
+    assert isinstance(choose(plain, batch).space, VertexSpace)
     assert plain.generate(batch).shape == folded.generate(batch).shape == batch.motion.shape
 
 
@@ -242,7 +242,7 @@ def test_sampling_space_is_vertices_without_linear_ends(ready: Make, batch: Batc
     for one in (model, same):
         torch.manual_seed(1)
         one.network.embed = nn.Sequential(nn.Linear(72, 16), nn.Tanh())
-    assert isinstance(choose(model, batch), VertexSpace)
+    assert isinstance(choose(model, batch).space, VertexSpace)
     assert torch.equal(model.generate(batch), same.generate(batch))
 
 
@@ -262,7 +262,7 @@ def test_sampling_space_is_vertices_for_a_sampler_that_is_not_linear(
 ) -> None:
     model = ready()
     monkeypatch.setattr(type(model.sampler), "linear", False)
-    assert isinstance(choose(model, batch), VertexSpace)
+    assert isinstance(choose(model, batch).space, VertexSpace)
     assert model.generate(batch).shape == batch.motion.shape
 
 

@@ -85,8 +85,8 @@ def test_guided_prediction_is_the_incremental_formula(ready: Ready, batch: Batch
         )
         expected = nothing + w_a * (speech - nothing) + w_i * (person - speech) + w_s * (everything - person)
         model.choose_guidance({"speech": w_a, "identity": w_i, "style": w_s})
-        made = model._space(model.conditions(batch, guided=True), lambda features: features)
-        assert type(made) is space
+        made = model.denoiser(model.conditions(batch, guided=True), lambda features: features)
+        assert type(made.space) is space
         state = noisy if space is VertexSpace else noisy @ model.network.embed.weight.T
         found = made.motion(made.denoise(state, step))
     assert (speech - nothing)[batch.mask].std() > 1e-3
@@ -105,7 +105,7 @@ def test_guidance_on_preconditioned_components_is_the_formula(ready: Ready, tiny
     with torch.no_grad():
         for scale in (0.0, 1.0, 1.6):
             model.choose_guidance({"style": scale})
-            made = model._space(model.conditions(batch, guided=True), lambda features: features)
+            made = model.denoiser(model.conditions(batch, guided=True), lambda features: features)
             found[scale] = made.denoise(noisy, 30)[batch.mask]
     assert (found[1.0] - found[0.0]).std() > 1e-3
     torch.testing.assert_close(found[1.6], found[0.0] + 1.6 * (found[1.0] - found[0.0]), rtol=0, atol=1e-4)

@@ -15,7 +15,7 @@ from facediff.data import collate
 from facediff.models import DualPathDiffusion
 from facediff.models.decoders import Decoder
 from facediff.models.dual_path.network import Conditions
-from facediff.models.folding import Space
+from facediff.models.folding import ConditionalDenoiser
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -70,8 +70,8 @@ def test_step_table_is_kept_until_the_weights_change(make_model: Make) -> None:
     given = Conditions(torch.randn(1, FRAMES, DIM), torch.randn(1, 3, DIM), torch.ones(1, FRAMES, dtype=torch.bool))
 
     def table(steps: int = 40) -> Tensor:
-        space: Space = network.prepare_for_inference(given, steps, folded=True)
-        found = space.conditions.step_table  # type: ignore[attr-defined]
+        denoiser: ConditionalDenoiser = network.prepare_for_inference(given, steps, folded=True)
+        found = denoiser.conditions.step_table  # type: ignore[attr-defined]
         assert isinstance(found, Tensor)
         return found
 

@@ -17,7 +17,7 @@ from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.decoders import StyleTransformer
 from facediff.models.dual_path.network import Conditions
-from facediff.models.folding import SamplingSpace, Space, fold
+from facediff.models.folding import ConditionalDenoiser, SamplingSpace, fold
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise
 from facediff.models.samplers import Sampler
@@ -132,25 +132,25 @@ class Bench:
         """Name and steps of the model's sampler."""
         return self.model.hparams["sampler"]["class_path"].rpartition(".")[2], self.model.sampler.steps
 
-    def space(self, name: SamplingSpace, conditions: Conditions) -> Space:
-        """A sampling space, with the model's own cache."""
+    def denoiser(self, name: SamplingSpace, conditions: Conditions) -> ConditionalDenoiser:
+        """The network in a sampling space, with the model's own cache."""
         steps = self.model.process.steps
         return self.model.network.prepare_for_inference(conditions, steps, folded=name == "folded")
 
     def stepper(self, name: SamplingSpace, sampler: Sampler, conditions: Conditions) -> Callable[[], None]:
         """A call that takes one step of the real loop: prediction, noise, update."""
-        space, batch = self.space(name, conditions), self.batch
+        denoiser, batch = self.denoiser(name, conditions), self.batch
         unit = ClipNoise(batch.names, batch.frame_lengths.tolist(), [0] * len(batch), self.model.device)
-        shape = (*batch.motion.shape[:2], space.width)
-        state = space.noise(unit(torch.empty(shape, device=self.model.device)))
+        shape = (*batch.motion.shape[:2], denoiser.width)
+        state = denoiser.noise(unit(torch.empty(shape, device=self.model.device)))
         places = iter(enumerate(sampler.timesteps))
         predictions: list[Tensor] = []
 
         def step() -> None:
             nonlocal state, predictions
             i, place = next(places)
-            predictions = [*predictions, space.denoise(state, place)][-sampler.memory :]
-            state = sampler.update(i, state, predictions, lambda like: space.noise(unit(like)))
+            predictions = [*predictions, denoiser.denoise(state, place)][-sampler.memory :]
+            state = sampler.update(i, state, predictions, lambda like: denoiser.noise(unit(like)))
 
         return step
 
@@ -167,7 +167,7 @@ class Bench:
         network, batch = self.model.network, self.batch
         audio_encoder, others = self.once_a_clip()
         conditions = self.conditions()
-        prepared = self.space("folded", conditions)
+        prepared = self.denoiser("folded", conditions)
         number = self.model.process.steps // 2
         step = torch.full((len(batch),), number, device=self.model.device)
         entered = torch.randn(*batch.motion.shape[:2], network.embed.out_features, device=self.model.device)
@@ -185,7 +185,7 @@ class Bench:
             audio_encoder=audio_encoder,
             conditions=others,
             fold=self.clock(lambda: fold(*maps)),
-            look=self.quickest(lambda: self.space("folded", conditions)),
+            look=self.quickest(lambda: self.denoiser("folded", conditions)),
             core=cores["kept"],
             core_unprepared=cores["anew"],
             leave=self.quickest(lambda: network.clean_motion(decoded)),

@@ -64,8 +64,8 @@ class StepGraph(nn.Module):
             kept.append(torch.lerp(before, now, share[..., None]))
             return kept[0]
 
-        space = self.model._space(Conditions(features, tokens, mask), blend)  # noqa: SLF001 - a part of the model
-        return space.denoise(state, step), kept[0]
+        denoiser = self.model.denoiser(Conditions(features, tokens, mask), blend)
+        return denoiser.denoise(state, step), kept[0]
 
 
 class MotionGraph(nn.Module):
@@ -128,8 +128,7 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
     root = None
     with torch.no_grad():
         if folded:  # else noise is used as it is, and the unit matrix of all coordinates would take gigabytes
-            space = model._space(_nothing(step.inputs), unchanged)  # noqa: SLF001 - a part of the model
-            root = space.noise(torch.eye(state)[None])[0]
+            root = model.denoiser(_nothing(step.inputs), unchanged).noise(torch.eye(state)[None])[0]
     decoded: Literal["sample", "kept"] = "kept" if folded else "sample"
     last = Graph(
         "motion",

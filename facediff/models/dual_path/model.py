@@ -24,8 +24,8 @@ from facediff.models.decoders import DecoderFactory, StyleTransformer
 from facediff.models.dual_path.network import Conditions, DualPathNetwork, Hidden, TokenForm
 from facediff.models.folding import (
     Blend,
+    ConditionalDenoiser,
     SamplingSpace,
-    Space,
     unchanged,
 )
 from facediff.models.fusions import BidirectionalCrossAttention, FusionFactory
@@ -165,8 +165,9 @@ class DualPathDiffusion(AnimationModel):
     ) -> None:
         super().__init__(**options)
         self.identity_dropout = identity_dropout
-        made = InventedSpeakers(self.n_vertices, invented_speakers, invented_gain) if invented_speakers else None
-        self.invented_speakers = made
+        self.invented_speakers = (
+            InventedSpeakers(self.n_vertices, invented_speakers, invented_gain) if invented_speakers else None
+        )
         self.style_dropout = style_dropout
         self.speech_dropout = speech_dropout
         self.expressivity: Expressivity = expressivity
@@ -334,8 +335,8 @@ class DualPathDiffusion(AnimationModel):
         """
         names = self.guidable
         scales = [1.0, *(self.guidance[name] for name in names), 0.0]
-        found = {tuple(names[given:]): scales[given] - scales[given + 1] for given in range(len(names) + 1)}
-        return {hidden: share for hidden, share in found.items() if share}
+        shares = {tuple(names[shown:]): scales[shown] - scales[shown + 1] for shown in range(len(names) + 1)}
+        return {hidden: share for hidden, share in shares.items() if share}
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Noise each clip to a random step (algorithm 1, lines 3 and 4), then take the four losses (eq. 15 to 19)."""
@@ -366,10 +367,10 @@ class DualPathDiffusion(AnimationModel):
             drawn = conditions.drawn(draws)
             motion, mask = motion.repeat_interleave(draws, 0), mask.repeat_interleave(draws, 0)
         if space.preconditioning is not None:
-            found = self._preconditioned_losses(drawn, motion, mask, step, noise, space.preconditioning)
+            losses = self._preconditioned_losses(drawn, motion, mask, step, noise, space.preconditioning)
         else:
-            found = self._vertex_losses(drawn, motion, mask, step, noise)
-        return self._with_style_losses(found, batch, conditions)
+            losses = self._vertex_losses(drawn, motion, mask, step, noise)
+        return self._with_style_losses(losses, batch, conditions)
 
     def _vertex_losses(
         self,
@@ -414,7 +415,7 @@ class DualPathDiffusion(AnimationModel):
         predicted = scales.clean(noisy, features, step)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
 
-    def _with_style_losses(self, found: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:
+    def _with_style_losses(self, losses: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:
         """The terms of the dynamic style, where they are asked for, and the sum with them."""
         weights, style = self.style_weights, conditions.dynamic
         assert style is not None  # noqa: S101 - for the type checker
@@ -424,10 +425,10 @@ class DualPathDiffusion(AnimationModel):
         if weights["style_contrast"]:
             own = self.encode_style(batch.motion, batch.mask)
             terms["style_contrast"] = style_contrast(torch.cat([style, own]), batch.identity_names * 2)
-        loss = found["loss"]
+        loss = losses["loss"]
         for name, term in terms.items():
             loss = loss + weights[name] * term
-        return {**found, **terms, "loss": loss}
+        return {**losses, **terms, "loss": loss}
 
     def conditions(self, batch: Batch, *, guided: bool = False) -> Conditions:
         """Everything that is computed once per clip; in training, conditions are hidden now and then.
@@ -445,8 +446,8 @@ class DualPathDiffusion(AnimationModel):
         views = self.views() if guided else {}
         if [*views] not in ([], [()]):
             hidden = Hidden(*(self._in_views(name, views, len(batch)) for name in CONDITIONS))
-            made = network.conditions(batch, identity, self.style_of(batch), hidden)
-            return replace(made, shares=tuple(views.values()))
+            conditions = network.conditions(batch, identity, self.style_of(batch), hidden)
+            return replace(conditions, shares=tuple(views.values()))
         if hidden.speech is None and hidden.style is None:
             return network.conditions(batch, identity, self.style_of(batch))
         return network.conditions(batch, identity, self.style_of(batch), hidden)
@@ -460,7 +461,7 @@ class DualPathDiffusion(AnimationModel):
         # Guidance starts from the motion without any of the conditions that can be hidden, which would hardly ever be
         # seen if each were drawn by itself.
         if (silent := drawn["speech"]) is not None:
-            drawn = {name: None if each is None else each | silent for name, each in drawn.items()}
+            drawn = {name: None if mask is None else mask | silent for name, mask in drawn.items()}
         return Hidden(**drawn)
 
     def _in_views(self, name: str, views: Mapping[tuple[str, ...], float], clips: int) -> Tensor:
@@ -542,13 +543,15 @@ class DualPathDiffusion(AnimationModel):
         if mean is not None and whole and expressivity == 0:
             return mean.expand(samples * len(mean), -1, -1, -1)
         conditions = conditions.repeated(samples)
-        space = self._space(conditions, blend)
+        denoiser = self.denoiser(conditions, blend)
 
         def noise(like: Tensor) -> Tensor:
-            return space.noise(unit(like))
+            return denoiser.noise(unit(like))
 
-        sample = self.sampler.run(space.denoise, noise(self._empty(space, conditions)), noise=noise, progress=progress)
-        motion = self._motion(space, sample, first)
+        sample = self.sampler.run(
+            denoiser.denoise, noise(self._empty(denoiser, conditions)), noise=noise, progress=progress
+        )
+        motion = self._motion(denoiser, sample, first)
         if mean is None:
             return motion
         share = expressivity.to(motion)[:, None] if isinstance(expressivity, Tensor) else expressivity
@@ -560,13 +563,15 @@ class DualPathDiffusion(AnimationModel):
         # all motions that the conditions allow. A network lets some of the noise through all the same, nearly linearly:
         # between noise and its negative that cancels (2 evaluations leave 1/20 of the variance of one). The noise is
         # the mean's own, so that a clip has one mean whatever the seed.
-        space = self._space(conditions, blend)
-        noise = space.noise(of_mean(self._empty(space, conditions)))
-        ends = [self._motion(space, space.denoise(start, self.process.steps - 1), first) for start in (noise, -noise)]
+        denoiser = self.denoiser(conditions, blend)
+        noise = denoiser.noise(of_mean(self._empty(denoiser, conditions)))
+        ends = [
+            self._motion(denoiser, denoiser.denoise(start, self.process.steps - 1), first) for start in (noise, -noise)
+        ]
         return (ends[0] + ends[1]) / 2
 
-    def _space(self, conditions: Conditions, blend: Blend) -> Space:
-        """Where to sample under some conditions."""
+    def denoiser(self, conditions: Conditions, blend: Blend) -> ConditionalDenoiser:
+        """The network under some conditions, in the space in which the sampler runs."""
         # A sampler that clips or thresholds acts on vertices, and no fold can follow it.
         folded = self.sampling_space == "folded" and self.sampler.linear
         preconditioning = self.motion_space.preconditioning
@@ -574,15 +579,17 @@ class DualPathDiffusion(AnimationModel):
             conditions, self.process.steps, folded=folded, blend=blend, preconditioning=preconditioning
         )
 
-    def _empty(self, space: Space, conditions: Conditions) -> Tensor:
-        """A state of the space with no values yet."""
+    def _empty(self, denoiser: ConditionalDenoiser, conditions: Conditions) -> Tensor:
+        """A state with no values yet."""
         rows, frames = conditions.mask.shape
-        shape = (rows // len(space.shares), frames, space.width)
+        shape = (rows // len(denoiser.shares), frames, denoiser.width)
         return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
 
-    def _motion(self, space: Space, sample: Tensor, first: int) -> Float[Tensor, "batch wanted vertices 3"]:
+    def _motion(
+        self, denoiser: ConditionalDenoiser, sample: Tensor, first: int
+    ) -> Float[Tensor, "batch wanted vertices 3"]:
         """Offsets from the template, from a first frame on."""
-        return self.motion_space.decode(space.motion(sample, first)) / self.scale
+        return self.motion_space.decode(denoiser.motion(sample, first)) / self.scale
 
 
 def mean_names(batch: Batch) -> list[str]:

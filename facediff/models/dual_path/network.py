@@ -18,11 +18,9 @@ from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.decoders import Decoder
 from facediff.models.folding import (
     Blend,
+    ConditionalDenoiser,
     Fold,
-    FoldedSpace,
-    PreconditionedSpace,
-    Space,
-    VertexSpace,
+    PreconditionedDenoiser,
     WeightCache,
     fold,
     unchanged,
@@ -163,7 +161,7 @@ class DualPathNetwork(nn.Module):
         cached = batch.cached_features or ()
         audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
         mask, encoded = frame_mask(batch.frame_lengths, audio.shape[1]), dynamic_style
-        times = max((len(each) for each in hidden if each is not None), default=len(batch)) // len(batch)
+        times = max((len(mask) for mask in hidden if mask is not None), default=len(batch)) // len(batch)
         if times > 1:
             audio, mask = audio.repeat(times, 1, 1), mask.repeat(times, 1)
             identity, dynamic_style = identity.repeat(times), dynamic_style.repeat(times, 1)
@@ -206,7 +204,9 @@ class DualPathNetwork(nn.Module):
             conditions: as they are, or prepared for inference.
         """
         # A component that prepares nothing need not know that others do.
-        fusion, decoder = ([] if made is None else [made] for made in (conditions.fusion, conditions.decoder))
+        fusion, decoder = (
+            [] if prepared is None else [prepared] for prepared in (conditions.fusion, conditions.decoder)
+        )
         fused = self.fusion(conditions.audio, motion, conditions.mask, *fusion)  # eq. 12
         table = conditions.step_table
         embedded = self.step_embedding(step) if table is None else table[step]
@@ -228,8 +228,8 @@ class DualPathNetwork(nn.Module):
         folded: bool,
         blend: Blend = unchanged,
         preconditioning: Preconditioning | None = None,
-    ) -> Space:
-        """Everything that is constant over the denoising steps of a clip or window, as the space a sampler runs in.
+    ) -> ConditionalDenoiser:
+        """Everything that is constant over the denoising steps of a clip or window, as what a sampler calls.
 
         It holds for the weights and the precision in which it was made, so it is made again for every run; what follows
         from the weights alone is kept until they change.
@@ -257,10 +257,8 @@ class DualPathNetwork(nn.Module):
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
         ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
         if preconditioning is not None:
-            return PreconditionedSpace(self, ready, preconditioning, blend, ready.shares)
-        if product is None:
-            return VertexSpace(self, ready, blend, ready.shares)
-        return FoldedSpace(self, ready, product, blend, ready.shares)
+            return PreconditionedDenoiser(self, ready, preconditioning, blend, ready.shares)
+        return ConditionalDenoiser(self, ready, product, blend, ready.shares)
 
 
 class StyleTokens(nn.Module):

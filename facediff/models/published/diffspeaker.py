@@ -21,7 +21,7 @@ from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
-from facediff.models.folding import WeightCache
+from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
@@ -37,12 +37,10 @@ from facediff.models.published.base import LongSpeech, SpeakerTable, masked_mean
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
-    FoldedSpace,
     NoiseSource,
-    SamplingSpace,
-    VertexSpace,
     conditions_of,
     features_graph,
+    space_of,
 )
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
@@ -231,9 +229,7 @@ class DiffSpeaker(DiffusionModel):
     def space(self) -> VertexSpace | FoldedSpace:
         """Where the reverse process runs."""
         rest = self.network.motion_out.bias.new_zeros(1, 1, 3 * self.n_vertices)
-        if self.sampling_space == "vertices":
-            return VertexSpace(self.network, rest)
-        return FoldedSpace(self.network, rest, fresh_noise=False)
+        return space_of(self.network, self.sampling_space, rest, fresh_noise=False)
 
     def graphs(self) -> Graphs:
         """Speech, one step of the reverse process, the last map with the smoothing."""
@@ -247,14 +243,14 @@ class DiffSpeaker(DiffusionModel):
         network, conditions = self.network, self.conditions(batch, frames)
         start = noise(batch.template.new_empty(len(batch), int(frames.max()), 3 * self.n_vertices))
         space = self.space()
-        state = space.of(start)
+        state = space.project(start)
         # Noisy motion is always U h + weight · b + left · start, of which h, a sum of features, has the network's
         # width; so the vertices are not needed before the end.
         features, weight, left = torch.zeros((), device=state.device), 0.0, 1.0
         steps = step_shares(self.signal, self.sampling_steps, self.scheduler)
         for number in progress(range(len(steps))) if progress is not None else range(len(steps)):
             step, of_clean, of_noisy = steps[number]
-            made = network(space.mapped(state), torch.full((len(batch),), step, device=state.device), conditions)
+            made = network(space.embed(state), torch.full((len(batch),), step, device=state.device), conditions)
             state = of_clean * space.clean(made) + of_noisy * state
             features, weight, left = (
                 of_clean * made + of_noisy * features,
@@ -417,7 +413,7 @@ class DiffSpeakerNetwork(nn.Module):
         nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
         nn.init.zeros_(self.motion_out.bias)
         self.dropout = nn.Dropout(dropout)
-        self.of_weights: WeightCache[tuple[Tensor, ...]] = WeightCache()
+        self.of_weights: WeightCache[Fold] = WeightCache()
 
     def conditions(
         self,
@@ -498,7 +494,7 @@ class SpeakerStep(nn.Module):
         """The prediction, and the features that it is made of."""
         model, network, space = self.model, self.model.network, self.model.space()
         conditions = network.conditions(features, model.weights_of(identity), None)
-        made = network(space.mapped(state[..., : space.width]), step, conditions)
+        made = network(space.embed(state[..., : space.width]), step, conditions)
         if model.sampling_space == "vertices":
             return space.clean(made), made
         ones = torch.ones_like(made[..., :1])
@@ -514,7 +510,7 @@ class SpeakerStart(nn.Module):
 
     def forward(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
         """Noise alone: of features and bias there is nothing yet."""
-        state = self.model.space().of(noise)
+        state = self.model.space().project(noise)
         ones = torch.ones_like(state[..., :1])
         return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
 

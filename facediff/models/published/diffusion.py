@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -17,13 +17,10 @@ from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.errors import FaceDiffError
-from facediff.models.folding import WeightCache, fold_maps, fold_noise
+from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache, fold
 from facediff.models.graphs import BATCH, FRAMES, Axes, Graph, Speech, Spoken, speech_graph
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.published.base import PublishedModel, zeros
-
-SamplingSpace = Literal["vertices", "folded"]
-"""Where the reverse process runs."""
 
 NoiseSource = Callable[[Tensor], Tensor]
 """New unit Gaussian noise like a tensor, zero on padding."""
@@ -90,7 +87,7 @@ def conditions_of(features: Tensor, model: PublishedModel) -> dict[str, Tensor]:
     return {"features": features, "identity": zeros(batch), "template": torch.zeros(batch, model.n_vertices, 3)}
 
 
-def features_graph(model: DiffusionModel, network: Maps, steps: int) -> Graph:
+def features_graph(model: DiffusionModel, network: LinearEnds, steps: int) -> Graph:
     """Speech to features in the network's width.
 
     Args:
@@ -132,92 +129,36 @@ class SeededNoise:
         return noise
 
 
-class Maps(Protocol):
+class LinearEnds(Protocol):
     """A network between two linear maps.
 
     Attributes:
         audio_map: from features of speech to the network's width.
         motion_in: E x + e, from noisy motion x (3V) to the network's width.
         motion_out: U h + b, from features h to clean motion.
-        of_weights: what was computed of both.
+        of_weights: the products of both.
     """
 
     audio_map: nn.Linear
     motion_in: nn.Linear
     motion_out: nn.Linear
-    of_weights: WeightCache[tuple[Tensor, ...]]
+    of_weights: WeightCache[Fold]
 
 
-class VertexSpace:
-    """The reverse process on the vertices.
-
-    Args:
-        network: the network.
-        rest: what is added to every prediction.
-    """
-
-    def __init__(self, network: Maps, rest: Tensor) -> None:
-        self.network, self.rest = network, rest
-        self.width = network.motion_in.in_features
-
-    def of(self, motion: Tensor) -> Tensor:
-        """Motion as a state."""
-        return motion
-
-    def mapped(self, state: Tensor) -> Tensor:
-        """The state after the network's first map."""
-        return self.network.motion_in(state)
-
-    def clean(self, made: Tensor) -> Tensor:
-        """Clean motion as a state."""
-        return self.network.motion_out(made) + self.rest
-
-    def noise(self, source: NoiseSource, like: Tensor) -> Tensor:
-        """Noise as a state."""
-        return source(like)
-
-
-class FoldedSpace:
-    """The reverse process in the width of the network's first map.
-
-    Noisy motion enters the network through that map alone, and the reverse process is linear in noisy motion, clean
-    motion and noise. So all of it may be mapped: clean motion by the product of the last and the first map, and unit
-    noise to noise whose covariance is that of the map, E Eᵀ.
+def space_of(
+    network: LinearEnds, space: SamplingSpace, rest: Tensor, *, fresh_noise: bool = True
+) -> VertexSpace | FoldedSpace:
+    """The space of the reverse process.
 
     Args:
         network: the network.
-        rest: what is added to every prediction.
-        fresh_noise: whether noise is drawn by :meth:`noise`, and not on the vertices.
+        space: ``vertices``, or ``folded`` into the width of the network's first map.
+        rest: added to every prediction of clean motion, on the vertices.
+        fresh_noise: whether noise is drawn in the space, and not on the vertices.
     """
-
-    def __init__(self, network: Maps, rest: Tensor, *, fresh_noise: bool = True) -> None:
-        first, last = network.motion_in, network.motion_out
-        self.network, self.width = network, first.out_features
-
-        def computed() -> tuple[Tensor, ...]:
-            maps = fold_maps(first.weight, last.weight, last.bias)
-            return (*maps, fold_noise(first.weight)) if fresh_noise else maps
-
-        weights = [first.weight, last.weight, last.bias]
-        self._product, offset, *self._root = network.of_weights.get(weights, fresh_noise, computed)
-        self._offset = offset + self.of(rest)
-
-    def of(self, motion: Tensor) -> Tensor:
-        """Motion as a state: the first map without its bias, which the reverse process must not repeat."""
-        with torch.autocast(motion.device.type, enabled=False):
-            return nn.functional.linear(motion.to(self.network.motion_in.weight), self.network.motion_in.weight)
-
-    def mapped(self, state: Tensor) -> Tensor:
-        """The state with the map's bias."""
-        return state + self.network.motion_in.bias
-
-    def clean(self, made: Tensor) -> Tensor:
-        """Clean motion as a state."""
-        # In the weights' own precision: errors of the state add up over the steps.
-        with torch.autocast(made.device.type, enabled=False):
-            return nn.functional.linear(made.to(self._product), self._product) + self._offset
-
-    def noise(self, source: NoiseSource, like: Tensor) -> Tensor:
-        """Noise as a state."""
-        with torch.autocast(like.device.type, enabled=False):
-            return source(like) @ self._root[0]
+    first, last = network.motion_in, network.motion_out
+    if space == "vertices":
+        return VertexSpace(first, last, first.in_features, rest)
+    weights = (first.weight, last.weight, last.bias)
+    products = network.of_weights.get(weights, fresh_noise, lambda: fold(*weights, noise=fresh_noise))
+    return FoldedSpace(first, products, rest)

@@ -20,7 +20,7 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
-from facediff.models.folding import WeightCache
+from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states
@@ -28,12 +28,10 @@ from facediff.models.published.base import SpeakerTable, masked_mean, whole_mode
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
-    FoldedSpace,
     NoiseSource,
-    SamplingSpace,
-    VertexSpace,
     conditions_of,
     features_graph,
+    space_of,
 )
 from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
 from facediff.models.samplers import cosine_betas
@@ -176,7 +174,7 @@ class FaceDiffuser(DiffusionModel):
 
     def space(self, rest: Float[Tensor, "batch 1 coordinates"]) -> VertexSpace | FoldedSpace:
         """Where the reverse process runs."""
-        return VertexSpace(self.network, rest) if self.sampling_space == "vertices" else FoldedSpace(self.network, rest)
+        return space_of(self.network, self.sampling_space, rest)
 
     def graphs(self) -> Graphs:
         """Speech, one step of the reverse process, the last map."""
@@ -190,7 +188,7 @@ class FaceDiffuser(DiffusionModel):
         style, space = network.style(self.identity_weights(batch)), self.space(rest)
         speech = network.audio_map(self.hear(batch, frames))
         last = self.steps - self.skip_steps - 1
-        state = space.noise(noise, speech.new_empty(len(batch), int(frames.max()), space.width))
+        state = space.noise(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
         if self.skip_steps:
             state = state * posterior.noise_share(last)
         made = speech
@@ -198,11 +196,11 @@ class FaceDiffuser(DiffusionModel):
             if self.encode_speech == "every_step" and step < last:
                 speech = network.audio_map(self.hear(batch, frames))
             steps = torch.full((len(batch),), step, device=state.device)
-            made = network(space.mapped(state), steps, speech, style)
+            made = network(space.embed(state), steps, speech, style)
             if step:
                 of_clean, of_noisy, of_noise = posterior.shares(step)
                 state = of_clean * space.clean(made) + of_noisy * state
-                state = state + of_noise * space.noise(noise, state)
+                state = state + of_noise * space.noise(noise(state))
         # At the last step nothing but the prediction of clean motion is left.
         motion = (network.motion_out(made) + rest - (batch.template * self.scale).flatten(1)[:, None]) / self.scale
         if self.noised == "offsets":
@@ -278,7 +276,7 @@ class FaceDiffuserNetwork(nn.Module):
         self.motion_out = nn.Linear(dim, 3 * n_vertices)
         nn.init.zeros_(self.motion_out.weight)
         nn.init.zeros_(self.motion_out.bias)
-        self.of_weights: WeightCache[tuple[Tensor, ...]] = WeightCache()
+        self.of_weights: WeightCache[Fold] = WeightCache()
 
     def forward(
         self,
@@ -319,7 +317,7 @@ class DiffuserStep(nn.Module):
         """Where vertices are noised with the face, the template is a part of what is predicted."""
         model, network = self.model, self.model.network
         space = model.space(model.rest(template))
-        made = network(space.mapped(state), step, features, network.style(model.weights_of(identity)))
+        made = network(space.embed(state), step, features, network.style(model.weights_of(identity)))
         return space.clean(made), made
 
 
@@ -334,7 +332,7 @@ class DiffuserStart(nn.Module):
     def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
         """Noised zeros."""
         space = self.model.space(torch.zeros(1, 1, 3 * self.model.n_vertices))
-        return space.noise(lambda like: like, noise) * self.share
+        return space.noise(noise) * self.share
 
 
 class LastMap(nn.Module):
@@ -376,7 +374,7 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     root = None
     if model.sampling_space == "folded":
         with torch.no_grad():
-            root = space.noise(lambda like: like, torch.eye(space.width))
+            root = space.noise(torch.eye(space.width))
     loop = SamplingLoop(
         state=space.width,
         drawn=space.width,
