@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable, Mapping
 
 MANY = 40
@@ -51,6 +52,66 @@ class FaceDiffError(Exception):
 
     def __init__(self, message: object = "") -> None:
         super().__init__(shortened(printable(message)))
+
+    @property
+    def on_command_line(self) -> str:
+        """The message with options as the command line calls them."""
+        return str(self)
+
+    def within(self, place: object) -> FaceDiffError:
+        """The same error with the place it comes from, such as a file and its line, in front of the message."""
+        return FaceDiffError(f"{place}: {self}")
+
+
+_OPTION_NAME = re.compile(r"\{([a-z]+(?:_[a-z]+)*)\}")
+
+
+class OptionError(FaceDiffError):
+    """The value of an option cannot be used. The option is carried as data, since it has two spellings.
+
+    In Python an option is called ``target_mesh``, which is how the message says it; on the command line it is
+    ``--target-mesh``, see :attr:`on_command_line`.
+
+    Args:
+        option: name of the option as in Python; empty if the message is about something else.
+        problem: what is wrong, what was expected, what to do. Other options stand in braces: "give {style} as well".
+        value: the wrong value, if it is to be shown.
+        place: where the option was read, if not from the user directly: stands in front of the message.
+
+    Example:
+        >>> error = OptionError("target_mesh", "no such file; omit {correspondence} too", "face.obj")
+        >>> print(error)
+        target_mesh face.obj: no such file; omit correspondence too
+        >>> print(error.on_command_line)
+        --target-mesh face.obj: no such file; omit --correspondence too
+    """
+
+    def __init__(self, option: str, problem: str, value: object = None, *, place: str = "") -> None:
+        self.option, self.problem, self.value, self.place = option, problem, value, place
+        super().__init__(self._sentence(str))
+
+    @property
+    def on_command_line(self) -> str:
+        """The message with options as the command line calls them."""
+        return shortened(printable(self._sentence(lambda name: f"--{name.replace('_', '-')}")))
+
+    def within(self, place: object) -> OptionError:
+        """The same error with the place it comes from in front of the message."""
+        return OptionError(self.option, self.problem, self.value, place=f"{place}: {self.place}")
+
+    def _sentence(self, spelled: Callable[[str], str]) -> str:
+        value = "" if self.value is None else f" {self.value}"
+        subject = f"{spelled(self.option)}{value}: " if self.option else ""
+        return self.place + subject + _OPTION_NAME.sub(lambda match: spelled(match[1]), self.problem)
+
+    def __reduce__(self) -> tuple[Callable[..., OptionError], tuple[str, str, str | None, str]]:
+        """Pickling, by which worker processes hand errors over."""
+        value = None if self.value is None else str(self.value)
+        return _option_error, (self.option, self.problem, value, self.place)
+
+
+def _option_error(option: str, problem: str, value: str | None, place: str) -> OptionError:
+    return OptionError(option, problem, value, place=place)
 
 
 class ArgumentError(FaceDiffError, ValueError):

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed, confirm_cost
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source, model_name
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule

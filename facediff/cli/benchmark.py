@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.cli.options import OutputFolder, Scheduler, Seed, Workers
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices
 from facediff.utils import ranges
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.benchmark import BenchmarkPlan, BenchmarkReport, Cell

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import Picture, SourceOptions, check_picture_path
-from facediff.cli.parsing import Option, changed, refuse_idle
+from facediff.animation.options import SourceOptions
+from facediff.cli.options import Picture, check_picture_path, check_source
+from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import Weights
@@ -63,7 +65,7 @@ def blendshapes(
         if animation is not None:
             raise FaceDiffError("--write-puppet-shapes: writes shapes and solves for none; omit the animation")
         asked = {"output": output, "shapes": shapes, "region": region, "csv_rate": csv_rate, "show": show}
-        others = {name: is_changed for name, is_changed in changed(source).items() if name != "identity"}
+        others = {name: True for name in source.changed() if name != "identity"}
         switches = {"carry": carry, "only_arkit": only_arkit, "plain": plain}
         refuse_idle(
             "has no effect with --write-puppet-shapes",
@@ -80,14 +82,14 @@ def blendshapes(
         if value is None:
             raise FaceDiffError(f"{option}: is missing; `facediff blendshapes speech.npz -o weights.csv --shapes DIR`")
     assert animation is not None and output is not None and shapes is not None  # noqa: S101, PT018 - for type checkers
-    source.check([animation])
+    check_source(source, [animation])
     if output.suffix.lower() != ".csv":
         raise FaceDiffError(f'--output {output}: unknown suffix "{output.suffix}"; expected a table .csv')
     check_picture_path(show)
 
     from facediff.editing.blendshapes import SolveOptions
     from facediff.export.writing import check_free
-    from facediff.pipelines.motion import solve_weights
+    from facediff.pipelines.motion import SourceReader, solve_weights
     from facediff.utils.files import check_writable
 
     check_writable(output.with_suffix(".json"))
@@ -102,7 +104,7 @@ def blendshapes(
         region=region,
         residual_limit=residual_limit,
     )
-    own = source.read(animation)
+    own = SourceReader(source).read(animation)
     if show is not None:
         _ = own.triangles  # refuses an animation without triangles before anything is written
     found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit)

@@ -6,9 +6,10 @@ import inspect
 import json as json_format
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.parsing import Option, plain_text
+from facediff.cli.parsing import plain_text
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.registry import Entry

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
-from facediff.cli.parsing import Option, OptionGroup, Parameter, Parameters, parameters_of, parse
+from facediff.cli.parsing import OptionGroup, Parameter, Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.data.prepare.runner import PreparationPlan, PreparationReport

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import OutputFolder
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule

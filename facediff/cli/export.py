@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from facediff.cli.options import (
-    Animations,
-    ControlOptions,
-    Output,
-    OutputOptions,
-    SourceOptions,
-    with_different_names,
-)
+from dataclasses import replace
+
+from facediff.animation.options import AnimationControls, ExportOptions, SourceOptions
+from facediff.cli.options import Animations, Output, check_output, check_source, with_different_names
 from facediff.cli.parsing import with_more_help
 from facediff.cli.process import tell
 
@@ -27,9 +23,9 @@ def export(
     *,
     output: Output,
     quiet: bool = False,
-    files: OutputOptions,
+    files: ExportOptions,
     source: SourceOptions,
-    controls: ControlOptions,
+    controls: AnimationControls,
 ) -> None:
     """Write animations as files of other programs. The suffix of OUT chooses the format.
 
@@ -41,9 +37,12 @@ def export(
         source: what completes a bare .npy.
         controls: what is changed in the animations.
     """
-    source.check(animations)
+    check_source(source, animations)
 
+    from facediff.animation import Animation
+    from facediff.editing.controls import check_controls
     from facediff.export import FORMATS, check_export, write_animations
+    from facediff.pipelines.motion import SourceReader
 
     footer = ""  # under a video: the corpus, and whether it is synthetic
     if source.checkpoint is not None and output.suffix == ".mp4":
@@ -51,15 +50,16 @@ def export(
 
         assets = read_assets(source.checkpoint)
         footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
-    files.check(output.suffix)
-    options = files.export(footer=footer, quiet=quiet)
+    check_output(files, output.suffix)
+    options = replace(files, footer=footer, quiet=quiet)
     check_export(output, options, len(animations))
-    animation_controls = controls.controls()
-    finished = [source.read(path) for path in animations]
-    if not animation_controls.is_off:
+    check_controls(controls)
+    read = SourceReader(source).read
+    finished: list[Animation] = [read(path) for path in animations]
+    if not controls.is_off:
         from facediff.editing.controlled import apply_controls
 
-        finished = [apply_controls(animation, animation_controls) for animation in finished]
+        finished = [apply_controls(animation, controls) for animation in finished]
     for written in write_animations(output, with_different_names(finished, animations), options):
         inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
         counted = f"{len(inside)} files, " if written.is_dir() else ""

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from facediff.cli.options import File, OutputFolder
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.option import Option
 
 
 def export_model(

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from facediff.cli.options import File, Folder, Output
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
+from facediff.utils.option import Option
 
 MOST_NAMED = 4
 """Tensors of one part of a model that are named one by one where they are not needed."""

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import Identity, Seed
-from facediff.cli.parsing import Option, refuse_idle
+from facediff.cli.parsing import refuse_idle
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.live.command import LiveOptions
@@ -120,9 +121,10 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
     """
     import numpy as np
 
+    from facediff.animation.options import AnimationOptions
     from facediff.live.model import LiveModel
     from facediff.models import load_model
-    from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, usable_device
+    from facediff.pipelines.animate import AnimationPipeline, facts_of, usable_device
     from facediff.pipelines.stream import LiveAnimation
     from facediff.speech.windows import LOW_LATENCY
     from facediff.utils.licences import licence_metadata
@@ -140,13 +142,14 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
         window=options.window,
         overlap=options.overlap,
         low_latency=options.low_latency,
+        seed=options.seed,
         device=device,
     )
-    pipeline = AnimationPipeline(chosen, seed=options.seed, model=model)
+    pipeline = AnimationPipeline(chosen, model=model)
     facts = facts_of(model.assets, pipeline.identity)
     corpus = model.assets.corpus
     return LiveModel(
-        start=lambda: LiveAnimation(pipeline, seed=options.seed),
+        start=lambda: LiveAnimation(pipeline),
         frame_rate=model.frame_rate,
         neutral=facts["template"],
         faces=np.zeros((0, 3), np.int32) if facts["faces"] is None else facts["faces"],

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.parsing import Option, changed
-from facediff.errors import FaceDiffError
+from facediff.animation.options import View as View
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
 from facediff.utils.files import valid_text
 from facediff.utils.hub import check_model_source
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.editing.controls import AnimationControls
-    from facediff.export import ExportOptions
-    from facediff.pipelines.motion import Source
+    from facediff.animation.options import ExportOptions, SourceOptions
 
 Output = Annotated[Path, Option(also="-o", metavar="OUT", writes="file")]
 OutputFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder")]
@@ -34,147 +33,27 @@ Identity = Annotated[str | None, Option(metavar="NAME")]
 FrameRate = Annotated[ranges.FrameRate | None, Option(metavar="F")]
 Seed = Annotated[ranges.Seed, Option(metavar="N")]
 Size = Annotated[ranges.Pixels, Option(metavar="PIXELS")]
-View = Literal["front", "three_quarter", "side"]
 Workers = Annotated[ranges.Workers | None, Option(metavar="N")]
 Scheduler = Annotated[str | None, Option(metavar="WHERE")]
 
 
-@dataclass(frozen=True)
-class SourceOptions:
-    """What a bare .npy does not say (an .npz of `facediff animate` says all of it).
-
-    Attributes:
-        mesh: neutral face with triangles: .ply, .obj, .glb …
-        checkpoint: what is still missing, from a checkpoint
-        identity: whose face in the checkpoint; by default the first one trained on
-        speech: the recording that the motion belongs to
-        frame_rate: frames a second
-        unit: unit of length: m, cm, mm, in, or a number of metres
-    """
-
-    mesh: File = None
-    checkpoint: Annotated[Path | None, Option(metavar="C", reads=True)] = None
-    identity: Identity = None
-    speech: Annotated[Path | None, Option(metavar="WAV", reads=True)] = None
-    frame_rate: FrameRate = None
-    unit: Annotated[str | None, Option(metavar="U")] = None
-
-    def check(self, animations: Sequence[Path]) -> None:
-        """Refuse, before anything is imported, files that do not exist."""
-        for path in animations:
-            if not path.is_file():
-                raise FaceDiffError(f"{path}: no such file; expected an animation, .npz or .npy")
-        if self.checkpoint is not None:
-            check_model_source(self.checkpoint, "--checkpoint")
-        for option, file in (("--mesh", self.mesh), ("--speech", self.speech)):
-            if file is not None and not file.is_file():
-                raise FaceDiffError(f"{option} {file}: no such file")
-        if self.identity is not None and self.checkpoint is None:
-            raise FaceDiffError("--identity: names a face of a checkpoint; give --checkpoint as well")
-
-    def source(self) -> Source:
-        """The same for reading."""
-        from facediff.pipelines.motion import Source
-
-        return Source(**vars(self))
-
-    def read(self, path: Path) -> Animation:
-        """The animation in a file, completed by the options; all of its frames are finite."""
-        self.check([path])
-        return self.source().read(path)
+def check_source(source: SourceOptions, animations: Sequence[Path]) -> None:
+    """Refuse, before anything is imported, files that do not exist."""
+    for path in animations:
+        if not path.is_file():
+            raise FaceDiffError(f"{path}: no such file; expected an animation, .npz or .npy")
+    if source.checkpoint is not None:
+        check_model_source(source.checkpoint, "--checkpoint")
+    for option, file in (("mesh", source.mesh), ("speech", source.speech)):
+        if file is not None and not Path(file).is_file():
+            raise OptionError(option, "no such file", file)
 
 
-@dataclass(frozen=True)
-class ControlOptions:
-    """Animation controls.
+def check_output(output: ExportOptions, suffix: str) -> None:
+    """Refuse options that a format does not use."""
+    from facediff.export import check_used
 
-    Blinks, gaze, sway and acting are procedural: made by rules, not learnt, and called so in the metadata.
-
-    Attributes:
-        expressiveness: scale the motion: 1.2, or by region, upper_face=1.5,lips=0.9,all=1.1 (all: every vertex that no
-            other name covers)
-        blinks: blinks a minute (17 if no number)
-        gaze: eyes that wander by so much at most (4 if no number)
-        sway: a head that sways by so much at most (2 if no number)
-        eyes: where lids and eyeballs are (.json or .npz, see docs/animation_controls.md); the built-in puppet needs
-            none
-        controls_seed: seed of blinks, gaze, sway and acting (default: --seed, or 0)
-        direction: keys over time of style, expressiveness, brows, head and others (.json, .csv, or an .npz that was
-            made with some; see docs/direction.md); for a batch also a folder with a file for each recording
-        acting: brows, head and lids that move with the speech: prosody, with options (prosody:strength=0.8,brows=3)
-    """
-
-    expressiveness: Annotated[str | None, Option(metavar="FACTORS")] = None
-    blinks: Annotated[ranges.BlinkRate | None, Option(metavar="RATE", bare=ranges.USUAL_BLINKS)] = None
-    gaze: Annotated[ranges.GazeAngle | None, Option(metavar="DEGREES", bare=ranges.USUAL_GAZE)] = None
-    sway: Annotated[ranges.SwayAngle | None, Option(metavar="DEGREES", bare=ranges.USUAL_SWAY)] = None
-    eyes: File = None
-    controls_seed: Annotated[ranges.Seed | None, Option(metavar="N")] = None
-    direction: Annotated[Path | None, Option(metavar="KEYS", reads=True)] = None
-    acting: Annotated[str | None, Option(metavar="ACTING")] = None
-
-    def controls(self) -> AnimationControls:
-        """The controls that the options ask for."""
-        from facediff.editing.controls import AnimationControls
-
-        return AnimationControls(
-            self.expressiveness,
-            self.blinks,
-            self.gaze,
-            self.sway,
-            self.eyes,
-            seed=self.controls_seed,
-            direction=self.direction,
-            acting=self.acting,
-        )
-
-
-@dataclass(frozen=True)
-class OutputOptions:
-    """Output.
-
-    Attributes:
-        output_unit: unit of length of the file: m, cm, mm, in, or a number of metres (default: the motion's own)
-        up: axis that points up in the file (default: y)
-        no_speech: omit the sound
-        shapes: for .csv and .glb: folder of meshes, .glb with targets, or "puppet" (built in)
-        key_tolerance: for weights: leave out keys that a straight line replaces to within so much
-        tolerance: for .glb: largest error in mm
-        view: for .mp4: camera
-        size: for .mp4: height and width in pixels
-    """
-
-    output_unit: Annotated[str | None, Option(metavar="U")] = None
-    up: Literal["y", "z"] | None = None
-    no_speech: bool = False
-    shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None
-    key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0
-    tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
-    view: View = "front"
-    size: Size = 512
-
-    def check(self, suffix: str) -> None:
-        """Refuse options that a format does not use."""
-        from facediff.export import check_used
-
-        check_used(suffix, [name for name, is_changed in changed(self).items() if is_changed])
-
-    def export(self, *, footer: str = "", quiet: bool = True) -> ExportOptions:
-        """The same for :func:`facediff.export.write_animations`."""
-        from facediff.export import ExportOptions
-
-        return ExportOptions(
-            unit=self.output_unit,
-            up=self.up,
-            speech=not self.no_speech,
-            view=self.view,
-            size=self.size,
-            shapes=self.shapes,
-            key_tolerance=self.key_tolerance,
-            tolerance_mm=self.tolerance,
-            footer=footer,
-            quiet=quiet,
-        )
+    check_used(suffix, output.changed())
 
 
 def with_different_names(animations: Sequence[Animation], paths: Sequence[Path]) -> list[Animation]:

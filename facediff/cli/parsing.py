@@ -26,6 +26,7 @@ from typing import Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.option import Option
 from facediff.utils.ranges import Range, extras_of, range_of, shown
 
 MISSING = inspect.Parameter.empty
@@ -33,31 +34,6 @@ LONGEST_NAME = 255  # Bytes of the name of a file on usual disks; a path may be 
 
 RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed"}
 """Options of version 0.1 that have another name now; the error names it."""
-
-
-@dataclass(frozen=True)
-class Option:
-    """What a type hint cannot say about an option; used as ``Annotated[float, Option(...)]``.
-
-    Which numbers an option takes is said by a :class:`~facediff.utils.ranges.Range`.
-
-    Attributes:
-        also: another flag, such as ``-o``.
-        metavar: the name or, for a pair, the names of the value in the help text.
-        many: for lists, whether one flag takes several values; else the flag is repeated.
-        bare: the value if the option is given without one; None if a value is needed.
-        reads: for paths, and texts that hold paths: whether the file or folder is read.
-        writes: for paths: what is written; with ``reads``, what exists is read instead.
-        dash: for paths: whether ``-`` stands for standard input or output.
-    """
-
-    also: str = ""
-    metavar: str | tuple[str, ...] = ""
-    many: bool = False
-    bare: Any = None
-    reads: bool = False
-    writes: Literal["", "file", "folder", "file or folder"] = ""
-    dash: bool = False
 
 
 @dataclass(frozen=True)
@@ -122,6 +98,8 @@ class Parameter:
     def value_type(self) -> Any:  # noqa: ANN401 - a type or a type hint
         """The type of a single value."""
         hint = without_none(self.hint)
+        if get_origin(hint) in (Union, types.UnionType):  # Python takes more; the command line, the first of them
+            return get_args(hint)[0]
         return get_args(hint)[0] if self.is_list or self.length else hint
 
     @property
@@ -215,6 +193,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | OptionG
         if dataclasses.is_dataclass(hint):
             made = typing.cast(type, hint)
             fields = [field for field in parameters_of(made).values() if isinstance(field, Parameter)]
+            fields = [field for field in fields if not field.option.hidden]
             found[name] = OptionGroup(made, *summary_of(made), fields)
             continue
         option = next((extra for extra in extras_of(annotated) if isinstance(extra, Option)), Option())

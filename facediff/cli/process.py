@@ -132,7 +132,7 @@ def report(error: BaseException) -> int:
     if isinstance(error, StandardOutputError):
         return error.status if error.status == READER_GONE else fail(str(error), error.status)
     if isinstance(error, FaceDiffError):
-        return fail(str(error))
+        return fail(error.on_command_line)
     if os.environ.get(TRACEBACK):
         raise error
     more = f"{TRACEBACK}=1 shows where"

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from facediff.cli.parsing import Option, refuse_idle
+from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import hub
+from facediff.utils.option import Option
 
 SCORES = "test_scores.csv"
 

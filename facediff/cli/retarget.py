@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import File, Map, Output, Picture, SourceOptions, check_picture_path
-from facediff.cli.parsing import Option, refuse_idle
+from facediff.animation.options import SourceOptions
+from facediff.cli.options import File, Map, Output, Picture, check_picture_path, check_source
+from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.files import check_writable
+from facediff.utils.option import Option
 from facediff.utils.server import LOOPBACK
 
 if TYPE_CHECKING:
@@ -65,7 +67,7 @@ def retarget(
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
     if add_to_mesh and (output.suffix != ".glb" or target_mesh.suffix.lower() != ".glb" or output == target_mesh):
         raise FaceDiffError(f"--add-to-mesh: expected two different .glb, not {target_mesh} and {output}; name them so")
-    source.check([animation])
+    check_source(source, [animation])
     for option, file in (("--target-mesh", target_mesh), ("--landmarks", landmarks)):
         if file is not None and not file.is_file():
             raise FaceDiffError(f"{option} {file}: no such file")
@@ -80,9 +82,10 @@ def retarget(
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.pictures import draw_correspondence
+    from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    own = source.read(animation)
+    own = SourceReader(source).read(animation)
     if pick:
         pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
         landmarks = picked
@@ -100,7 +103,7 @@ def retarget(
     if add_to_mesh:
         from facediff.export.glb_added import add_to_glb
 
-        add_to_glb(output, target_mesh, made, ExportOptions().tolerance_mm)
+        add_to_glb(output, target_mesh, made, ExportOptions().tolerance)
         written = [output]
     else:
         written = write_animations(output, [made], ExportOptions())

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.option import Option
 from facediff.utils.server import LOOPBACK, require_server
 
 

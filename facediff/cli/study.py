@@ -20,11 +20,12 @@ from facediff.cli.options import (
     confirm_cost,
     named_folders,
 )
-from facediff.cli.parsing import Option, refuse_idle
+from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler
+from facediff.utils.option import Option
 from facediff.utils.ranges import Range
 from facediff.utils.server import LOOPBACK
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 from facediff.cli.options import Checkpoint, Identity, Output
-from facediff.cli.parsing import Option
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils.hub import check_model_source
+from facediff.utils.option import Option
 
 
 def extract(

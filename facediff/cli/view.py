@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.options import Animations, File, Output, SourceOptions, with_different_names
-from facediff.cli.parsing import Option
+from facediff.animation.options import SourceOptions
+from facediff.cli.options import Animations, File, Output, check_source, with_different_names
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -46,7 +47,7 @@ def view(
     if output.suffix not in (".html", ".htm"):
         raise FaceDiffError(f'--output {output}: unknown suffix "{output.suffix}"; expected .html')
     paths = [*([] if truth is None else [truth]), *animations]
-    source.check(paths)
+    check_source(source, paths)
     if labels is not None and len(labels) != len(paths):
         raise FaceDiffError(
             f"--labels: {len(labels)} names for {len(paths)} panels; give one for each, the truth's first"
@@ -70,9 +71,10 @@ def view(
 
 def read_animations(paths: Sequence[Path], source: SourceOptions) -> list[Animation]:
     """The animations of all files; the first archive completes arrays of as many vertices."""
+    from facediff.pipelines.motion import SourceReader
     from facediff.utils.arrays import open_vertices
 
-    completing = source.source()
+    completing = SourceReader(source)
     whole = {path: completing.read(path) for path in paths if path.suffix == ".npz"}
     lender = next(iter(whole.values()), None)
     found: list[Animation] = []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,14 +17,15 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.editing import procedural
+from facediff.editing.controls import keys_of
 from facediff.editing.direction import METADATA, Direction, channel_of, curve
 from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
 from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, noted
 from facediff.errors import FaceDiffError
 
 if TYPE_CHECKING:
+    from facediff.animation.options import AnimationControls
     from facediff.editing.brows import Brows
-    from facediff.editing.controls import AnimationControls
 
 HEAD = ("head.pitch", "head.yaw", "head.roll")
 ACTED = ("brows", "lids", *HEAD)
@@ -83,7 +85,13 @@ class ControlledFace:
     ) -> None:
         self.controls, self.direction = controls, direction
         channels = {} if direction is None else direction.channels
-        factors = [*controls.factors, *(channel.partition(".")[2] or "all" for channel in self._keys("expressiveness"))]
+        self.factors: dict[str, float] = {}
+        if controls.expressiveness is not None:
+            from facediff.editing.expressiveness import read_factors
+
+            self.factors = read_factors(controls.expressiveness)
+        keyed = (channel.partition(".")[2] or "all" for channel in self._keys("expressiveness"))
+        factors = [*self.factors, *keyed]
         if factors:
             from facediff.editing.expressiveness import check_factors
 
@@ -110,7 +118,7 @@ class ControlledFace:
         asking = lids or balls
         if asking is None and not helped:
             return None
-        eyes = eyes_for(template, faces, controls.eyes)
+        eyes = eyes_for(template, faces, None if controls.eyes is None else Path(controls.eyes))
         if asking is None:
             return eyes
         if eyes is None:
@@ -159,7 +167,7 @@ class ControlledFace:
                 if channel_of(name).range is not None
             }
         )
-        factors: dict[str, Amount] = dict(controls.factors)
+        factors: dict[str, Amount] = dict(self.factors)
         factors |= {name.partition(".")[2] or "all": found[name] for name in self._keys("expressiveness")}
 
         def of_option(name: str, number: float | None) -> Amount | None:
@@ -203,7 +211,7 @@ class ControlledFace:
             raise FaceDiffError(
                 f"{animation.name}: its head sways already; apply the controls to the animation as it was before"
             )
-        seed = seed if self.controls.seed is None else self.controls.seed
+        seed = seed if self.controls.controls_seed is None else self.controls.controls_seed
         frames, rate, eyes = len(animation.vertices), animation.frame_rate, self.eyes
         amounts = self.amounts(frames, rate, start=start, acted=acted)
         # Expressiveness must not scale procedural motion, a blink must be able to shut eyes that gaze has opened, and
@@ -284,14 +292,16 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     """
     if controls.is_off:
         return animation
-    direction = controls.keys(animation.frame_rate)
+    direction = keys_of(controls.direction, animation.frame_rate)
     if direction is not None:
         direction.refuse_model_channels()
     acted = None
     if controls.acting is not None:
         from facediff.editing.acting import act, read_acting
 
-        acted = act(read_acting(controls.acting), animation, seed if controls.seed is None else controls.seed)
+        acted = act(
+            read_acting(controls.acting), animation, seed if controls.controls_seed is None else controls.controls_seed
+        )
     face = ControlledFace(
         controls,
         direction,

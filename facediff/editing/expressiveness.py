@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.options import Scales, scales_text
 from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
 from facediff.editing.procedural import EDITED, in_words, noted, room_for
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.utils.ranges import Range
 from facediff.utils.without_scipy import nearest_distances
 
@@ -21,34 +22,37 @@ FALL_OFF = 0.06
 HIGHEST = 4.0  # Motion more than this many times as large does not look like a face's any more
 
 
-def read_factors(words: str, option: str = "--expressiveness", highest: float = HIGHEST) -> dict[str, float]:
-    """Factors by region from the command line: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``.
+def read_factors(scales: Scales | None, option: str = "expressiveness", highest: float = HIGHEST) -> dict[str, float]:
+    """Factors by region: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``; empty for None.
 
     Args:
-        words: what was typed.
-        option: after which option, for errors.
+        scales: a number, a mapping, or text as the command line takes it.
+        option: the option's name, for errors.
         highest: the largest factor.
 
     Raises:
-        FaceDiffError: if the words are neither, a name comes twice, or a factor is not in 0 … ``highest``.
+        FaceDiffError: if the text is neither, a name comes twice, or a factor is not in 0 … ``highest``.
 
     Example:
         >>> read_factors("upper_face=1.5,all=1.1")
         {'upper_face': 1.5, 'all': 1.1}
     """
+    if scales is None:
+        return {}
     factors: dict[str, float] = {}
-    for word in words.split(","):
+    text = scales_text(scales)
+    for word in text.split(","):
         name, equals, number = word.rpartition("=")
         name = name.strip() if equals else ALL
         expected = f"a factor from 0 to {highest:g} (1.2), or factors by region (upper_face=1.5,lips=0.9)"
         if not name:
-            raise FaceDiffError(f"{option} {words}: expected {expected}")
+            raise OptionError(option, f"expected {expected}", text)
         try:
             factor = Range(0, highest).read(name, number.strip())
         except FaceDiffError as error:
-            raise FaceDiffError(f"{option} {words}: expected {expected}") from error
+            raise OptionError(option, f"expected {expected}", text) from error
         if name in factors:
-            raise FaceDiffError(f"{option} {words}: names {name} twice; give one factor for it")
+            raise OptionError(option, f"names {name} twice; give one factor for it", text)
         factors[name] = factor
     return factors
 

@@ -6,7 +6,8 @@ Example:
     'glTF 2.0 with morph targets, exact or under the names of --shapes: Blender, Unity, three.js, Unreal'
 """
 
-from facediff.export.format import ExportOptions, Format
+from facediff.animation.options import ExportOptions
+from facediff.export.format import Format
 from facediff.export.writing import FORMATS, check_export, check_used, write_animations
 
 __all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "check_used", "write_animations"]

@@ -10,7 +10,8 @@ import numpy as np
 
 from facediff.animation import Animation, write_archive
 from facediff.animation.files import MotionWriter
-from facediff.export.format import ExportOptions, Format, Space
+from facediff.animation.options import ExportOptions
+from facediff.export.format import Format, Space
 from facediff.registry import export_format
 
 
@@ -45,7 +46,7 @@ class Archive(Format):
         """Write everything that the animation has, in another unit where one is chosen."""
         (animation,) = animations
         space = Space.of(animation, options)
-        if options.unit is not None:
+        if options.output_unit is not None:
             vertices = np.stack(list(space.frames(animation)))
             head = animation.head
             animation = replace(
@@ -55,7 +56,7 @@ class Archive(Format):
                 unit=space.unit,
                 head=None if head is None else head * np.repeat([1.0, space.factor], 3),
             )
-        write_archive(path, animation if options.speech else replace(animation, speech=None))
+        write_archive(path, animation if not options.no_speech else replace(animation, speech=None))
 
 
 @export_format.register("csv")
@@ -81,7 +82,7 @@ class BlendshapeWeights(Format):
 
         (animation,) = animations
         assert options.shapes is not None  # noqa: S101 - checked by check_export
-        shapes = read_shapes(options.shapes, animation.template, animation.unit)
+        shapes = read_shapes(Path(options.shapes), animation.template, animation.unit)
         solve(animation, shapes, SolveOptions()).save(path, key_tolerance=options.key_tolerance)
 
     def companions(self, path: Path, animation: Animation) -> list[Path]:

@@ -14,51 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.options import ExportOptions, Up
 from facediff.errors import FaceDiffError
 from facediff.render.meshes import face_outward, vertex_normals
 from facediff.render.rasteriser import to_linear
-from facediff.utils import ranges
-
-Up = Literal["y", "z"]
 
 MARK = b"facediff"  # Stands near the start of every file that is written without having been named by the user
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """What a user chooses; a format uses the options that concern it.
-
-    Attributes:
-        unit: unit of length to convert to, as :func:`facediff.animation.metres_per_unit` takes it; None for the one
-            that the format prescribes (metres in glTF), else the animation's own.
-        up: the axis that points up in the file; None for the one that the format prescribes, else y, as in animations.
-        speech: whether the speech is written, into the file or next to it.
-        view: camera of a video: ``front``, ``three_quarter`` or ``side``.
-        size: height and width of a video's panels in pixels.
-        shapes: blendshapes that weights are solved for: a folder of meshes, a .glb with named targets, or ``puppet``
-            for those of the built-in face.
-        key_tolerance: keys of weights are left out where a straight line is no further from them than this.
-        tolerance_mm: largest distance between a compressed vertex and the original one, in millimetres.
-        footer: text below a video, such as "synthetic corpus".
-        quiet: whether progress bars are hidden.
-        speech_file: name of the .wav file that is written next to the animation; None if there is none. Set by
-            :func:`facediff.export.write_animations` for formats that refer to it.
-    """
-
-    unit: str | None = None
-    up: Up | None = None
-    speech: bool = True
-    view: str = "front"
-    size: ranges.Pixels = 512
-    shapes: Path | None = None
-    key_tolerance: ranges.KeyTolerance = 0.0
-    tolerance_mm: ranges.Millimetres = 0.05
-    footer: str = ""
-    quiet: bool = True
-    speech_file: str | None = None
-
-    def __post_init__(self) -> None:
-        ranges.check_fields(self)
 
 
 class Format(ABC):
@@ -103,7 +64,7 @@ class Format(ABC):
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
     uses: ClassVar[tuple[str, ...]] = ()
-    """Which of the options ``view``, ``size``, ``tolerance_mm``, ``shapes`` and ``key_tolerance`` the format uses; the
+    """Which of the options ``view``, ``size``, ``tolerance``, ``shapes`` and ``key_tolerance`` the format uses; the
     command line refuses others."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
@@ -141,7 +102,7 @@ class Space:
     @classmethod
     def of(cls, animation: Animation, options: ExportOptions, prescribed: str | None = None) -> Space:
         """The space that the user chose, else the format's prescribed unit, else the animation's, with y up."""
-        unit = options.unit or prescribed or animation.unit
+        unit = options.output_unit or prescribed or animation.unit
         metres = metres_per_unit(unit)
         return cls(unit, metres, options.up or "y", metres_per_unit(animation.unit) / metres)
 

@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError
-from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward
+from facediff.export.format import Format, Space, facts, linear_colours, normals_of, outward
 from facediff.registry import export_format
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Glb(Format):
     speech = "next to it"
     units = "m"
     up_axes = ("y",)
-    uses = ("tolerance_mm", "shapes", "key_tolerance")
+    uses = ("tolerance", "shapes", "key_tolerance")
     requires = ("pygltflib", "train")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
@@ -54,12 +55,12 @@ class Glb(Format):
         rest = space.place(animation.template)
         extras = facts(animation, space)
         if options.shapes is not None:
-            morphs, fit = named_shapes(animation, space, options.shapes, options.key_tolerance)
+            morphs, fit = named_shapes(animation, space, Path(options.shapes), options.key_tolerance)
             extras |= fit
         else:
             offsets = np.stack([frame - rest for frame in space.frames(animation)])
-            morphs = compress(offsets, options.tolerance_mm / 1000)
-            extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance_mm
+            morphs = compress(offsets, options.tolerance / 1000)
+            extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
         binary = Binary()

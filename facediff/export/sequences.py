@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.export.format import ExportOptions, Format, Space, facts, folder_of
+from facediff.animation.options import ExportOptions
+from facediff.export.format import Format, Space, facts, folder_of
 from facediff.registry import export_format
 from facediff.utils.plain_files import json_text
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from facediff.animation import Animation
+from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export.format import ExportOptions, Format, Space, facts, linear_colours, normals_of, outward
+from facediff.export.format import Format, Space, facts, linear_colours, normals_of, outward
 from facediff.registry import export_format
 
 

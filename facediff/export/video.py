@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError
-from facediff.export.format import ExportOptions, Format
+from facediff.export.format import Format
 from facediff.registry import export_format
 from facediff.utils.progress import track
 
@@ -46,7 +47,7 @@ class Mp4(Format):
             drawn_frames(animations, options), f"drawing {path.name}", total=longest, shown=not options.quiet
         )
         speaking = next((animation for animation in animations if animation.speech is not None), animations[0])
-        sound = speaking.sound() if options.speech else None
+        sound = speaking.sound() if not options.no_speech else None
         write_video(path, frames, speaking.frame_rate, sound, speaking.sample_rate)
 
 

@@ -9,19 +9,14 @@ from pathlib import Path
 
 from facediff import registry
 from facediff.animation import Animation, metres_per_unit
-from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.export.format import MARK, ExportOptions, Format, check_animation, folder_of, speech_wav
+from facediff.animation.options import ExportOptions
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
+from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
-OPTIONS = {
-    "view": "view",
-    "size": "size",
-    "tolerance": "tolerance_mm",
-    "shapes": "shapes",
-    "key_tolerance": "key_tolerance",
-}
-"""Options that some formats use, as the command line and as formats call them."""
+OPTIONS = ("view", "size", "tolerance", "shapes", "key_tolerance")
+"""Options that some formats use."""
 
 
 class _Formats(Mapping[str, Format]):
@@ -62,7 +57,7 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
             did not write would be replaced, or the disk is full.
 
     Example:
-        >>> write_animations(Path("hello.usdc"), [animation], ExportOptions(unit="cm", up="z"))  # doctest: +SKIP
+        >>> write_animations(Path("hello.usdc"), [animation], ExportOptions(output_unit="cm", up="z"))  # doctest: +SKIP
         [PosixPath('hello.usdc'), PosixPath('hello.wav')]
     """
     options = options or ExportOptions()
@@ -119,8 +114,8 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
     if n_animations < 1:
         raise FaceDiffError(f"{path}: there is no animation to write; give at least one")
     form = FORMATS[suffix]
-    if options.unit is not None:
-        metres = metres_per_unit(options.unit)
+    if options.output_unit is not None:
+        metres = metres_per_unit(options.output_unit)
         if form.units == "none":
             raise FaceDiffError(f"{path}: {suffix} holds no lengths; omit the unit")
         if form.units == "m" and metres != 1:
@@ -131,13 +126,14 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
         reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
         raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
     if form.needs_shapes and options.shapes is None:
-        raise FaceDiffError(
-            f"{path}: {suffix} needs blendshapes; give --shapes with a folder of meshes, a .glb with targets, or puppet"
+        raise OptionError(
+            "",
+            f"{path}: {suffix} needs blendshapes; give {{shapes}}: a folder of meshes, a .glb with targets, or puppet",
         )
     if options.shapes is not None and (form.needs_shapes or "shapes" in form.uses):
         from facediff.editing.shapes import check_shapes
 
-        check_shapes(options.shapes)
+        check_shapes(Path(options.shapes))
     if form.requires is not None and importlib.util.find_spec(form.requires[0]) is None:
         raise MissingExtraError(*form.requires, f"writing {suffix}")
     for target in _targets(path, form, n_animations):
@@ -159,16 +155,14 @@ def check_used(suffix: str, given: Collection[str]) -> None:
     if suffix not in FORMATS:
         return
     form = FORMATS[suffix]
-    for name, field in OPTIONS.items():
-        if name in given and field not in form.uses:
-            users = [other for other, each in FORMATS.items() if field in each.uses]
-            raise FaceDiffError(
-                f"--{name.replace('_', '-')}: has no effect on {suffix}, but on {', '.join(users)}; omit it"
-            )
+    for name in OPTIONS:
+        if name in given and name not in form.uses:
+            users = [other for other, other_form in FORMATS.items() if name in other_form.uses]
+            raise OptionError(name, f"has no effect on {suffix}, but on {', '.join(users)}; omit it")
     if "shapes" in given and "tolerance" in given:
-        raise FaceDiffError("--tolerance: has no effect with --shapes, which fixes the targets; omit one")
+        raise OptionError("tolerance", "has no effect with {shapes}, which fixes the targets; omit one")
     if "key_tolerance" in given and "shapes" not in given:
-        raise FaceDiffError("--key-tolerance: has no effect without --shapes, whose weights have keys; omit it")
+        raise OptionError("key_tolerance", "has no effect without {shapes}, whose weights have keys; omit it")
 
 
 def _targets(path: Path, form: Format, count: int) -> list[Path]:
@@ -180,7 +174,7 @@ def _targets(path: Path, form: Format, count: int) -> list[Path]:
 
 def _speech_file(path: Path, form: Format, animation: Animation, options: ExportOptions) -> str | None:
     """Name of the .wav file: ``hello.wav``, or ``hello_speech.wav`` where the former is the user's; None for none."""
-    if form.speech != "next to it" or not options.speech or animation.speech is None:
+    if form.speech != "next to it" or options.no_speech or animation.speech is None:
         return None
     usual = path.with_suffix(".wav")
     if form.is_folder or is_free(usual):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from facediff.editing.controls import AnimationControls
-from facediff.errors import FaceDiffError
-from facediff.export import ExportOptions, check_export
+from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
+from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
 from facediff.utils.files import scratch_folder, valid_text
 from facediff.utils.hub import model_name
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
     from facediff.models import AnimationModel, Style
-    from facediff.models.styles import StyleLike
     from facediff.pipelines.directing import DirectedStream
     from facediff.pipelines.rest import MouthAtRest
     from facediff.speech.phonemes import TimedPhoneme
@@ -42,155 +40,95 @@ STEP_SECONDS = 0.01  # What a denoising step of a second of speech takes on two 
 PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
 
 
-@dataclass(frozen=True)
-class AnimationOptions:
-    """How recordings are animated: the options of :func:`facediff.cli.animate.animate`, which explains them."""
+def check_options(options: AnimationOptions) -> None:
+    """Refuse options that contradict each other and files that are not there, before a model is loaded.
 
-    checkpoint: Path
-    identity: str | None = None
-    condition: str | None = None
-    style: str | None = None
-    style_template: str | None = None
-    samples: ranges.Samples = 1
-    sampler: str | None = None
-    steps: ranges.Steps | None = None
-    expressivity: str | None = None
-    guidance: str | None = None
-    device: str = "cpu"
-    commercial_only: bool = False
-    precision: Literal["32", "bf16"] = "32"
-    window: ranges.Window | None = None
-    overlap: ranges.Window | None = None
-    low_latency: bool = False
-    controls: AnimationControls = field(default_factory=AnimationControls)
-    voice_gate: str = "energy"
-    denoise: bool = False
-    alignment: Path | None = None
-    transcript: str | None = None
-    closure_budget: ranges.Millimetres | None = None
-    target_mesh: Path | None = None
-    correspondence: Path | None = None
-    export: ExportOptions = field(default_factory=ExportOptions)
-    quiet: bool = True
+    Raises:
+        FaceDiffError: naming the option.
+    """
+    expressivity_of(options)
+    read_scales(options.guidance)
+    gate_of(options)
+    check_controls(options)
+    if options.acting is not None:
+        from facediff.editing.acting import read_acting
 
-    def __post_init__(self) -> None:
-        ranges.check_fields(self)
-        if self.low_latency and (self.window is not None or self.overlap is not None):
-            raise FaceDiffError("--low-latency: chooses the windows; omit --window and --overlap")
-        _ = self.expressivity_factors, self.guidance_scales, self.gate
-        if self.controls.acting is not None:
-            from facediff.editing.acting import read_acting
+        read_acting(options.acting)
+    if (keys := keys_of(options.direction)) is not None:
+        for name in ("style", "condition", "expressivity", "guidance"):
+            if getattr(options, name) is not None:
+                keys.refuse_both(name)
+    if options.style_template is not None and options.style is None:
+        raise OptionError("style_template", "belongs to a motion; give {style} as well")
+    if options.target_mesh is not None and not Path(options.target_mesh).is_file():
+        raise OptionError("target_mesh", "no such file", options.target_mesh)
 
-            read_acting(self.controls.acting)
-        if (keys := self.controls.keys()) is not None:
-            for name in ("style", "condition", "expressivity", "guidance"):
-                if getattr(self, name) is not None:
-                    keys.refuse_both(name)
 
-    @property
-    def expressivity_factors(self) -> dict[str, float]:
-        """Expressivity by region; ``all`` stands for every vertex that no other name covers."""
-        if self.expressivity is None:
-            return {}
-        from facediff.editing.expressiveness import read_factors
+def expressivity_of(options: AnimationOptions) -> dict[str, float]:
+    """Expressivity by region; ``all`` stands for every vertex that no other name covers. Empty for the model's own."""
+    if options.expressivity is None:
+        return {}
+    from facediff.editing.expressiveness import read_factors
 
-        return read_factors(self.expressivity, "--expressivity", ranges.EXPRESSIVITY.most)
+    return read_factors(options.expressivity, "expressivity", ranges.EXPRESSIVITY.most)
 
-    @property
-    def gate(self) -> VoiceGate | None:
-        """What finds the pauses in which the mouth comes to rest; None if nothing does."""
-        from facediff.speech.voice_activity import read_gate
 
-        return read_gate(self.gate_text)
+def gate_text(options: AnimationOptions) -> str:
+    """The voice gate's name with its options."""
+    from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE
 
-    @property
-    def gate_text(self) -> str:
-        """The gate's name with its options."""
-        from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE
+    # The usual gate looks further ahead than windows of low latency do.
+    return QUICK_GATE if options.low_latency and options.voice_gate == USUAL_GATE else options.voice_gate
 
-        # The usual gate looks further ahead than windows of low latency do.
-        return QUICK_GATE if self.low_latency and self.voice_gate == USUAL_GATE else self.voice_gate
 
-    @property
-    def guidance_scales(self) -> dict[str, float]:
-        """Scales of guidance by condition."""
-        return {} if self.guidance is None else read_scales(self.guidance)
+def gate_of(options: AnimationOptions) -> VoiceGate | None:
+    """What finds the pauses in which the mouth comes to rest; None if nothing does."""
+    from facediff.speech.voice_activity import read_gate
 
-    def check(self, output: Path) -> None:
-        """Refuse what can be refused before a model is loaded."""
-        self.check_inputs()
-        check_export(output, self.export, self.samples)
-
-    def check_inputs(self, *, styled: bool = False) -> None:
-        """Refuse options that belong to others that are not given, and meshes that are not there.
-
-        Args:
-            styled: whether there is a style that is no words.
-        """
-        if self.alignment is not None and self.transcript is not None:
-            raise FaceDiffError("--alignment and --transcript both say when what is spoken; give one of them")
-        if self.closure_budget is not None and self.alignment is None and self.transcript is None:
-            raise FaceDiffError("--closure-budget: has no effect without --alignment or --transcript; give one of them")
-        if self.correspondence is not None and self.target_mesh is None:
-            raise FaceDiffError("--correspondence: belongs to a mesh; give --target-mesh as well")
-        if self.style_template is not None and self.style is None and not styled:
-            raise FaceDiffError("--style-template: belongs to a motion; give --style as well")
-        if self.target_mesh is not None and not self.target_mesh.is_file():
-            raise FaceDiffError(f"--target-mesh {self.target_mesh}: no such file")
+    return read_gate(gate_text(options))
 
 
 class AnimationPipeline:
     """Animates recordings with one model, one face and one style.
 
     Args:
-        options: the choices.
-        seed: the one that recordings will be animated with; refused if it decides nothing.
+        options: the choices. A seed that decides nothing is refused.
         model: a model that is loaded already, on its device; it keeps what the options choose. None to load the
             checkpoint.
-        style: a style that is no words; that of the options if None.
 
     Raises:
         FaceDiffError: if the checkpoint, the style or another option cannot be used.
 
     Example::
 
-        pipeline = AnimationPipeline(AnimationOptions(Path("demo/puppet.ckpt"), identity="F1"))
+        pipeline = AnimationPipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))
         pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), seed=0)
     """
 
-    def __init__(
-        self,
-        options: AnimationOptions,
-        *,
-        seed: int = 0,
-        model: AnimationModel | None = None,
-        style: StyleLike | None = None,
-    ) -> None:
+    def __init__(self, options: AnimationOptions, *, model: AnimationModel | None = None) -> None:
         from facediff.models import load_model
         from facediff.models.styles import style_from
 
         self.options = options
         if model is None:
             model = load_model(
-                options.checkpoint, usable_device(options.device), commercial_only=options.commercial_only
+                Path(options.checkpoint), usable_device(options.device), commercial_only=options.commercial_only
             )
         self.model = model
         if options.samples > 1 and not self.model.samples:
-            raise FaceDiffError(
-                f"--samples {options.samples}: {type(self.model).__name__} makes one animation, whatever the "
-                f"seed; omit the option"
-            )
-        controls = options.controls
-        if seed and not self.model.samples and (controls.seed is not None or not controls.is_procedural):
-            raise FaceDiffError(
-                f"--seed {seed}: {type(self.model).__name__} makes one animation, whatever the seed; omit the option"
-            )
+            raise OptionError("samples", f"{self._one_animation}; omit the option", options.samples)
+        if (
+            options.seed
+            and not self.model.samples
+            and (options.controls_seed is not None or not is_procedural(options))
+        ):
+            raise OptionError("seed", f"{self._one_animation}; omit the option", options.seed)
         if options.low_latency:
             self.model.choose_low_latency()
         if options.sampler is not None or options.steps is not None:
             self.model.choose_sampler(options.sampler, options.steps)
         if options.guidance is not None:
-            self.model.choose_guidance(options.guidance_scales)
+            self.model.choose_guidance(read_scales(options.guidance))
         self.model.windows = self.model.windows.chosen(options.window, options.overlap)
         self.model.windows.in_frames(self.model.frame_rate)
         self.identity = options.identity or self.model.identities[0]
@@ -199,7 +137,7 @@ class AnimationPipeline:
         name = f"the checkpoint's corpus {self.model.assets.corpus}"
         if options.expressivity is not None:
             self._choose_expressivity(facts["template"], facts["regions"], name)
-        gate = options.gate
+        gate = gate_of(options)
         self.rest: MouthAtRest | None = None
         if gate is not None:
             from facediff.pipelines.rest import MouthAtRest
@@ -208,15 +146,18 @@ class AnimationPipeline:
         self._correspondence: Correspondence | None = None
         self._phonemes: list[TimedPhoneme] | None = None  # of the recording, once they are known
         self.style: Reference | Style | None = None
-        wanted = style if style is not None else options.style or None
-        if wanted is not None:
-            self.style = style_from(wanted, self.identity, self.model, template=options.style_template)
+        if options.style is not None and not (isinstance(options.style, str) and not options.style):
+            self.style = style_from(options.style, self.identity, self.model, template=options.style_template)
         self.acting: Acting | None = None
-        if controls.acting is not None:
+        if options.acting is not None:
             from facediff.editing.acting import read_acting
 
-            self.acting = read_acting(controls.acting)
-        self.direct(controls.keys(self.model.frame_rate))
+            self.acting = read_acting(options.acting)
+        self.direct(keys_of(options.direction, self.model.frame_rate))
+
+    @property
+    def _one_animation(self) -> str:
+        return f"{type(self.model).__name__} makes one animation, whatever the seed"
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on.
@@ -226,7 +167,7 @@ class AnimationPipeline:
         """
         from facediff.pipelines.directing import plan_runs
 
-        options, controls = self.options, self.options.controls
+        options = self.options
         if direction is not None and self.style is not None:
             direction.refuse_both("style")
         self.direction = direction
@@ -235,13 +176,13 @@ class AnimationPipeline:
         )
         finished = None if direction is None else direction.without_model_channels()
         self.face: ControlledFace | None = None
-        if finished is not None or not controls.without_keys.is_off:
+        if finished is not None or not options.without_keys.is_off:
             from facediff.editing.controlled import ControlledFace
 
             facts = facts_of(self.model.assets, self.identity)
             name = f"the checkpoint's corpus {self.model.assets.corpus}"
             self.face = ControlledFace(
-                controls, finished, facts["template"], facts["faces"], facts["regions"], facts["unit"], name
+                options.controls, finished, facts["template"], facts["faces"], facts["regions"], facts["unit"], name
             )
 
     def stream(self, seeds: Sequence[int]) -> DirectedStream:
@@ -256,11 +197,12 @@ class AnimationPipeline:
         """Take over the expressivity of a face (V, 3) with regions, which errors call ``name``."""
         from facediff.editing.expressiveness import ALL, region_factors
 
-        factors = self.options.expressivity_factors
+        factors = expressivity_of(self.options)
         if not self.model.samples and {*factors.values()} != {1.0}:
-            raise FaceDiffError(
-                f"--expressivity {self.options.expressivity}: {type(self.model).__name__} makes one animation and no "
-                f"samples around a mean; omit the option"
+            raise OptionError(
+                "expressivity",
+                f"{type(self.model).__name__} makes one animation and no samples around a mean; omit the option",
+                self.options.expressivity,
             )
         if {*factors} == {ALL}:
             self.model.choose_expressivity(factors[ALL])
@@ -271,7 +213,7 @@ class AnimationPipeline:
         of_vertices = region_factors(template, regions, factors, name)
         self.model.choose_expressivity(torch.from_numpy(of_vertices).float())
 
-    def cost(self, speech: npt.NDArray[np.float32], output: Path) -> tuple[float, float]:
+    def cost(self, speech: npt.NDArray[np.float32], output: Path, size: int) -> tuple[float, float]:
         """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech (S,)."""
         from facediff.speech.audio import SAMPLE_RATE
 
@@ -280,11 +222,11 @@ class AnimationPipeline:
         steps = getattr(getattr(self.model, "sampler", None), "steps", 1)
         seconds = STEP_SECONDS * steps * count * heard * len(self.runs)
         if output.suffix == ".mp4":
-            seconds += PIXEL_SECONDS * frames * self.options.export.size**2
+            seconds += PIXEL_SECONDS * frames * size**2
         return seconds, 12 * frames * len(self.model.assets.template(self.identity))
 
     def write(
-        self, speech: npt.NDArray[np.float32], name: str, output: Path, *, seed: int
+        self, speech: npt.NDArray[np.float32], name: str, output: Path, export: ExportOptions, *, seed: int
     ) -> tuple[list[Path], Animation]:
         """Animate speech and write the animations.
 
@@ -292,6 +234,7 @@ class AnimationPipeline:
             speech: (S,) at 16 kHz.
             name: the animations' name.
             output: the file; its suffix names the format.
+            export: how it is written.
             seed: seed of the first sample.
 
         Returns:
@@ -304,7 +247,7 @@ class AnimationPipeline:
 
         with self.samples(speech, name, output, seed=seed) as samples:
             finished = [self.finished(animation, seed + i) for i, animation in enumerate(samples)]
-            return write_animations(output, finished, self.options.export), finished[0]
+            return write_animations(output, finished, export), finished[0]
 
     @contextmanager
     def samples(
@@ -345,9 +288,10 @@ class AnimationPipeline:
         animation = self.closed(animation)
         if self.face is not None:
             animation = self.face.apply(animation, seed=seed, acted=self._acted(animation, seed))
-        target = self.options.target_mesh
-        if target is None:
+        if self.options.target_mesh is None:
             return animation
+        target = Path(self.options.target_mesh)
+        correspondence = None if self.options.correspondence is None else Path(self.options.correspondence)
         from facediff.editing.fit_check import check_fit, refuse_poor
         from facediff.editing.retargeting import carry, retarget
         from facediff.mesh import read_mesh
@@ -355,11 +299,11 @@ class AnimationPipeline:
         if self._correspondence is not None:
             return carry(animation, self._correspondence, read_mesh(target))
         # All samples have one face, so that one correspondence serves all.
-        known = self.options.correspondence is not None and self.options.correspondence.exists()
+        known = correspondence is not None and correspondence.exists()
         made, self._correspondence = retarget(
             animation,
             target,
-            self.options.correspondence,
+            correspondence,
             judge=None if known else lambda made, found: refuse_poor(target, check_fit(animation, made, found)),
         )
         return made
@@ -377,8 +321,10 @@ class AnimationPipeline:
         """What acts to speech while it arrives; None without acting."""
         if self.acting is None:
             return None
-        seed = seed if self.options.controls.seed is None else self.options.controls.seed
-        return self.acting.performer(self.model.frame_rate, seed)
+        return self.acting.performer(self.model.frame_rate, self._acting_seed(seed))
+
+    def _acting_seed(self, seed: int) -> int:
+        return seed if self.options.controls_seed is None else self.options.controls_seed
 
     def animation_of(self, vertices: npt.NDArray[np.float32]) -> Animation:
         """Frames (m, V, 3) of the animated face, with nothing else that is known of them."""
@@ -392,7 +338,7 @@ class AnimationPipeline:
             return None
         from facediff.editing.acting import act
 
-        return act(self.acting, animation, seed if self.options.controls.seed is None else self.options.controls.seed)
+        return act(self.acting, animation, self._acting_seed(seed))
 
     def closed(self, animation: Animation) -> Animation:
         """A sample whose lips touch where its phonemes say so, if their times are given."""
@@ -402,7 +348,7 @@ class AnimationPipeline:
 
         if self._phonemes is None:
             if alignment is not None:
-                self._phonemes = read_alignment(alignment)
+                self._phonemes = read_alignment(Path(alignment))
             elif transcript is not None and speech is not None:
                 from facediff.editing.transcripts import align_transcript
 
@@ -501,56 +447,61 @@ class AnimationPipeline:
         if sampler is not None:
             metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
         if self.rest is not None:
-            metadata["voice gate"] = self.options.gate_text
+            metadata["voice gate"] = gate_text(self.options)
         if self.options.denoise:
             metadata["denoised"] = "yes"
         if self.direction is not None:
             metadata["direction"] = self.direction.text()
         for option in ("expressivity", "guidance"):
             if (chosen := getattr(self.options, option)) is not None:
-                metadata[option] = chosen
+                metadata[option] = scales_text(chosen)
         facts = facts_of(assets, self.identity)
         return Animation(name=name, vertices=motion, speech=speech, metadata=metadata, **facts)
 
 
-def read_scales(words: str) -> dict[str, float]:
-    """Scales of guidance from the command line.
+def read_scales(guidance: Scales | None) -> dict[str, float]:
+    """Scales of guidance by condition; empty for None.
 
     Raises:
-        FaceDiffError: if the words are none, a condition comes twice, or a scale is out of range.
+        FaceDiffError: if the text holds none, a condition comes twice, or a scale is out of range.
 
     Example:
         >>> read_scales("style=1.5,speech=1.2")
         {'style': 1.5, 'speech': 1.2}
     """
     scales: dict[str, float] = {}
-    for word in words.split(","):
+    if guidance is None:
+        return scales
+    text = scales_text(guidance)
+    for word in text.split(","):
         name, equals, number = word.partition("=")
         if not equals or not name.strip() or name.strip() in scales:
-            raise FaceDiffError(
-                f"--guidance {ranges.shown(words)}: expected each condition once with its scale, such as "
-                f"style=1.5,speech=1.2"
+            raise OptionError(
+                "guidance",
+                "expected each condition once with its scale, such as style=1.5,speech=1.2",
+                ranges.shown(text),
             )
         scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"--guidance {name.strip()}", number.strip())
     return scales
 
 
-def direction_for(direction: Path | Direction, recording: Path, *, streamed: bool = False) -> Path | Direction:
+def direction_for(direction: DirectionLike, recording: Path, *, streamed: bool = False) -> DirectionLike:
     """The keys over time of one recording, where a folder has a file for each.
 
     Raises:
         FaceDiffError: if the folder has none for this recording.
     """
-    if not isinstance(direction, Path) or not direction.is_dir():
+    folder = keys_file(direction)
+    if folder is None or not folder.is_dir():
         return direction
     from facediff.editing.direction import direction_file
 
-    found = None if streamed else direction_file(direction, recording)
-    if found is None:
-        raise FaceDiffError(
-            f"--direction {direction}: has no {recording.stem}.json or {recording.stem}.csv; give the file's name"
+    file = None if streamed else direction_file(folder, recording)
+    if file is None:
+        raise OptionError(
+            "direction", f"has no {recording.stem}.json or {recording.stem}.csv; give the file's name", folder
         )
-    return found
+    return file
 
 
 def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
@@ -622,5 +573,5 @@ def usable_device(name: str) -> str:
         float(torch.ones(1, device=torch.device(name)).sum())
     except Exception as error:  # each backend raises its own, down to NotImplementedError and ImportError
         reason = next(iter(str(error).splitlines()), "")[:200]
-        raise FaceDiffError(f"--device {name}: not usable on this machine ({reason}); try --device cpu") from error
+        raise OptionError("device", f"not usable on this machine ({reason}); try {{device}} cpu", name) from error
     return name

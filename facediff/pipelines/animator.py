@@ -8,13 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Unpack, cast, overload
 
+from facediff.animation.options import (
+    AnimateKeywords,
+    AnimationOptions,
+    RecordingKeywords,
+    StreamKeywords,
+    with_options,
+)
 from facediff.errors import FaceDiffError
-from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, check_speech, read_recording, usable_device
-from facediff.pipelines.motion import Animation, Samples, _given, controls_of
-from facediff.pipelines.words import Scales, in_python_words, words_of
-from facediff.utils import SAMPLE_RATE, ranges
+from facediff.pipelines.animate import AnimationPipeline, check_options, check_speech, read_recording, usable_device
+from facediff.pipelines.motion import Animation, Samples
+from facediff.pipelines.words import in_python_words
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.hub import EXPECTED, check_model_source
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_number
@@ -26,9 +33,6 @@ if TYPE_CHECKING:
 
     from facediff.models import AnimationModel
     from facediff.models.styles import StyleLike
-    from facediff.pipelines.motion import DirectionLike
-
-Precision = Literal["32", "bf16"]
 
 FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0)}
 """What whole numbers are divided by to get a full scale of 1, and where they have silence; as .wav files hold them."""
@@ -186,10 +190,10 @@ class Animator:
         speech: Speech,
         rate: float | None = None,
         *,
-        identity: str | None = None,
-        style: StyleLike | None = None,
         samples: Literal[1] = 1,
-        **options: Any,  # noqa: ANN401 - all that follow below, with their types
+        name: str | None = None,
+        progress: bool = False,
+        **options: Unpack[RecordingKeywords],
     ) -> Animation: ...
 
     @overload
@@ -198,49 +202,22 @@ class Animator:
         speech: Speech,
         rate: float | None = None,
         *,
-        identity: str | None = None,
-        style: StyleLike | None = None,
         samples: int,
-        **options: Any,  # noqa: ANN401 - all that follow below, with their types
+        name: str | None = None,
+        progress: bool = False,
+        **options: Unpack[RecordingKeywords],
     ) -> Animation | Samples: ...
 
-    @in_python_words  # type: ignore[misc]  # the overloads leave out the types of most options
+    @in_python_words
+    @with_options(AnimationOptions, AnimateKeywords)
     def animate(
         self,
         speech: Speech,
         rate: float | None = None,
         *,
-        identity: str | None = None,
-        condition: str | None = None,
-        style: StyleLike | None = None,
-        style_template: str | Path | None = None,
-        samples: int = 1,
-        sampler: str | None = None,
-        steps: int | None = None,
-        expressivity: Scales | None = None,
-        guidance: Scales | None = None,
-        seed: int = 0,
-        precision: Precision = "32",
-        window: float | None = None,
-        overlap: float | None = None,
-        max_seconds: float | None = None,
-        voice_gate: str = "energy",
-        denoise: bool = False,
-        alignment: str | Path | None = None,
-        transcript: str | None = None,
-        closure_budget: float | None = None,
-        expressiveness: Scales | None = None,
-        blinks: float | bool | None = None,
-        gaze: float | bool | None = None,
-        sway: float | bool | None = None,
-        eyes: str | Path | None = None,
-        controls_seed: int | None = None,
-        direction: DirectionLike | None = None,
-        acting: str | None = None,
-        target_mesh: str | Path | None = None,
-        correspondence: str | Path | None = None,
         name: str | None = None,
-        quiet: bool = True,
+        progress: bool = False,
+        **options: Any,
     ) -> Animation | Samples:
         """Animate a face with speech. The keywords are the options of ``facediff animate``.
 
@@ -249,42 +226,9 @@ class Animator:
                 several channels, in floating point with full scale 1 or in whole numbers with theirs; or a pair of
                 samples and their rate, as soundfile, librosa and torchaudio read them.
             rate: sample rate of an array; that of a tensor is 16 kHz if None.
-            identity: whose face and identity; the first one trained on if None.
-            condition: the training identity that the model is conditioned on, where it is not that of the face.
-            style: the speaking style: a clip's name (``"F1_e03"``), a file, a mixture of them
-                (``"F1_e03:0.4,M2_e05:0.6"`` or ``{"F1_e03": 0.4, "M2_e05": 0.6}``), an animation, a motion (T, V, 3) of
-                absolute vertices or a vector of :meth:`extract_style`; the identity's own one if None.
-            style_template: neutral face of the speaker whose motion ``style`` holds, or ``"median"``.
-            samples: how many animations, with seeds one after another.
-            sampler: sampler by name.
-            steps: its denoising steps.
-            expressivity: 0 for the mean of what the model finds possible, 1 for a sample, up to 2; or by region,
-                ``{"lips": 0.5, "upper_face": 1.2}``.
-            guidance: follow conditions more than the model would by itself, ``{"style": 1.5, "speech": 1.2}``.
-            seed: seed of the noise; equal seeds give equal motion.
-            precision: ``"bf16"`` multiplies in 16 bits.
-            window: seconds of a window of long speech.
-            overlap: seconds that neighbouring windows share.
-            max_seconds: refuse speech that lasts longer.
-            voice_gate: what finds the pauses, in which the mouth comes to rest, with its options
-                (``"energy:release=0.3"``); ``"off"`` for the model's own motion there.
-            denoise: take steady noise out of the speech before the model hears it.
-            alignment: when which phoneme is spoken (.TextGrid, or .csv with start, end, ipa), so that the lips touch at
-                each p, b and m.
-            transcript: the English words that are spoken, from which these times are found.
-            closure_budget: millimetres that a vertex is moved by at most for that; 12 if None.
-            expressiveness: as :meth:`Animation.control` takes it.
-            blinks: likewise.
-            gaze: likewise.
-            sway: likewise.
-            eyes: likewise.
-            controls_seed: likewise; the seed of the sample if None.
-            direction: likewise; keys of style, condition, guidance and expressivity as well.
-            acting: likewise.
-            target_mesh: transfer the motion to this mesh.
-            correspondence: with ``target_mesh``: .npz to use if it exists, else to write.
             name: the animation's name; the recording's if None.
-            quiet: whether there is no progress bar.
+            progress: whether there is a progress bar.
+            options: listed below.
 
         Returns:
             the animation, or a list of them where ``samples`` is not 1.
@@ -292,74 +236,22 @@ class Animator:
         Raises:
             FaceDiffError: naming what is wrong with the speech or an option.
         """
-        options = self._options(
-            identity=identity,
-            condition=condition,
-            style_template=None if style_template is None else str(style_template),
-            samples=samples,
-            sampler=sampler,
-            steps=steps,
-            expressivity=words_of(expressivity),
-            guidance=words_of(guidance),
-            precision=precision,
-            window=window,
-            overlap=overlap,
-            voice_gate=voice_gate,
-            denoise=denoise,
-            alignment=None if alignment is None else Path(alignment),
-            transcript=transcript,
-            closure_budget=closure_budget,
-            controls=controls_of(
-                **_given(
-                    {
-                        "expressiveness": expressiveness,
-                        "blinks": blinks,
-                        "gaze": gaze,
-                        "sway": sway,
-                        "eyes": eyes,
-                        "controls_seed": controls_seed,
-                        "direction": direction,
-                        "acting": acting,
-                    }
-                )
-            ),
-            target_mesh=None if target_mesh is None else Path(target_mesh),
-            correspondence=None if correspondence is None else Path(correspondence),
-            quiet=quiet,
-        )
-        options.check_inputs(styled=style is not None)
-        check_seed(seed)
-        samples_of_speech, usual_name = speech_of(speech, rate, max_seconds)
+        chosen = AnimationOptions(checkpoint=self.source, device=self.device, quiet=not progress, **options)
+        check_options(chosen)
+        samples_of_speech, usual_name = speech_of(speech, rate, chosen.max_seconds)
         with self.module.choosing():
-            pipeline = AnimationPipeline(options, seed=seed, model=self.module, style=style)
+            pipeline = AnimationPipeline(chosen, model=self.module)
+            seed = chosen.seed or 0
             with pipeline.samples(samples_of_speech, name or usual_name, None, seed=seed) as made:
                 animations = [
                     Animation.of(pipeline.finished(animation, seed + number)) for number, animation in enumerate(made)
                 ]
-        return animations[0] if samples == 1 else Samples(animations)
+        return animations[0] if chosen.samples == 1 else Samples(animations)
 
     @in_python_words
+    @with_options(AnimationOptions, StreamKeywords)
     def stream(
-        self,
-        chunks: Iterable[Waveform | bytes],
-        rate: int = SAMPLE_RATE,
-        *,
-        identity: str | None = None,
-        condition: str | None = None,
-        style: StyleLike | None = None,
-        style_template: str | Path | None = None,
-        sampler: str | None = None,
-        steps: int | None = None,
-        expressivity: Scales | None = None,
-        guidance: Scales | None = None,
-        seed: int = 0,
-        precision: Precision = "32",
-        window: float | None = None,
-        overlap: float | None = None,
-        voice_gate: str = "energy",
-        controls_seed: int | None = None,
-        direction: DirectionLike | None = None,
-        acting: str | None = None,
+        self, chunks: Iterable[Waveform | bytes], rate: int = SAMPLE_RATE, **options: Unpack[StreamKeywords]
     ) -> Iterator[npt.NDArray[np.float32]]:
         """Animate speech of any length while it arrives, as ``facediff animate --stream`` does.
 
@@ -368,22 +260,7 @@ class Animator:
         Args:
             chunks: pieces of mono speech: arrays or tensors (n,), or bytes of 16-bit samples (little endian).
             rate: their sample rate.
-            identity: as :meth:`animate` takes it.
-            condition: likewise.
-            style: likewise.
-            style_template: likewise.
-            sampler: likewise.
-            steps: likewise.
-            expressivity: likewise.
-            guidance: likewise.
-            seed: likewise.
-            precision: likewise.
-            window: likewise; shorter windows give frames sooner.
-            overlap: likewise.
-            voice_gate: likewise.
-            controls_seed: likewise, of acting.
-            direction: likewise; keys of blinks, gaze and sway need the whole animation.
-            acting: likewise.
+            options: listed below; of ``direction``, keys of blinks, gaze and sway need the whole animation.
 
         Yields:
             absolute vertices (m, V, 3) of the next frames, as soon as these are certain.
@@ -397,29 +274,11 @@ class Animator:
         """
         from facediff.pipelines.stream import LiveAnimation
 
-        check_seed(seed)
         rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
-        options = self._options(
-            identity=identity,
-            condition=condition,
-            style_template=None if style_template is None else str(style_template),
-            sampler=sampler,
-            steps=steps,
-            expressivity=words_of(expressivity),
-            guidance=words_of(guidance),
-            precision=precision,
-            window=window,
-            overlap=overlap,
-            voice_gate=voice_gate,
-            controls=controls_of(
-                **_given({"controls_seed": controls_seed, "direction": direction, "acting": acting}),
-            ),
-        )
-        options.check_inputs(styled=style is not None)
+        chosen = AnimationOptions(checkpoint=self.source, device=self.device, **options)
+        check_options(chosen)
         with self.module.choosing():
-            live = LiveAnimation(
-                AnimationPipeline(options, seed=seed, model=self.module, style=style), rate=rate, seed=seed
-            )
+            live = LiveAnimation(AnimationPipeline(chosen, model=self.module), rate=rate)
 
         def frames() -> Iterator[npt.NDArray[np.float32]]:
             heard = False
@@ -484,16 +343,6 @@ class Animator:
             f"{self.frame_rate:g} frames a second, {self.n_vertices} vertices in {self.unit}, on {self.device}; "
             f"{self.licence})"
         )
-
-    def _options(self, **options: Any) -> AnimationOptions:  # noqa: ANN401 - its fields
-        if options["precision"] not in ("32", "bf16"):
-            raise FaceDiffError(f"precision {ranges.shown(options['precision'])}: expected 32 or bf16")
-        return AnimationOptions(checkpoint=Path(self.source), **options)
-
-
-@ranges.checked
-def check_seed(seed: ranges.Seed) -> None:
-    """Refuse a seed that is out of range."""
 
 
 def speech_of(

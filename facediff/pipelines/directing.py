@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,7 +111,7 @@ def plan_runs(
     identity: str,
     style: Reference | Style | None,
     condition: str | None,
-    style_template: str | None = None,
+    style_template: str | Path | None = None,
 ) -> list[Run]:
     """What must be generated, one run where nothing changes.
 

@@ -12,11 +12,13 @@ from functools import partial
 from pathlib import Path
 
 from facediff.animation import Animation
+from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.animation.style_files import style_paths
-from facediff.errors import FaceDiffError, choices, printable
-from facediff.export import FORMATS
+from facediff.editing.controls import check_controls, keys_file
+from facediff.errors import FaceDiffError, OptionError, choices, printable
+from facediff.export import FORMATS, check_export
 from facediff.models.checkpoint import read_assets
-from facediff.pipelines.animate import AnimationOptions, AnimationPipeline, facts_of, on_processor, read_recording
+from facediff.pipelines.animate import AnimationPipeline, check_options, facts_of, on_processor, read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
@@ -45,8 +47,7 @@ def animate_folder(
     output: Path,
     suffix: str = ".mp4",
     *,
-    seed: int = 0,
-    max_seconds: float | None = None,
+    export: ExportOptions = ExportOptions(),  # noqa: B008 - frozen
     workers: int | None = None,
     scheduler: str | None = "",
     retry_failed: bool = False,
@@ -54,12 +55,12 @@ def animate_folder(
     """Animate many recordings into a folder.
 
     Args:
-        options: how each recording is animated.
+        options: how each recording is animated. From its seed follows each recording's own, together with the name of
+            the recording's file; recordings that last longer than ``max_seconds`` fail.
         speech: recordings, and folders of them.
         output: folder for the animations.
         suffix: format of the animations.
-        seed: from which each recording's own seed follows, together with the name of its file.
-        max_seconds: recordings that last longer fail.
+        export: how the files are written.
         workers: recordings at a time; as many as processors if None, one on an accelerator, which holds one model, or
             all workers of a cluster.
         scheduler: where recordings are animated; see :func:`facediff.utils.jobs.run_tasks`.
@@ -72,37 +73,38 @@ def animate_folder(
         FaceDiffError: if nothing can be made at all: the folder, the options or the checkpoint cannot be used.
     """
     if suffix not in FORMATS:
-        raise FaceDiffError(f"--suffix {suffix}: there is no such format: {choices(suffix, FORMATS)}")
+        raise OptionError("suffix", f"there is no such format: {choices(suffix, FORMATS)}", suffix)
     if output.suffix in FORMATS and not output.is_dir():
-        raise FaceDiffError(
-            f"--output {output}: several recordings go into a folder; give its name, and --suffix {output.suffix}"
+        raise OptionError(
+            "output", f"several recordings go into a folder; give its name, and {{suffix}} {output.suffix}", output
         )
-    options.check(output / f"recording{suffix}")
+    check_options(options)
+    check_export(output / f"recording{suffix}", export, options.samples)
     if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
         fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
-        raise FaceDiffError(f"--suffix {suffix}: a batch writes one file for each recording; choose {fit}")
+        raise OptionError("suffix", f"a batch writes one file for each recording; choose {fit}", suffix)
     found = recordings(speech)
-    if options.target_mesh is not None and options.correspondence is not None and not options.correspondence.exists():
+    correspondence = None if options.correspondence is None else Path(options.correspondence)
+    if options.target_mesh is not None and correspondence is not None and not correspondence.exists():
         from facediff.editing.retargeting import retarget
 
         # Otherwise every process would fit the mesh, and a second run would find a file that decides the outputs and
         # that the records of the first one do not know.
-        facts = facts_of(read_assets(options.checkpoint), options.identity)
+        facts = facts_of(read_assets(Path(options.checkpoint)), options.identity)
         neutral = Animation(name=str(options.checkpoint), vertices=facts["template"][None], **facts)
-        retarget(neutral, options.target_mesh, options.correspondence)
-    directions = options.controls.direction
-    if isinstance(directions, Path) and directions.is_dir():
+        retarget(neutral, Path(options.target_mesh), correspondence)
+    if (directions := directions_folder(options)) is not None:
         check_directions(options, found, directions)
-    quiet = replace(options, quiet=True, export=replace(options.export, quiet=True))
-    decides = {**asdict(quiet), "seed": seed, "max_seconds": max_seconds}
+    quiet, export = replace(options, quiet=True), replace(export, quiet=True)
+    decides = {**asdict(quiet), "export": asdict(export)}
     del decides["commercial_only"]  # refuses a model, and changes no animation
     return run_folder(
         found,
         output,
         suffix,
         [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
-        make_worker=partial(_load_pipeline, quiet, seed, max_seconds),
-        files=_deciding_files(options),
+        make_worker=partial(_load_pipeline, quiet, export),
+        files=_deciding_files(options, export),
         files_of=partial(_own_files, options),
         workers=workers or (None if on_processor(options.device) or is_cluster(scheduler) else 1),
         scheduler=scheduler,
@@ -121,21 +123,25 @@ def check_directions(options: AnimationOptions, found: Sequence[Path], folder: P
     files = {recording: direction_file(folder, recording) for recording in found}
     without = [recording.name for recording, file in files.items() if file is None]
     if len(without) == len(found):
-        raise FaceDiffError(
-            f"--direction {folder}: has no keys for any recording; expected {found[0].stem}.json or {found[0].stem}.csv"
-        )
+        expected = f"{found[0].stem}.json or {found[0].stem}.csv"
+        raise OptionError("direction", f"has no keys for any recording; expected {expected}", folder)
     for file in files.values():
         if file is not None:
-            replace(options, controls=replace(options.controls, direction=file))  # reads and checks it
+            check_controls(replace(options.controls, direction=file))
     if without:
         shown = ", ".join(without[:5]) + (" …" if len(without) > 5 else "")
         print(f"note: {folder}: has no keys for {len(without)} of {len(found)} recordings ({shown})")
 
 
+def directions_folder(options: AnimationOptions) -> Path | None:
+    """The folder with the keys over time of each recording, if there is one."""
+    folder = keys_file(options.direction)
+    return folder if folder is not None and folder.is_dir() else None
+
+
 def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
     """The files that decide one recording's animation alone: its keys over time."""
-    folder = options.controls.direction
-    if not isinstance(folder, Path) or not folder.is_dir():
+    if (folder := directions_folder(options)) is None:
         return []
     from facediff.editing.direction import direction_file
 
@@ -143,38 +149,40 @@ def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
     return [] if file is None else [file]
 
 
-def _deciding_files(options: AnimationOptions) -> list[Path]:
+def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Path]:
     """The files whose content decides the animations."""
-    files = [*model_files(options.checkpoint), *style_paths(options.style)]
-    template = None if options.style_template is None else Path(options.style_template)
+    files = [
+        *model_files(Path(options.checkpoint)),
+        *style_paths(None if options.style is None else str(options.style)),
+    ]
     optional = (
         options.target_mesh,
-        options.controls.eyes,
+        options.eyes,
         options.correspondence,
-        template,
-        options.controls.direction,
+        options.style_template,
+        keys_file(options.direction),
     )
-    files += [path for path in optional if isinstance(path, Path) and path.is_file()]
-    shapes = options.export.shapes
+    files += [Path(path) for path in optional if path is not None and Path(path).is_file()]
+    shapes = None if export.shapes is None else Path(export.shapes)
     if shapes is not None and shapes.exists():
         inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]
         files += [path for path in inside if path.is_file()]
     return files
 
 
-def _load_pipeline(options: AnimationOptions, seed: int, max_seconds: float | None, _command: list[str]) -> Animate:
+def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: list[str]) -> Animate:
     """Load what all recordings have in common, once in each process."""
-    pipeline = AnimationPipeline(options, seed=seed)
-    own = isinstance(options.controls.direction, Path) and options.controls.direction.is_dir()
+    pipeline = AnimationPipeline(options)
+    own = directions_folder(options) is not None
 
     def animate(recording: Path, output: Path) -> None:
-        speech = read_recording(recording, max_seconds)
+        speech = read_recording(recording, options.max_seconds)
         if own:
             from facediff.editing.direction import read_direction
 
             file = next(iter(_own_files(options, recording)), None)
             pipeline.direct(None if file is None else read_direction(file, pipeline.model.frame_rate))
-        pipeline.write(speech, recording.stem, output, seed=seed_of_recording(recording, seed))
+        pipeline.write(speech, recording.stem, output, export, seed=seed_of_recording(recording, options.seed or 0))
 
     return animate
 
@@ -243,9 +251,9 @@ def run_folder(
     ``make_worker``, a function of a module, is called once in each process with the command.
     """
     if workers is not None and workers < 1:
-        raise FaceDiffError(f"--workers {workers}: expected 1 or more")
+        raise OptionError("workers", "expected 1 or more", workers)
     if output.exists() and not output.is_dir():
-        raise FaceDiffError(f"--output {output}: is a file; expected a folder, since there are several recordings")
+        raise OptionError("output", "is a file; expected a folder, since there are several recordings", output)
     if not speeches:
         raise FaceDiffError("speech: no recording; give some, or a folder of them")
     names = output_names(speeches, suffix)

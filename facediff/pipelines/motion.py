@@ -15,20 +15,15 @@ from typing import TYPE_CHECKING, Any, Literal, Self, cast
 
 from facediff import animation as finished
 from facediff.animation.files import AnimationFacts, complete, facts_of, read_animation
-from facediff.errors import FaceDiffError
-from facediff.pipelines.words import Scales, in_python_words, words_of
+from facediff.animation.options import AnimationControls, DirectionLike, ExportOptions, Scales, SourceOptions
+from facediff.errors import FaceDiffError, OptionError
+from facediff.pipelines.words import in_python_words
 from facediff.utils import ranges
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import SolveOptions, Weights
-    from facediff.editing.controls import AnimationControls
-    from facediff.editing.direction import Direction
     from facediff.editing.shapes import ShapeSet
-    from facediff.export import ExportOptions
     from facediff.pipelines.animator import Animator
-
-    DirectionLike = str | Path | Direction | list[dict[str, Any]] | dict[str, Any]
-    """What keys over time may be given as in Python."""
 
 INLINE_MB = 8.0
 """The largest page that a notebook shows; of a larger one, it shows the beginning. A notebook keeps what it shows."""
@@ -144,10 +139,12 @@ class Animation(finished.Animation):
         Raises:
             FaceDiffError: if a value is out of range, or does not fit the face.
         """
-        wanted = controls_of(**_given(locals()))
+        controls = AnimationControls(**_given(locals()))
         from facediff.editing.controlled import apply_controls
+        from facediff.editing.controls import check_controls
 
-        return Animation.of(apply_controls(self, wanted))
+        check_controls(controls)
+        return Animation.of(apply_controls(self, controls))
 
     @in_python_words
     def retarget(
@@ -462,32 +459,24 @@ def read(
     Example:
         >>> truth = facediff.read("vertices_npy/F1_e28.npy", like=animation)  # doctest: +SKIP
     """
-    if identity is not None and checkpoint is None:
-        raise FaceDiffError("identity: names a face of a checkpoint; give checkpoint as well")
-    source = Source(
-        mesh=_path(mesh),
-        checkpoint=Path(checkpoint) if isinstance(checkpoint, str) else checkpoint,
-        identity=identity,
-        speech=_path(speech),
-        frame_rate=frame_rate,
-        unit=unit,
-    )
-    return source.read(Path(path), like)
+    options = SourceOptions(mesh, checkpoint, identity, speech, frame_rate, unit)
+    return SourceReader(options).read(Path(path), like)
 
 
-@dataclass(frozen=True)
-class Source:
-    """What completes a bare array of vertices: the options of ``facediff export``, which explains them."""
+class SourceReader:
+    """Reads motion files, and completes bare arrays of vertices by what options say.
 
-    mesh: Path | None = None
-    checkpoint: Path | Animator | None = None
-    identity: str | None = None
-    speech: Path | None = None
-    frame_rate: ranges.FrameRate | None = None
-    unit: str | None = None
+    Args:
+        options: what the arrays do not say.
 
-    def __post_init__(self) -> None:
-        ranges.check_fields(self)
+    Raises:
+        FaceDiffError: if an identity is named, and no checkpoint that has it.
+    """
+
+    def __init__(self, options: SourceOptions) -> None:
+        if options.identity is not None and options.checkpoint is None:
+            raise OptionError("identity", "names a face of a checkpoint; give {checkpoint} as well")
+        self.options = options
 
     @cached_property
     def facts(self) -> tuple[AnimationFacts, AnimationFacts | None]:
@@ -496,29 +485,29 @@ class Source:
 
         from facediff.mesh import read_mesh
 
+        options = self.options
         overrides: dict[str, Any] = {}
         defaults = None
-        if self.checkpoint is not None:
+        if options.checkpoint is not None:
             from facediff.models.checkpoint import read_assets
             from facediff.pipelines.animate import facts_of as facts_of_assets
 
-            assets = (
-                read_assets(self.checkpoint) if isinstance(self.checkpoint, Path) else self.checkpoint.module.assets
-            )
-            defaults = facts_of_assets(assets, self.identity)
-            if self.identity is not None:
+            source = options.checkpoint
+            assets = read_assets(Path(source)) if isinstance(source, str | Path) else source.module.assets
+            defaults = facts_of_assets(assets, options.identity)
+            if options.identity is not None:
                 overrides["template"] = defaults["template"]
-        if self.mesh is not None:
-            mesh = read_mesh(self.mesh)
+        if options.mesh is not None:
+            mesh = read_mesh(Path(options.mesh))
             overrides |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
             overrides |= {} if mesh.colours is None else {"colours": mesh.colours}
-        if self.speech is not None:
+        if options.speech is not None:
             from facediff.speech.audio import read_speech
             from facediff.utils import SAMPLE_RATE
 
-            overrides |= {"speech": read_speech(self.speech), "sample_rate": SAMPLE_RATE}
-        overrides |= {} if self.frame_rate is None else {"frame_rate": self.frame_rate}
-        overrides |= {} if self.unit is None else {"unit": self.unit}
+            overrides |= {"speech": read_speech(Path(options.speech)), "sample_rate": SAMPLE_RATE}
+        overrides |= {} if options.frame_rate is None else {"frame_rate": options.frame_rate}
+        overrides |= {} if options.unit is None else {"unit": options.unit}
         return cast("AnimationFacts", overrides), cast("AnimationFacts | None", defaults)
 
     def read(self, path: Path, lender: finished.Animation | None = None) -> Animation:
@@ -529,32 +518,6 @@ class Source:
         animation = Animation.of(read_animation(path, overrides, defaults))
         animation.refuse_not_finite()
         return animation
-
-
-def controls_of(**options: Any) -> AnimationControls:  # noqa: ANN401 - see Animation.control
-    """Animation controls from the keywords of :meth:`Animation.control`."""
-    from facediff.editing.controls import AnimationControls
-
-    usual = {"blinks": ranges.USUAL_BLINKS, "gaze": ranges.USUAL_GAZE, "sway": ranges.USUAL_SWAY}
-    for name, number in usual.items():
-        if isinstance(options.get(name), bool):
-            options[name] = number if options[name] else None
-    return AnimationControls(
-        expressiveness=words_of(options.pop("expressiveness", None)),
-        eyes=_path(options.pop("eyes", None)),
-        direction=direction_of(options.pop("direction", None)),
-        seed=options.pop("controls_seed", None),
-        **options,
-    )
-
-
-def direction_of(given: DirectionLike | None) -> Path | Direction | None:
-    """Keys over time from a file's name, rows, or what they were made into already."""
-    if given is None or isinstance(given, str | Path):
-        return None if given is None else Path(given)
-    from facediff.editing.direction import Direction
-
-    return given if isinstance(given, Direction) else Direction.parse(given, "direction")
 
 
 def solve_weights(
@@ -578,15 +541,10 @@ def export_options(path: str | Path, **options: Any) -> ExportOptions:  # noqa: 
     Raises:
         FaceDiffError: if the file's format does not use one of them.
     """
-    from facediff.export import ExportOptions, check_used
+    from facediff.export import check_used
 
     check_used(Path(path).suffix, options)
-    names = {"output_unit": "unit", "tolerance": "tolerance_mm"}
-    speech = not options.pop("no_speech", False)
-    shapes = _path(options.pop("shapes", None))
-    return ExportOptions(
-        speech=speech, shapes=shapes, **{names.get(name, name): value for name, value in options.items()}
-    )
+    return ExportOptions(**options)
 
 
 def write(animations: Sequence[finished.Animation], path: str | Path, options: ExportOptions) -> list[Path]:

@@ -9,11 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.errors import FaceDiffError
-from facediff.pipelines.animate import AnimationOptions, AnimationPipeline
+from facediff.animation.options import AnimationOptions, ExportOptions
+from facediff.errors import FaceDiffError, OptionError
+from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
 from facediff.speech.pcm import pcm
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic, check_writable
@@ -24,27 +26,27 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-def animate_stream(options: AnimationOptions, output: Path, *, rate: int = 16_000, seed: int = 0) -> None:
+def animate_stream(options: AnimationOptions, output: Path, export: ExportOptions, *, rate: int = 16_000) -> None:
     """Animate samples of standard input as they come, until they end or Ctrl-C ends them.
 
     Args:
         options: of inference; what needs the whole animation is refused.
         output: a .npy file, or ``-`` for raw float32 vertices to standard output.
+        export: what the whole animation needs of it is refused as well.
         rate: sample rate of the 16-bit mono samples.
-        seed: seed of the noise.
 
     Raises:
         FaceDiffError: if an option is impossible, or the speech ends before a frame.
     """
-    check_stream(options, output)
+    check_stream(options, output, export)
 
-    pipeline = AnimationPipeline(options, seed=seed)
+    pipeline = AnimationPipeline(options)
     model = pipeline.model
     plan = model.windows
     template = model.assets.template(pipeline.identity)
     busy, heard = 0.0, 0
     with sink(output, tuple(template.shape)) as write, ended_by_interrupt() as read:
-        live = LiveAnimation(pipeline, rate=rate, seed=seed)
+        live = LiveAnimation(pipeline, rate=rate)
         report(
             f"ready; look-ahead {pipeline.look_ahead:.2f} s and the time that a window takes; "
             f"{plan.in_frames(model.frame_rate).hop} frames at a time, {model.frame_rate:g} a second, "
@@ -73,30 +75,29 @@ class LiveAnimation:
     Args:
         pipeline: the model with its options, of which this keeps what is chosen now.
         rate: sample rate of the speech.
-        seed: seed of the noise.
 
     Raises:
         FaceDiffError: if the style or the windows do not fit the model.
     """
 
-    def __init__(self, pipeline: AnimationPipeline, *, rate: int = SAMPLE_RATE, seed: int = 0) -> None:
+    def __init__(self, pipeline: AnimationPipeline, *, rate: int = SAMPLE_RATE) -> None:
         import numpy as np
 
         from facediff.speech.audio import resampler
 
-        self._pipeline, model, self._seed = pipeline, pipeline.model, seed
+        self._pipeline, model, self._seed = pipeline, pipeline.model, pipeline.options.seed or 0
         self._chosen = model.choices()
         self._template = model.assets.template(pipeline.identity)
         self._convert = None if rate == SAMPLE_RATE else resampler(rate)
         with pipeline.precision():  # the style is encoded within it as well, as it is for a file
-            self._stream = pipeline.stream([seed])
+            self._stream = pipeline.stream([self._seed])
 
         self._rest = pipeline.rest
         self._openness = None if self._rest is None else self._rest.openness()
         self._face = pipeline.face
         if self._face is not None:
             self._face.refuse_whole_animation()
-        self._performer = pipeline.performer(seed)
+        self._performer = pipeline.performer(self._seed)
         # Frames of the model, how far their mouths may be open, and how they are acted, whichever is certain first.
         self._held = np.zeros((0, *self._template.shape), np.float32)
         self._opened = np.zeros(0, np.float32)
@@ -174,30 +175,38 @@ class LiveAnimation:
         return vertices
 
 
-def check_stream(options: AnimationOptions, output: Path) -> None:
+WHOLE = (
+    "expressiveness",
+    "blinks",
+    "gaze",
+    "sway",
+    "target_mesh",
+    "output_unit",
+    "up",
+    "samples",
+    "denoise",
+    "alignment",
+    "transcript",
+)
+"""Options that need the whole animation."""
+
+
+def check_stream(options: AnimationOptions, output: Path, export: ExportOptions) -> None:
     """Refuse what streaming cannot do."""
+    if options.direction is not None:
+        options = replace(options, direction=direction_for(options.direction, Path("-"), streamed=True))
+    check_options(options)
     if str(output) != "-" and output.suffix != ".npy":
-        raise FaceDiffError(
-            f"--output {output}: a stream is written as .npy, or as raw float32 to standard output with -o -; "
-            f"`facediff export` turns the .npy into other formats"
+        raise OptionError(
+            "output",
+            "a stream is written as .npy, or as raw float32 to standard output with -o -; `facediff export` turns the "
+            ".npy into other formats",
+            output,
         )
-    controls, export = options.controls, options.export
-    whole = {
-        "expressiveness": controls.expressiveness,
-        "blinks": controls.blinks,
-        "gaze": controls.gaze,
-        "sway": controls.sway,
-        "target-mesh": options.target_mesh,
-        "output-unit": export.unit,
-        "up": export.up,
-        "samples": None if options.samples == 1 else options.samples,
-        "denoise": options.denoise or None,
-        "alignment": options.alignment,
-        "transcript": options.transcript,
-    }
-    for option, value in whole.items():
-        if value is not None:
-            raise FaceDiffError(f"--{option}: needs the whole animation; stream to .npy, then use `facediff export`")
+    given = {**options.changed(), **export.changed()}
+    for name in WHOLE:
+        if name in given:
+            raise OptionError(name, "needs the whole animation; stream to .npy, then use `facediff export`")
     if sys.stdin is None:
         raise FaceDiffError("--stream: standard input is closed; send samples to it")
     if str(output) != "-":

@@ -19,7 +19,7 @@ from facediff.utils import SAMPLE_RATE
 from facediff.version import __version__
 
 if TYPE_CHECKING:
-    from facediff.export.format import ExportOptions
+    from facediff.animation.options import ExportOptions
 
 
 def parser() -> argparse.ArgumentParser:
@@ -125,7 +125,7 @@ def run(options: argparse.Namespace) -> None:
 
 def export_options(options: argparse.Namespace) -> ExportOptions:
     """What the writer of the format takes."""
-    from facediff.export.format import ExportOptions
+    from facediff.animation.options import ExportOptions
 
     return ExportOptions(shapes=options.shapes)
 

@@ -99,8 +99,8 @@ def _attempt(
     except FaceDiffError as error:
         disk_full = isinstance(error.__cause__, OSError) and error.__cause__.errno in NO_SPACE
         if disk_full or isinstance(error, SetupError | MissingExtraError):
-            return Outcome(problem=str(error), fatal=True)
-        outcome = Outcome(problem=str(error))
+            return Outcome(problem=error.on_command_line, fatal=True)
+        outcome = Outcome(problem=error.on_command_line)
     except OSError as error:
         if error.errno in NO_SPACE:
             return Outcome(problem=f"{task}: {error.strerror}", fatal=True)

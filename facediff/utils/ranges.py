@@ -24,7 +24,7 @@ from os import PathLike
 from types import SimpleNamespace
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.limits import FRAME_RATES, WORDS_SHOWN, quoted
 
 Arguments = ParamSpec("Arguments")
@@ -172,6 +172,25 @@ def check_fields(made: Any) -> None:  # noqa: ANN401 - an instance of a dataclas
         FaceDiffError: naming the class, the field and the range.
     """
     _check(type(made), {field.name: getattr(made, field.name) for field in dataclasses.fields(made)})
+
+
+def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
+    """Refuse options, the fields of a dataclass, that do not fit their type hints. None is allowed.
+
+    Raises:
+        OptionError: naming the option and the range.
+    """
+    for name, hint in _all_hints(type(options)).items():
+        value = getattr(options, name)
+        if value is not None and (expected := mismatch(hint, value)) is not None:
+            problem = "out of range" if isinstance(value, Real) and range_of(hint) is not None else "not valid"
+            raise OptionError(name, f"{problem}; expected {expected}", shown(value))
+
+
+@functools.cache
+def _all_hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a class
+    """The type hints of a class and of those that it extends."""
+    return typing.get_type_hints(owner, include_extras=True)
 
 
 def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

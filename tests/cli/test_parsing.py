@@ -15,7 +15,6 @@ from facediff.cli.app import COMMANDS, find, load
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.parsing import (
     RENAMED,
-    Option,
     OptionGroup,
     Parameters,
     arguments_of,
@@ -25,6 +24,7 @@ from facediff.cli.parsing import (
     with_more_help,
 )
 from facediff.errors import FaceDiffError
+from facediff.utils.option import Option
 from facediff.utils.ranges import Range
 
 ROOT = Path(__file__).parents[2]

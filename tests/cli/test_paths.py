@@ -13,11 +13,12 @@ import pytest
 from facediff.cli.app import COMMANDS, load, main
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.options import FileOrList, Folder, Map, Output
-from facediff.cli.parsing import Option, Parameters, flat, parameters_of, parse
+from facediff.cli.parsing import Parameters, flat, parameters_of, parse
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError
 from facediff.utils.destinations import reading
 from facediff.utils.files import atomic, atomic_folder, put_in_place
+from facediff.utils.option import Option
 
 # Its outputs lie in folders of runs with numbers of their own, and `--ckpt_path last` replaces what it reads.
 LIGHTNING = {"fit", "validate", "test", "predict"}

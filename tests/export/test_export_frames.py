@@ -91,7 +91,7 @@ def test_point_caches_need_no_faces(make_animation: Callable[..., Animation], tm
 
 def test_unit_and_axis(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     animation = make_animation(unit="mm")
-    options = ExportOptions(unit="cm", up="z", speech=False)
+    options = ExportOptions(output_unit="cm", up="z", no_speech=True)
     for suffix in (".obj", ".ply", ".pc2", ".mdd", ".npy"):
         write_animations(tmp_path / suffix[1:] / f"a{suffix}", [animation], options)
     want, rest = animation.vertices @ TURN.T / 10, animation.template @ TURN.T / 10
@@ -117,7 +117,7 @@ def test_numpy_files(animation: Animation, tmp_path: Path) -> None:
     np.testing.assert_array_equal(bare, animation.vertices)
     write_animations(tmp_path / "a.npz", [animation])
     np.testing.assert_array_equal(read_archive(tmp_path / "a.npz").vertices, animation.vertices)
-    write_animations(tmp_path / "b.npz", [animation], ExportOptions(unit="mm", speech=False))
+    write_animations(tmp_path / "b.npz", [animation], ExportOptions(output_unit="mm", no_speech=True))
     scaled = read_archive(tmp_path / "b.npz")
     np.testing.assert_allclose(scaled.vertices, animation.vertices * 1000, rtol=1e-6)
     np.testing.assert_allclose(scaled.template, animation.template * 1000, rtol=1e-6)
@@ -127,5 +127,5 @@ def test_numpy_files(animation: Animation, tmp_path: Path) -> None:
 def test_memory_map_may_be_replaced_by_its_own_export(animation: Animation, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", animation.vertices)
     mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
-    write_animations(tmp_path / "a.npy", [replace(animation, vertices=mapped)], ExportOptions(unit="mm"))
+    write_animations(tmp_path / "a.npy", [replace(animation, vertices=mapped)], ExportOptions(output_unit="mm"))
     np.testing.assert_allclose(np.load(tmp_path / "a.npy"), animation.vertices * 1000, rtol=1e-6)

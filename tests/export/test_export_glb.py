@@ -41,7 +41,7 @@ def test_glb_gives_back_every_vertex_at_its_time(
 
 
 def test_glb_has_few_targets_for_a_motion_of_few_shapes(animation: Animation, tmp_path: Path) -> None:
-    write_animations(tmp_path / "a.glb", [animation], ExportOptions(tolerance_mm=0.001))
+    write_animations(tmp_path / "a.glb", [animation], ExportOptions(tolerance=0.001))
     reader = Reader(tmp_path / "a.glb")
     assert len(reader.primitive.targets) == 10  # two halves of each of five components
     assert reader.gltf.meshes[0].extras["targetNames"] == [f"shape_{index:04d}" for index in range(10)]

@@ -88,7 +88,7 @@ def test_usd_layer_is_valid(animation: Animation, tmp_path: Path) -> None:
 
 def test_usd_in_another_unit_with_z_up(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     animation = make_animation(unit="mm", speech=None)
-    options = ExportOptions(unit="cm", up="z")
+    options = ExportOptions(output_unit="cm", up="z")
     assert write_animations(tmp_path / "a.usda", [animation], options) == [tmp_path / "a.usda"]
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (0.01, "Z")

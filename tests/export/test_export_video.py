@@ -38,7 +38,7 @@ def test_one_frame_for_every_frame_with_the_speech(animation: Animation, tmp_pat
 
 
 def test_no_speech_is_a_silent_video(animation: Animation, tmp_path: Path) -> None:
-    write_animations(tmp_path / "a.mp4", [animation], ExportOptions(size=64, speech=False, footer="synthetic corpus"))
+    write_animations(tmp_path / "a.mp4", [animation], ExportOptions(size=64, no_speech=True, footer="synthetic corpus"))
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert not container.streams.audio
 

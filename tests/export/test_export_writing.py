@@ -43,13 +43,13 @@ def test_formats_are_as_promised() -> None:
         ("a.gltf", {}, ["a.gltf", 'no format ".gltf"', '".glb"?', ".usdc"]),
         ("a.GLB", {}, ['no format ".GLB"', '".glb"?']),
         ("a", {}, ["suffix", "a.glb"]),
-        ("a.glb", {"unit": "cm"}, [".glb", "metres"]),
+        ("a.glb", {"output_unit": "cm"}, [".glb", "metres"]),
         ("a.glb", {"up": "z"}, [".glb", "y up"]),
         ("a.npz", {"up": "z"}, [".npz", "y up"]),
-        ("a.mp4", {"unit": "cm"}, [".mp4", "no lengths"]),
+        ("a.mp4", {"output_unit": "cm"}, [".mp4", "no lengths"]),
         ("a.mp4", {"up": "y"}, [".mp4", "no axes"]),
-        ("a.obj", {"unit": "parsec"}, ['unit "parsec"']),
-        ("a.csv", {}, ["a.csv", "--shapes"]),
+        ("a.obj", {"output_unit": "parsec"}, ['unit "parsec"']),
+        ("a.csv", {}, ["a.csv", "shapes"]),
         ("a.csv", {"shapes": Path("nowhere")}, ["nowhere: no such folder or file"]),
         ("file/a.glb", {}, ["cannot be written"]),
         ("folder.glb", {}, ["is a folder"]),
@@ -72,7 +72,7 @@ def test_export_is_refused_before_any_work(
 
 @pytest.mark.parametrize("unit", ["m", "1", None])
 def test_export_accepts_the_unit_that_the_format_prescribes(tmp_path: Path, unit: str | None) -> None:
-    check_export(tmp_path / "a.glb", ExportOptions(unit=unit, up="y"))
+    check_export(tmp_path / "a.glb", ExportOptions(output_unit=unit, up="y"))
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_export_to_a_full_disk_leaves_nothing(animation: Animation, tmp_path: Pa
         for suffix in sys.argv[3:]:
             for speech in (True, False):
                 try:
-                    options = ExportOptions(speech=speech, size=64)
+                    options = ExportOptions(no_speech=not speech, size=64)
                     write_animations(Path(sys.argv[2]) / f"a{suffix}", [animation], options)
                 except FaceDiffError as error:
                     print(error)
@@ -184,7 +184,7 @@ def test_files_next_to_an_export_never_replace_the_users_own(animation: Animatio
     (tmp_path / "hello_speech.wav").write_bytes(before)
     with pytest.raises(FaceDiffError, match=r"hello_speech\.wav: is a file that facediff did not write"):
         write_animations(tmp_path / "hello.glb", [animation])
-    write_animations(tmp_path / "hello.glb", [animation], ExportOptions(speech=False))
+    write_animations(tmp_path / "hello.glb", [animation], ExportOptions(no_speech=True))
     (tmp_path / "face.obj").write_text("v 0 0 0\n")
     with pytest.raises(FaceDiffError, match=r"face\.obj: is a file that facediff did not write"):
         write_animations(tmp_path / "face.mdd", [animation])
@@ -233,7 +233,7 @@ def test_page_holds_all_animations(animation: Animation, tmp_path: Path) -> None
     assert write_animations(path, [animation, animation]) == [path]
     assert path.read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype html>")
     silent = tmp_path / "b.html"
-    write_animations(silent, [animation, animation], ExportOptions(speech=False))
+    write_animations(silent, [animation, animation], ExportOptions(no_speech=True))
     assert silent.stat().st_size < path.stat().st_size
 
 

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation, read_archive
+from facediff.animation.options import AnimationControls
 from facediff.editing.controlled import apply_controls
-from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import Direction, Key
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
@@ -40,7 +40,7 @@ def test_head_is_taken_out_again(turned: Animation) -> None:
 
 @pytest.mark.parametrize("unit", [None, "m"])
 def test_archive_keeps_it_in_any_unit(turned: Animation, tmp_path: Path, unit: str | None) -> None:
-    write_animations(tmp_path / "a.npz", [turned], ExportOptions(unit=unit))
+    write_animations(tmp_path / "a.npz", [turned], ExportOptions(output_unit=unit))
     read = read_archive(tmp_path / "a.npz")
     factor = 1.0 if unit is None else 0.001
     np.testing.assert_allclose(read.still().vertices, factor * clicks().vertices, atol=1e-4 * factor)

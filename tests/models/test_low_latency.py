@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,9 +157,10 @@ def test_impossible_pasts_are_refused(change: dict[str, float], field: str) -> N
 
 
 def test_low_latency_excludes_lengths_of_windows() -> None:
-    from facediff.pipelines.animate import AnimationOptions
+    from facediff.animation.options import AnimationOptions
+    from facediff.pipelines.animate import gate_of, gate_text
 
     with pytest.raises(FaceDiffError, match="--low-latency"):
-        AnimationOptions(Path("a.ckpt"), window=1.0, low_latency=True)
-    assert AnimationOptions(Path("a.ckpt"), low_latency=True).gate_text == QUICK_GATE
-    assert AnimationOptions(Path("a.ckpt"), low_latency=True, voice_gate="off").gate is None
+        AnimationOptions(checkpoint="a.ckpt", window=1.0, low_latency=True)
+    assert gate_text(AnimationOptions(checkpoint="a.ckpt", low_latency=True)) == QUICK_GATE
+    assert gate_of(AnimationOptions(checkpoint="a.ckpt", low_latency=True, voice_gate="off")) is None

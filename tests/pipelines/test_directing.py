@@ -14,13 +14,12 @@ import pytest
 
 import facediff
 from facediff.animation import read_archive
+from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
-from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
 from facediff.editing.expressiveness import region_factors
 from facediff.editing.eyes import puppet_eyes
 from facediff.errors import FaceDiffError
-from facediff.pipelines.animate import AnimationOptions
 from facediff.pipelines.folder import animate_folder
 from facediff.speech.audio import read_speech
 
@@ -234,8 +233,7 @@ def test_a_batch_takes_the_keys_of_each_recording(workplace: Path, capsys: pytes
         shutil.copy("speech.wav", recordings / f"{name}.wav")
     Direction.parse(rows("brows", 3), "a").save(recordings / "a.direction.json")
     Direction.parse(rows("head.yaw", 0, 5), "b").save(recordings / "b.csv")
-    controls = AnimationControls(direction=recordings)
-    options = AnimationOptions(Path("demo/puppet.ckpt"), steps=1, controls=controls)
+    options = AnimationOptions(checkpoint="demo/puppet.ckpt", steps=1, direction=recordings)
     run = dict(speech=[recordings], output=Path("out"), suffix=".npz", workers=1)
     assert animate_folder(options, **run) == 0
     assert "c.wav" in capsys.readouterr().out

@@ -15,11 +15,12 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.files import FORMAT as ARCHIVE
+from facediff.animation.options import ExportOptions
 from facediff.editing import direction
 from facediff.editing.expressiveness import ALL, region_factors
 from facediff.editing.procedural import neck
 from facediff.errors import FaceDiffError
-from facediff.export.format import ExportOptions, Format, check_animation, outward, speech_wav
+from facediff.export.format import Format, check_animation, outward, speech_wav
 from facediff.export.viewer.packing import (
     CHUNK_FRAMES,
     STEP,
@@ -63,7 +64,7 @@ class Page(Format):
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write a page that shows all animations next to each other."""
-        write_page(path, [each if options.speech else replace(each, speech=None) for each in animations])
+        write_page(path, [each if not options.no_speech else replace(each, speech=None) for each in animations])
 
 
 def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 30.0, truth: int | None = None) -> None:

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.cli.options import ControlOptions
+from facediff.animation.options import AnimationControls
 from facediff.cli.parsing import parameters_of, parse
 from facediff.editing.controlled import apply_controls
-from facediff.editing.controls import AnimationControls
+from facediff.editing.controls import check_controls
 from facediff.editing.expressiveness import scale_regions
 from facediff.editing.eyes import Eyes, puppet_eyes, read_eyes
 from facediff.editing.procedural import add_blinks, add_gaze, add_sway
@@ -27,11 +27,12 @@ from facediff.synthetic.face import build_face
 
 def parsed(*words: str) -> AnimationControls:
     """The controls that the words of a command line ask for."""
-    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"].controls()
+    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"]
+    check_controls(controls)
     return controls
 
 
-def with_controls(*, controls: ControlOptions) -> None:
+def with_controls(*, controls: AnimationControls) -> None:
     """A command that has the controls only."""
 
 
@@ -78,12 +79,12 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--expressiveness", "a lot"], "--expressiveness a lot: expected a factor"),
+        (["--expressiveness", "a lot"], "expressiveness a lot: expected a factor"),
         (["--blinks", "0"], "--blinks 0: "),
         (["--blinks", "speech.wav"], "--blinks speech.wav: "),
         (["--gaze", "50"], "--gaze 50: "),
         (["--sway", "0"], "--sway 0: "),
-        (["--eyes", "none.json"], "--eyes none.json: no such file"),
+        (["--eyes", "none.json"], "eyes none.json: no such file"),
         (["--controls-seed", "-1"], "--controls-seed -1: "),
         (["--directing-seed", "1"], "--controls-seed"),
     ],

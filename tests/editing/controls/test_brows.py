@@ -11,9 +11,9 @@ import pytest
 import trimesh
 
 from facediff.animation import Animation
+from facediff.animation.options import AnimationControls
 from facediff.editing.brows import brows_of
 from facediff.editing.controlled import apply_controls
-from facediff.editing.controls import AnimationControls
 from facediff.editing.direction import Direction, Key
 from facediff.errors import FaceDiffError
 from facediff.synthetic.corpus import rig_of
