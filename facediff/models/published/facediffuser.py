@@ -374,7 +374,7 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     root = None
     if model.sampling_space == "folded":
         with torch.no_grad():
-            root = space.noise(torch.eye(space.width))
+            root = space.noise(torch.eye(space.width)[None])[0]
     loop = SamplingLoop(
         state=space.width,
         drawn=space.width,
