@@ -1,4 +1,4 @@
-"""Build the project's dashboard on Weights & Biases: a saved view over the names in docs/dashboard.md.
+"""Build the project's dashboard on Weights & Biases: a saved view over the names in docs/monitoring.md.
 
     python tools/wandb_dashboard.py --entity TEAM --project facediff
     python tools/wandb_dashboard.py --entity TEAM --output dashboard.json    # no network, nothing saved

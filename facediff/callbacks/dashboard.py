@@ -1,4 +1,4 @@
-"""What every run logs under stable names next to losses and scores; listed in docs/dashboard.md."""
+"""What every run logs under stable names next to losses and scores; listed in docs/monitoring.md."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ METHOD_NAMES = {
 class EpochLines(Callback):
     """Prints a line after each epoch of training, where no terminal would show a progress bar.
 
-    The line has the training loss, what is monitored in validation (names that a run logs, see ``docs/dashboard.md``)
+    The line has the training loss, what is monitored in validation (names that a run logs, see ``docs/monitoring.md``)
     where that has been measured, and the seconds since training began. It goes to standard error.
     """
 

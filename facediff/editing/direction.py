@@ -1,7 +1,7 @@
 """Direction: keys over time for style, expressiveness, head, brows and whatever else an animation is controlled by.
 
 From top to bottom: the channels that keys can be set for; :class:`Key`, and :class:`Direction`, whose curves are
-evaluated at any times; and its files, JSON and CSV, which docs/direction.md describes.
+evaluated at any times; and its files, JSON and CSV, which docs/animation_controls.md describes.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class Archive(Format):
 class BlendshapeWeights(Format):
     """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes."""
 
-    next_step = "Unreal: docs/tools/unreal.md; `facediff blendshapes` has more options"
+    next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
     speech = "next to it"
     needs_mesh = False
     needs_shapes = True

@@ -105,7 +105,7 @@ def _comment(animation: Animation, space: Space) -> str:
 class PointCache(Format):
     """Positions of every frame, and next to them the mesh at rest on which they are played."""
 
-    next_step = "Blender: import the .obj, add the modifier Mesh Cache and choose this file: docs/tools/blender.md"
+    next_step = "Blender: import the .obj, add the modifier Mesh Cache and choose this file: docs/programs.md"
     speech = "next to it"
     needs_mesh = False
     dtype: str

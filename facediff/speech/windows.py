@@ -131,7 +131,7 @@ class WindowPlan:
 
 
 LOW_LATENCY = WindowPlan(seconds=1 / 30, overlap=0.0, before=0.4, after=0.12, above=0.0, past=1.0)
-"""Windows of one frame that hear 0.12 s ahead and continue the last second of motion; see docs/low_latency.md."""
+"""Windows of one frame that hear 0.12 s ahead and continue the last second of motion; see docs/streaming.md."""
 
 LOW_LATENCY_STEPS = 2
 """Denoising steps of such a window: what is random in its motion is mostly decided by the motion that it continues."""

@@ -337,7 +337,7 @@ def test_ctrl_c_ends_the_speech_and_what_was_said_is_kept(checkpoint: Path, tmp_
     with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stderr is not None
-        # docs/long_speech.md promises this line to programs that wait for it.
+        # docs/streaming.md promises this line to programs that wait for it.
         ready = process.stderr.readline().decode()
         told = r"look-ahead 4.50 s .* 75 frames at a time, 25 a second, 24 vertices; reading 16000 Hz, 16 bit"
         assert re.fullmatch(f"facediff animate: ready; {told}\n", ready)

@@ -24,7 +24,7 @@ from tests.cli.conftest import SMALL
 from tests.fakes.wandb_run import OfflineRun
 
 ROOT = Path(__file__).parents[2]
-DOCS = ROOT / "docs" / "dashboard.md"
+DOCS = ROOT / "docs" / "monitoring.md"
 CALLBACKS = """
 trainer:
   callbacks+:
@@ -37,7 +37,7 @@ trainer:
 
 
 def documented(head: str) -> list[str]:
-    """The names in the first column of a table of docs/dashboard.md, by the table's head."""
+    """The names in the first column of a table of docs/monitoring.md, by the table's head."""
     lines = DOCS.read_text(encoding="utf-8").splitlines()
     start = lines.index(head) + 2
     end = next(place for place, line in enumerate(lines) if place >= start and not line.startswith("|"))

@@ -13,7 +13,7 @@ import soundfile
 
 from facediff.cli.app import main
 
-PAGE = (Path(__file__).parents[2] / "docs" / "new_corpus.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "own_data.md").read_text()
 (SOURCE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 

@@ -17,7 +17,7 @@ from facediff.cli.parsing import arguments_of
 from facediff.export import FORMATS, write_animations
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "docs" / "export.md", *sorted((ROOT / "docs" / "tools").glob("*.md"))]
+PAGES = [ROOT / "docs" / "export.md", ROOT / "docs" / "programs.md"]
 COMMANDS = {
     line
     for page in PAGES

@@ -312,6 +312,6 @@ def test_the_blocks_of_the_page_run(model: facediff.Animator, workplace: Path) -
     model.animate("speech.wav", steps=1).save("plain.npz")
     (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     names: dict[str, object] = {}
-    exec(compile(block, "docs/direction.md", "exec"), names)  # noqa: S102 - our own page
+    exec(compile(block, "docs/animation_controls.md", "exec"), names)  # noqa: S102 - our own page
     assert names["direction"].at([0.0, 0.5, 1.2])["head.yaw"].tolist() == [0, 3, 6]  # type: ignore[attr-defined]
     assert Path("directed.npz").is_file()

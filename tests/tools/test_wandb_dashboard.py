@@ -1,4 +1,4 @@
-"""The dashboard shows what docs/dashboard.md lists, and is made without a network."""
+"""The dashboard shows what docs/monitoring.md lists, and is made without a network."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def tool() -> ModuleType:
 
 
 def documented(head: str) -> list[str]:
-    lines = (ROOT / "docs" / "dashboard.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "monitoring.md").read_text(encoding="utf-8").splitlines()
     start = lines.index(head) + 2
     end = next(place for place, line in enumerate(lines) if place >= start and not line.startswith("|"))
     return [line.split("`")[1] for line in lines[start:end]]

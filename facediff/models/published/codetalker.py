@@ -3,7 +3,7 @@
 Xing, Xia, Zhang, Cun, Wang, Wong: "CodeTalker: Speech-Driven 3D Facial Animation with Discrete Motion Prior". Two
 stages of one model: a prior, which learns to write motion in a table of codes (``motion_prior.py``), and a predictor,
 FaceFormer's decoder, which finds the codes that speech asks for. Its authors' files are read in
-``codetalker_checkpoints.py``; docs/methods/codetalker.md says what of the published code is an option here.
+``codetalker_checkpoints.py``; docs/methods.md says what of the published code is an option here.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Diffusion over offsets from the template, with one Transformer layer in which the speaker and the denoising step are
 tokens that every frame attends to. From top to bottom: the model, its network, the sampler's steps, the authors'
-checkpoints. docs/methods/diffspeaker.md says what of the published code is an option here.
+checkpoints. docs/methods.md says what of the published code is an option here.
 """
 
 from __future__ import annotations

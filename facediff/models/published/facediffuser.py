@@ -1,7 +1,7 @@
 """FaceDiffuser (Stan, Haque, Yumak: "FaceDiffuser: Speech-Driven 3D Facial Animation Synthesis Using Diffusion", 2023).
 
 Diffusion over the vertices themselves, with HuBERT's features and recurrent layers. From top to bottom: the model, its
-network, the sampling loop in the width of the network, the authors' checkpoints. docs/methods/facediffuser.md says what
+network, the sampling loop in the width of the network, the authors' checkpoints. docs/methods.md says what
 of the published code is an option here.
 """
 

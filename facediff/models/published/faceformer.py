@@ -1,7 +1,7 @@
 """FaceFormer (Fan, Lin, Saito, Wang, Komura: "FaceFormer: Speech-Driven 3D Facial Animation with Transformers", 2022).
 
 An autoregressive Transformer decoder over wav2vec 2.0; the network is that of ``autoregressive.py`` with one column of
-a table for each speaker. docs/methods/faceformer.md says what of the published code is an option here.
+a table for each speaker. docs/methods.md says what of the published code is an option here.
 """
 
 from __future__ import annotations

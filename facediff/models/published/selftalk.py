@@ -2,7 +2,7 @@
 
 A Transformer decoder that makes all frames in one pass, and in training a lip reader, which reads the generated lips
 and must find what a frozen speech recogniser finds in the speech. From top to bottom: the model, its network, the lip
-reader, the authors' checkpoints. docs/methods/selftalk.md says what of the published code is an option here.
+reader, the authors' checkpoints. docs/methods.md says what of the published code is an option here.
 """
 
 from __future__ import annotations

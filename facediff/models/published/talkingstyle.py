@@ -1,7 +1,7 @@
 """TalkingStyle (Song et al.: "Personalized Speech-Driven 3D Facial Animation with Style Preservation", 2024).
 
 FaceFormer's autoregressive decoder with six layers over HuBERT large, and a style of two tables of speakers. From top
-to bottom: the model, the style, the authors' checkpoints. docs/methods/talkingstyle.md says what of the published code
+to bottom: the model, the style, the authors' checkpoints. docs/methods.md says what of the published code
 is an option here.
 """
 

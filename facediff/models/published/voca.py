@@ -2,7 +2,7 @@
 
 Convolutions over a window of DeepSpeech's logits around each frame, joined with the speaker as a one-hot vector, give
 the coefficients of linear shapes. From top to bottom: the model, its network, the authors' checkpoint.
-docs/methods/voca.md says what of the published code is an option here.
+docs/methods.md says what of the published code is an option here.
 """
 
 from __future__ import annotations
