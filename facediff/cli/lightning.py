@@ -195,7 +195,7 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
     elif chosen is None and is_path(named) and find_class(registry.corpus, named, SpeechMotionDataModule) is None:
         raise FaceDiffError(
             f"{path}: was trained on the corpus {named}, which is not known here and was not imported. If it is your "
-            f"own, add  {option}{named}  and run the command in the folder of its file; docs/new_corpus.md says how to "
+            f"own, add  {option}{named}  and run the command in the folder of its file; docs/own_data.md says how to "
             f"register it once and for all"
         )
 

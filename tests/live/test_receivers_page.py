@@ -12,7 +12,7 @@ from facediff import registry
 from facediff.live.frames import open_receiver
 from facediff.registry import Kind
 
-PAGE = Path(__file__).parents[2] / "docs" / "live_receivers.md"
+PAGE = Path(__file__).parents[2] / "docs" / "live.md"
 
 
 @pytest.fixture
