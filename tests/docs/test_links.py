@@ -15,6 +15,8 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.ipynb")),
 ]
 
+LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#\s]*)(?:#([^)\s]+))?\)")
+
 
 @cache
 def anchors(page: Path) -> set[str]:
@@ -28,7 +30,7 @@ def anchors(page: Path) -> set[str]:
 def test_links_lead_somewhere() -> None:
     offenders = []
     for page in PAGES:
-        for target, anchor in re.findall(r"\]\((?!https?:|mailto:)([^)#\s]*)(?:#([^)\s]+))?\)", page.read_text("utf-8")):
+        for target, anchor in LINK.findall(page.read_text("utf-8")):
             path = (page.parent / target).resolve() if target else page
             if not path.exists() or (anchor and path.suffix == ".md" and anchor not in anchors(path)):
                 offenders.append(f"{page.relative_to(ROOT)}: {target}{'#' if anchor else ''}{anchor}")
