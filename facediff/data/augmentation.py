@@ -132,9 +132,6 @@ class Augmenter:
 def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
     """Augmentations from ``NAME:option=value,option=value``.
 
-    Raises:
-        FaceDiffError: if there is no such augmentation or option, or a value is out of range.
-
     Example:
         >>> [type(change).__name__ for change in read_augmentations(["voice:semitones=3", "room"])]
         ['Voice', 'Room']

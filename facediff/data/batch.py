@@ -271,11 +271,7 @@ class Assets:
         return len(next(iter(self.templates.values())))
 
     def template(self, identity: str) -> Float[Tensor, "vertices 3"]:
-        """The neutral face of an identity.
-
-        Raises:
-            FaceDiffError: naming the known identities.
-        """
+        """The neutral face of an identity."""
         if identity not in self.templates:
             raise FaceDiffError(
                 f'identity: there is no "{identity}"; the checkpoint knows {", ".join(sorted(self.templates))}'

@@ -190,11 +190,7 @@ class Corpus:
         return templates
 
     def template(self, clip: Clip) -> Tensor:
-        """Neutral face (V, 3) of a clip's speaker.
-
-        Raises:
-            FaceDiffError: if there is none.
-        """
+        """Neutral face (V, 3) of a clip's speaker."""
         if clip.identity not in self.templates:
             raise FaceDiffError(
                 f"{clip.root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {clip.name}; "
@@ -286,9 +282,6 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
     Args:
         path: the file.
         n_vertices: vertices of the mesh; those of the first face if None.
-
-    Raises:
-        FaceDiffError: if the file holds anything else.
     """
     loaded = load_pickle(path)
     if not isinstance(loaded, dict):
@@ -336,11 +329,7 @@ def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
 
 
 def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
-    """``clips.csv`` of a folder: the further columns of each clip; empty if there is none.
-
-    Raises:
-        FaceDiffError: if it is not a UTF-8 table, or has no column ``clip``.
-    """
+    """``clips.csv`` of a folder: the further columns of each clip; empty if there is none."""
     path = root / "clips.csv"
     if not path.is_file():
         return {}
@@ -374,9 +363,6 @@ def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, 
     A source is a file below ``root``: a text file of indices separated by "," or ", "; a pickle with a list of indices;
     or ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a pickle with named masks. ``all`` is every
     vertex.
-
-    Raises:
-        FaceDiffError: if no file exists (naming all that were looked for), or it is not what it should be.
     """
     for source in sources:
         if source == ALL:

@@ -228,11 +228,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         *arguments: Any,  # noqa: ANN401
         **options: Any,  # noqa: ANN401
     ) -> Self:
-        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.
-
-        Raises:
-            FaceDiffError: if the file is no checkpoint, or its options are not plain values of this class's.
-        """
+        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's."""
         with open_checkpoint(checkpoint_path) as (stream, path):
             content = load_tensors(stream, path)
             hyperparameters = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
@@ -312,11 +308,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     @cached_property
     def corpus(self) -> Corpus:
-        """The corpus on disk.
-
-        Raises:
-            FaceDiffError: if the folder does not exist; the message says how to obtain the corpus.
-        """
+        """The corpus on disk."""
         if not self.root.is_dir():
             raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
         return Corpus(
@@ -384,11 +376,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return by_speaker
 
     def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
-        """The samples of a split: whole clips with fixed references, or (``training``) random windows and references.
-
-        Raises:
-            FaceDiffError: if the split has no clip.
-        """
+        """The samples of a split: whole clips with fixed references, or (``training``) random windows and references."""
         clips = self.clips(split)
         if not clips:
             raise FaceDiffError(
@@ -414,11 +402,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         )
 
     def _mouth(self) -> npt.NDArray[np.float32]:
-        """Which vertices speech moves (V,): 1 for all but the upper face.
-
-        Raises:
-            FaceDiffError: if training is such that speech cannot be augmented.
-        """
+        """Which vertices speech moves (V,): 1 for all but the upper face."""
         if self.features.reader is not None:
             raise FaceDiffError(
                 "data.augmentations: speech features that were computed before training are those of the recordings "
@@ -466,11 +450,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return self._assets
 
     def eyelid_pairs(self) -> Tensor | None:
-        """Pairs of an upper and a lower eyelid vertex (P, 2) by which blinks are seen; None if nobody has listed any.
-
-        Raises:
-            FaceDiffError: if the file that was chosen does not exist, or is not that.
-        """
+        """Pairs of an upper and a lower eyelid vertex (P, 2) by which blinks are seen; None if nobody has listed any."""
         file = self.eyelid_file or EYELID_PAIRS
         pairs = self.corpus.read_pairs(file)
         if pairs is None and self.eyelid_file is not None:
@@ -483,9 +463,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """Factor that gives the training motion unit variance: one over the root mean square of its coordinates.
 
         The mean is not subtracted, since offsets from the template are centred near zero.
-
-        Raises:
-            FaceDiffError: if the training clips hold no motion at all.
         """
         return measure_scale(self.corpus, self.clips("train"), self.trainer)
 
@@ -577,11 +554,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
 
 def person_name(folder: Path) -> str:
-    """The speaker of a folder, as ``facediff data import-person`` wrote it.
-
-    Raises:
-        FaceDiffError: if it is no such folder.
-    """
+    """The speaker of a folder, as ``facediff data import-person`` wrote it."""
     name = read_manifest(folder).get("person")
     if not isinstance(name, str):
         raise FaceDiffError(
@@ -592,11 +565,7 @@ def person_name(folder: Path) -> str:
 
 
 def person_licence(folder: Path) -> Licence:
-    """The terms of an imported speaker's recordings, as ``manifest.json`` of their folder states them.
-
-    Raises:
-        FaceDiffError: if the manifest states them in another form than :meth:`Licence.state`.
-    """
+    """The terms of an imported speaker's recordings, as ``manifest.json`` of their folder states them."""
     manifest = read_manifest(folder)
     stated = manifest.get("licence")
     (label,) = read_licences(folder / "manifest.json", [Licence("speaker").state() if stated is None else stated])

@@ -294,11 +294,7 @@ class ReferencePolicy:
                 self.eligible(clip)
 
     def eligible(self, target: Clip, *, any_mood: bool = False) -> list[Clip]:
-        """The clips that may serve ``target``, never ``target`` itself; the best matching ones unless ``any_mood``.
-
-        Raises:
-            FaceDiffError: if the speaker has no other clip outside the evaluated splits.
-        """
+        """The clips that may serve ``target``, never ``target`` itself; the best matching ones unless ``any_mood``."""
         others = [clip for clip in self.candidates.get(target.identity, []) if clip.name != target.name]
         if not others:
             raise FaceDiffError(
@@ -311,11 +307,7 @@ class ReferencePolicy:
         return alike or others
 
     def evaluated(self, target: Clip) -> Clip:
-        """The one that serves ``target`` in evaluation; it follows from the target's name.
-
-        Raises:
-            FaceDiffError: as :meth:`eligible` does.
-        """
+        """The one that serves ``target`` in evaluation; it follows from the target's name."""
         eligible = self.eligible(target)
         return eligible[zlib.crc32(target.name.encode()) % len(eligible)]
 

@@ -25,9 +25,6 @@ def load_manifest(path: Path, *, name: str = "", remedy: str = REMEDY) -> dict[s
         path: the file.
         name: what messages call it; its path if empty.
         remedy: what messages advise.
-
-    Raises:
-        FaceDiffError: if it is damaged, no object, or of a later format.
     """
     name = name or str(path)
     manifest = load_json(path, name=name, remedy=remedy)
@@ -38,11 +35,7 @@ def load_manifest(path: Path, *, name: str = "", remedy: str = REMEDY) -> dict[s
 
 
 def read_manifest(root: Path) -> dict[str, Any]:
-    """``manifest.json`` of a folder, its facts checked; empty if there is none.
-
-    Raises:
-        FaceDiffError: if it is damaged, of a later format, or a fact is not what it should be.
-    """
+    """``manifest.json`` of a folder, its facts checked; empty if there is none."""
     path = root / "manifest.json"
     if not path.is_file():
         return {}

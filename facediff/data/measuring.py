@@ -39,9 +39,6 @@ def measure_scale(corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None
         corpus: the corpus.
         clips: its training clips.
         trainer: the trainer whose processes share the result; None outside training.
-
-    Raises:
-        FaceDiffError: if the clips hold no motion at all.
     """
 
     def measure() -> npt.NDArray[np.float64]:

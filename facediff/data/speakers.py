@@ -27,9 +27,6 @@ class MeanFaces:
 
     Args:
         data: the corpus.
-
-    Raises:
-        FaceDiffError: if nobody has a training clip.
     """
 
     def __init__(self, data: SpeechMotionDataModule) -> None:
@@ -59,9 +56,6 @@ def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str]) -> Sp
     Args:
         data: the corpus.
         speakers: their names, by number.
-
-    Raises:
-        FaceDiffError: if there are not two speakers with such recordings.
     """
     candidates = data.reference_policy().candidates
     means, numbers = [], []

@@ -61,11 +61,7 @@ class ClipFolder:
         self.n_vertices = n_vertices
 
     def names(self) -> list[str]:
-        """The clips that have both files, sorted.
-
-        Raises:
-            FaceDiffError: if a name cannot be printed.
-        """
+        """The clips that have both files, sorted."""
         names = []
         for name in sorted(path.stem for path in (self.root / "wav").glob("*.wav")):
             if not name.isprintable():
@@ -76,13 +72,9 @@ class ClipFolder:
                 names.append(name)
         return names
 
-    def open(self, name: str) -> MotionFile:
-        """Map a clip's file into memory.
-
-        Raises:
-            FaceDiffError: if it is unreadable, of another shape, or empty.
-        """
-        return MotionFile(motion_path(self.root, name), self.n_vertices)
+    def open(self, name: str) -> VertexFile:
+        """Map a clip's file into memory."""
+        return VertexFile(motion_path(self.root, name), self.n_vertices)
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
@@ -94,7 +86,7 @@ class ClipFolder:
         return facts.st_size, facts.st_mtime_ns
 
 
-class MotionFile:
+class VertexFile:
     """Absolute vertices of a clip in a ``.npy`` file.
 
     Args:
@@ -112,11 +104,7 @@ class MotionFile:
         return len(self.vertices)
 
     def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Offsets from the template of some frames; only these are read.
-
-        Raises:
-            FaceDiffError: if a frame holds what no vertex can be.
-        """
+        """Offsets from the template of some frames; only these are read."""
         picks = within(picks, self.frames)
         if isinstance(picks, range):
             stored = self.vertices[picks.start : picks.stop : picks.step]
@@ -148,9 +136,6 @@ def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int
         vertices: the frames.
         numbers: the frames' numbers in the clip, for the message.
         source: the clip's file.
-
-    Raises:
-        FaceDiffError: naming the first such frame.
     """
     if not in_range(vertices):
         bad = int(np.argmax(~(np.abs(vertices) <= COORDINATE).all((1, 2))))

@@ -54,9 +54,6 @@ def puppet_shapes(speaker: str | None = None) -> tuple[Array, npt.NDArray[np.int
 
     Args:
         speaker: a speaker of the built-in corpus; the common face if None.
-
-    Raises:
-        FaceDiffError: if there is no such speaker.
     """
     if speaker is not None and speaker not in SPEAKERS:
         raise FaceDiffError(f'--identity: there is no speaker "{speaker}"; {choices(speaker, SPEAKERS)}')
@@ -137,9 +134,6 @@ def write_puppet_shapes(folder: Path, speaker: str | None = None) -> list[str]:
 
     Returns:
         the names of the shapes.
-
-    Raises:
-        FaceDiffError: if the folder is there already or cannot be written, or there is no such speaker.
     """
     if folder.exists():
         raise FaceDiffError(f"{folder}: exists already; choose a new folder")

@@ -109,9 +109,6 @@ def generate(
         progress: Whether to show a progress bar.
         only: Names of clips to write instead of all, for trials; such a corpus never counts as complete.
         drawn: How many drawn speakers say the training sentences, besides the eight.
-
-    Raises:
-        FaceDiffError: If the folder holds something else, cannot be written, or espeak-ng is missing.
     """
     root = Path(root)
     chosen = _chosen(only, drawn)

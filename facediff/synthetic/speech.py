@@ -131,9 +131,6 @@ def speak(text: str, voice: EspeakVoice) -> Utterance:
 
     Returns:
         The waveform at 16 kHz and the phonemes with their times.
-
-    Raises:
-        FaceDiffError: If espeakng_loader is not installed or espeak-ng refuses the voice.
     """
     library, _ = _paths()
     return _finish(*(_speak_elsewhere if _is_loaded(library) else _speak_here)(text, voice))

@@ -114,9 +114,6 @@ def identify(
 
     ``recorded`` is the corpus that ``manifest.json`` or ``prepare.json`` names, ``corpus`` the one that the user names,
     ``split`` the only one of the ways in which the corpus is split that is wanted.
-
-    Raises:
-        FaceDiffError: if the user names a corpus or a split that there is not.
     """
     root, n_vertices, findings = folder.root, folder.n_vertices(), report.findings
     module = None if corpus is None else by_name(corpus, n_vertices)
@@ -157,9 +154,6 @@ def view_of(root: Path, corpus: str | None) -> View:
     Args:
         root: the folder.
         corpus: name or import path of its data module; found out if None.
-
-    Raises:
-        FaceDiffError: if that cannot be found out, or its preparation was interrupted.
     """
     from facediff.data.corpus import MOTION_FOLDERS
     from facediff.data.manifest import read_manifest
@@ -359,11 +353,7 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> View:
 
 
 def instance(module: Module, root: Path, way: str | None) -> SpeechMotionDataModule:
-    """The data module of a folder, for one of the ways in which the corpus is split.
-
-    Raises:
-        FaceDiffError: if it needs further parameters.
-    """
+    """The data module of a folder, for one of the ways in which the corpus is split."""
     options: dict[str, Any] = {} if way is None else {"split": way}
     try:
         return module(root=str(root), **options)

@@ -357,9 +357,6 @@ def check_array_metadata(text: bytes, name: str, facts: ArrayFacts) -> None:
     """Refuse an array that its own ``zarr.json`` describes otherwise than the record, or with other codecs.
 
     Only the codecs that ``facediff data pack`` writes are ever run; Zarr knows others, some of which run code.
-
-    Raises:
-        FaceDiffError: naming the field.
     """
     content = parse_json(text, name, remedy=REMEDY)
     width = (facts.width,) if facts.width else ()

@@ -172,9 +172,6 @@ def pack(
         workers: processes; as many as there are processors if None.
         scheduler: where tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
         quiet: no progress bar.
-
-    Raises:
-        FaceDiffError: if the folder cannot be packed, a clip is damaged, or ``out`` is in the way.
     """
     if not lossless and tolerance < FINEST:
         raise FaceDiffError(
@@ -199,11 +196,7 @@ def pack(
 
 
 def require_zarr(purpose: str) -> None:
-    """Refuse to begin what needs the zarr package where it is not installed.
-
-    Raises:
-        MissingExtraError: naming the extra.
-    """
+    """Refuse to begin what needs the zarr package where it is not installed."""
     try:
         import zarr  # noqa: F401
     except ImportError as error:
@@ -234,11 +227,7 @@ class PackingPlan:
     def of(
         cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float, exact: Exact
     ) -> PackingPlan:
-        """Look through a corpus folder.
-
-        Raises:
-            FaceDiffError: if it is none, or a clip has no template.
-        """
+        """Look through a corpus folder."""
         from facediff.data.check.layouts import view_of
 
         view = view_of(root, corpus)
@@ -563,11 +552,7 @@ def _exact(
 
 
 def encode_speech(path: Path) -> bytes:
-    """A recording as FLAC streams after a line of JSON that says where they lie; kept as it is where FLAC would lose.
-
-    Raises:
-        FaceDiffError: if it cannot be read, or is cut short.
-    """
+    """A recording as FLAC streams after a line of JSON that says where they lie; kept as it is where FLAC would lose."""
     import soundfile
 
     with open_sound(path) as file:

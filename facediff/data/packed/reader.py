@@ -47,10 +47,6 @@ class PackedCorpus:
 
     Args:
         source: its folder, or its address.
-
-    Raises:
-        FaceDiffError: if there is none, or its record is damaged.
-        MissingExtraError: if fsspec is needed and not installed.
     """
 
     def __init__(self, source: str | Path) -> None:
@@ -79,11 +75,7 @@ class PackedCorpus:
 
     @cached_property
     def folder(self) -> Path:
-        """A folder on this machine with every file of the corpus but motion and speech, made on first use.
-
-        Raises:
-            FaceDiffError: if a file is not what was packed, or the cache cannot be written.
-        """
+        """A folder on this machine with every file of the corpus but motion and speech, made on first use."""
         place = cache_dir() / "packed" / self.identity / "corpus"
         if not place.is_dir():
             try:
@@ -95,11 +87,7 @@ class PackedCorpus:
         return place
 
     def write_files(self, folder: Path) -> None:
-        """Write every file of the corpus but motion and speech.
-
-        Raises:
-            FaceDiffError: if one is not what was packed.
-        """
+        """Write every file of the corpus but motion and speech."""
         for file in self.record.files.values():
             content = self._arrays["files"].read(file.first, file.first + file.bytes).tobytes()
             if hashlib.sha256(content).hexdigest() != file.sha256:
@@ -158,11 +146,7 @@ class PackedCorpus:
             return read_speech(path)
 
     def samples(self, name: str, first: int, stop: int) -> npt.NDArray[np.int32]:
-        """Samples ``first`` to ``stop`` of a clip (samples, channels) as they were recorded, whole numbers.
-
-        Raises:
-            FaceDiffError: if a stream is damaged, or not what the record says.
-        """
+        """Samples ``first`` to ``stop`` of a clip (samples, channels) as they were recorded, whole numbers."""
         sound = self.record.clips[name].sound
         piece_samples = PIECE_SECONDS * sound.rate
         places = np.cumsum([sound.first, *sound.pieces])
@@ -221,11 +205,7 @@ class PackedMotion:
         return self.clip.frames
 
     def offsets(self, picks: Sequence[int], template: Floats) -> Floats:
-        """Offsets from the template of some frames; only the chunks that hold them are read.
-
-        Raises:
-            FaceDiffError: naming the clip and the chunk that is damaged.
-        """
+        """Offsets from the template of some frames; only the chunks that hold them are read."""
         picks = within(picks, self.frames)
         motion = np.empty((len(picks), self.array.facts.width), np.float32)
         rows_by_chunk = chunks_of(picks, self.array.facts.chunk)

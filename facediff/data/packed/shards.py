@@ -69,11 +69,7 @@ class ShardedArray:
         return blosc, google_crc32c
 
     def fetch(self, first: int, stop: int) -> list[memoryview]:
-        """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array.
-
-        Raises:
-            FaceDiffError: if a shard is missing, cut short or damaged.
-        """
+        """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array."""
         if not self._checked:
             check_array_metadata(
                 self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.facts
@@ -95,11 +91,7 @@ class ShardedArray:
         return encoded
 
     def decode(self, number: int, encoded: memoryview) -> npt.NDArray[Any]:
-        """A chunk (rows, width), or (rows,), in memory that the thread's next chunk overwrites.
-
-        Raises:
-            FaceDiffError: if its checksum or its size is not what it must be.
-        """
+        """A chunk (rows, width), or (rows,), in memory that the thread's next chunk overwrites."""
         blosc, crc32c = self._codecs
         body = encoded[:-CHECKSUM]
         if len(encoded) < HEADER.size + CHECKSUM or crc32c.value(bytes(body)) != int.from_bytes(

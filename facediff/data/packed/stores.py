@@ -202,11 +202,7 @@ def runs(byte_ranges: Sequence[Range]) -> list[list[Range]]:
 
 
 def split(content: bytes | bytearray, run: Sequence[Range], source: object) -> list[memoryview]:
-    """The bytes of a run of ranges, one view for each.
-
-    Raises:
-        FaceDiffError: if there are fewer bytes than asked for, or more, as of a server that ignores ranges.
-    """
+    """The bytes of a run of ranges, one view for each."""
     if len(content) != sum(size for _, size in run):
         raise FaceDiffError(
             f"{source}: gave {len(content)} bytes instead of {sum(size for _, size in run)} from byte {run[0][0]} on; "
@@ -286,11 +282,7 @@ class ChunkCache:
 
 
 def limit_bytes() -> float:
-    """Bytes that the cache may take, as the environment says.
-
-    Raises:
-        FaceDiffError: if the variable is no number from 0 on.
-    """
+    """Bytes that the cache may take, as the environment says."""
     text = os.environ.get(VARIABLE, str(USUAL_GB))
     try:
         limit = float(text)

@@ -53,11 +53,7 @@ class TargetCorpus:
 
 
 def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> TargetCorpus:
-    """Read what a new speaker must match; ``frame_rate`` is needed where ``manifest.json`` does not record it.
-
-    Raises:
-        FaceDiffError: if the folder is no corpus, knows the name already, or its frame rate is unknown or contradicted.
-    """
+    """Read what a new speaker must match; ``frame_rate`` is needed where ``manifest.json`` does not record it."""
     if not root.is_dir():
         raise FaceDiffError(f"--corpus {root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
     templates = read_templates(root / "templates.pkl")
@@ -100,11 +96,7 @@ def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
 
 
 def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
-    """Whether faces could be compared with the corpus's.
-
-    Raises:
-        FaceDiffError: if they could, and are others.
-    """
+    """Whether faces could be compared with the corpus's."""
     if faces is None or target.faces is None:
         return False
     differing = differing_faces(faces, target.faces)
@@ -117,11 +109,7 @@ def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
 
 
 def lay_onto_corpus(path: Path, face: Array, target: TargetCorpus) -> tuple[Similarity, float]:
-    """The similarity from a face to the corpus's mean face, and what is left as a share of the face's size.
-
-    Raises:
-        FaceDiffError: naming ``path``, if so much is left that the vertices cannot be in the corpus's order.
-    """
+    """The similarity from a face to the corpus's mean face, and what is left as a share of the face's size."""
     map_ = robust_align(face, target.mean, scale=True)
     residual = relative_residual(map_.apply(face), target.mean)
     if not residual < RESIDUAL_LIMIT:
@@ -182,11 +170,7 @@ def read_stable(source: str, n_vertices: int) -> Indices:
 
 
 def stabilise(motion: FaceSequence, face: Array, stable: Indices, scratch: Path) -> Stabilised:
-    """Align every frame with the median face (V, 3); parameters without head motion stay as they are.
-
-    Raises:
-        FaceDiffError: if a frame holds NaN, or if nothing moves.
-    """
+    """Align every frame with the median face (V, 3); parameters without head motion stay as they are."""
     count = len(motion.frames)
     if motion.has_head_motion:
         frames = scratch_array(scratch, motion.frames.shape)
@@ -300,11 +284,7 @@ def _onto_template(stabilised: Stabilised, template: Template) -> Similarity:
 
 
 def read_template(path: Path, target: TargetCorpus) -> Template:
-    """A neutral face from .obj, .ply or .npy.
-
-    Raises:
-        FaceDiffError: if it is none of these, damaged, of another topology than the corpus, or holds NaN.
-    """
+    """A neutral face from .obj, .ply or .npy."""
     suffix, faces, count = path.suffix.lower(), None, target.n_vertices
     vertices: Array
     if suffix == ".npy":

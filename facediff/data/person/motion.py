@@ -42,9 +42,6 @@ def read_motion(
 
     ``flame`` is the FLAME model file, needed for parameters and only for them; ``scratch`` is a temporary file for
     frames that must be put together.
-
-    Raises:
-        FaceDiffError: if it is none of these, or damaged.
     """
     parameters = path.suffix.lower() in HDF5_SUFFIXES
     if path.suffix.lower() == ".npy" and path.is_file():
@@ -105,9 +102,6 @@ def read_frames(
 
     Returns:
         vertices (T, V, 3), the faces that all files share (None if they have none), and remarks for the user.
-
-    Raises:
-        FaceDiffError: naming the file, if one is unreadable or of another topology; if too many frames are missing.
     """
     files = find_frames(folder)
     gaps = files.missing()
@@ -169,11 +163,7 @@ class FrameFiles:
 
 
 def find_frames(folder: Path) -> FrameFiles:
-    """The mesh files of a folder, in the natural order of the one number in which their names differ.
-
-    Raises:
-        FaceDiffError: if there is none, if names differ in more than that number, or if two have the same number.
-    """
+    """The mesh files of a folder, in the natural order of the one number in which their names differ."""
     try:
         paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES and not p.name.startswith("."))
     except OSError as error:

@@ -78,9 +78,6 @@ def plan(
         dtype: of the motion on disk; ``float64`` is what CodeTalker writes and takes twice the space
         subjects: only these, e.g. F2,F3,M5; all that are there if not given
         regions: folder with lve.txt and fdd.txt; regions/ of the raw folder if not given
-
-    Raises:
-        FaceDiffError: if there is no usable sequence, a subject is unknown, or the templates do not fit together.
     """
     chosen = choose_subjects(subjects, SUBJECTS, "BIWI")
     region_files = find_regions(raw, regions)
@@ -126,11 +123,7 @@ def plan(
 def prepare_clip(
     name: str, folder: Path, sound: Path, template_file: Path, normalise: Normalisation, dtype: Precision, out: Path
 ) -> int:
-    """Write one sequence and return its number of frames.
-
-    Raises:
-        FaceDiffError: if a frame or the sound cannot be used; the file is named.
-    """
+    """Write one sequence and return its number of frames."""
     from facediff.speech.audio import read_speech
 
     template, faces = read_template(template_file)
@@ -277,11 +270,7 @@ def _count_frames(name: str, folder: Path, notes: list[str]) -> int:
 
 
 def frame_files(folder: Path) -> dict[int, Path]:
-    """The frames of a sequence by number, in numeric order.
-
-    Raises:
-        FaceDiffError: if the folder cannot be read, or two files claim the same number.
-    """
+    """The frames of a sequence by number, in numeric order."""
     files: dict[int, Path] = {}
     try:
         names = os.listdir(folder)
@@ -307,11 +296,7 @@ def gaps(numbers: list[int]) -> list[str]:
 
 
 def check_sizes(files: list[Path]) -> None:
-    """All frames of a sequence must be of one size, or a truncated file could pass for one with a shorter header.
-
-    Raises:
-        FaceDiffError: naming the first file that is not as large as most are.
-    """
+    """All frames of a sequence must be of one size, or a truncated file could pass for one with a shorter header."""
     sizes = [path.stat().st_size for path in files]
     usual = max(set(sizes), key=lambda size: (sizes.count(size), size))
     for path, size in zip(files, sizes, strict=True):
@@ -323,11 +308,7 @@ def check_sizes(files: list[Path]) -> None:
 
 
 def read_vl(path: Path) -> npt.NDArray[np.float32]:
-    """Vertices (V, 3) of one frame, in mm. The width of the count follows from the file's size.
-
-    Raises:
-        FaceDiffError: if the file is missing, or its size does not fit its count: bytes found and expected are named.
-    """
+    """Vertices (V, 3) of one frame, in mm. The width of the count follows from the file's size."""
     try:
         if not path.is_file():  # a device would never end
             raise OSError(0, "no regular file")

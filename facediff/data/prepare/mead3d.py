@@ -122,9 +122,6 @@ def plan(
         subjects: only these speakers; all that are there if None.
         regions: folder with ``lve.txt`` and ``fdd.txt``; ``regions/`` of the raw folder if None.
         quiet: no progress bar.
-
-    Raises:
-        FaceDiffError: if there is no usable clip, a speaker is unknown, or the model file is none.
     """
     model = load_flame(flame)
     region_files = find_regions(raw, regions)
@@ -173,11 +170,7 @@ def plan(
 def prepare_clip(
     name: str, file: Path, sound: Path, model: Path, shape: Array | None, dtype: Precision, out: Path
 ) -> int:
-    """Write one clip, with its own shape if ``shape`` is None, and return its number of frames.
-
-    Raises:
-        FaceDiffError: if the parameters or the sound cannot be used; the file is named.
-    """
+    """Write one clip, with its own shape if ``shape`` is None, and return its number of frames."""
     from facediff.speech.audio import read_speech
 
     parameters = read_parameters(file)
@@ -286,11 +279,7 @@ class RawDistribution:
 
 
 def find_recordings(raw: Path) -> RawDistribution:
-    """Every clip of a raw folder, which holds EMOTE's distribution or ProbTalk3D's; the folder's layout says which.
-
-    Raises:
-        FaceDiffError: if there is neither, or more than one.
-    """
+    """Every clip of a raw folder, which holds EMOTE's distribution or ProbTalk3D's; the folder's layout says which."""
     bases = [
         folder
         for folder in _folders(raw)
@@ -327,9 +316,6 @@ def find_sounds(root: Path) -> dict[str, Path]:
 
     MEAD has it in ``<speaker>/audio/<emotion>/level_<k>/<number>.m4a``; converted files may lie in the same place, in
     ``<speaker>/<emotion>/level_<k>/``, or under the clip's name in one folder.
-
-    Raises:
-        FaceDiffError: if there is no such folder or it cannot be read.
     """
     best: dict[str, tuple[int, Path]] = {}
     for folder in _folders(root):

@@ -52,9 +52,6 @@ def resample_frames(
         rate_in: frames a second of ``motion``.
         rate_out: frames a second of the result.
         out: where to write, shape (round(T · rate_out / rate_in), C); a new array of ``motion``'s type if None.
-
-    Raises:
-        FaceDiffError: if a rate is not positive, or the result would have no frame.
     """
     if not (rate_in > 0 and rate_out > 0 and math.isfinite(rate_in) and math.isfinite(rate_out)):
         raise FaceDiffError(f"frame rates {rate_in:g} and {rate_out:g}: expected positive numbers of frames a second")
@@ -148,10 +145,6 @@ def read_parameters(path: Path) -> Parameters:
 
     The shape is the mean over all frames with equal weights, since these files do not say how well the face was seen
     in each. Rotation of the head and the camera are left out.
-
-    Raises:
-        FaceDiffError: if the file is missing or damaged, lacks something, or holds NaN.
-        MissingExtraError: if h5py is not installed and needed.
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected FLAME parameters, .hdf5 or .npy")

@@ -356,11 +356,7 @@ def write_clip(
 
 
 def write_motion(path: Path, vertices: npt.NDArray[np.floating], dtype: Precision = "float32") -> None:
-    """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically.
-
-    Raises:
-        FaceDiffError: if there is no frame, a value is not finite, or the file cannot be written.
-    """
+    """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically."""
     frames = len(vertices)
     if not frames:
         raise FaceDiffError(f"{path.stem}: has no frame; expected at least one")
@@ -406,11 +402,7 @@ def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]
 
 
 def write_mesh(path: Path, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> None:
-    """Write vertices (V, 3) and triangles (F, 3) as binary PLY, atomically.
-
-    Raises:
-        MissingExtraError: if trimesh is not installed.
-    """
+    """Write vertices (V, 3) and triangles (F, 3) as binary PLY, atomically."""
     try:
         import trimesh
     except ImportError as error:
@@ -434,22 +426,14 @@ def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str
 
 
 def bases(raw: Path) -> list[Path]:
-    """The raw folder and the folders in it, sorted and without hidden ones: where a data set may begin.
-
-    Raises:
-        FaceDiffError: if there is no such folder or it cannot be read.
-    """
+    """The raw folder and the folders in it, sorted and without hidden ones: where a data set may begin."""
     if not raw.is_dir():
         raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed, unpacked")
     return [raw, *folders_in(raw)]
 
 
 def folders_in(folder: Path) -> list[Path]:
-    """Folders in a folder, sorted, without hidden ones.
-
-    Raises:
-        FaceDiffError: if it cannot be read.
-    """
+    """Folders in a folder, sorted, without hidden ones."""
     try:
         return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
     except OSError as error:
@@ -462,11 +446,7 @@ def find_file(raw: Path, name: str) -> Path | None:
 
 
 def find_regions(raw: Path, chosen: Path | None) -> list[Path]:
-    """The lists of vertices in the folder given, else in ``regions/`` of the raw folder if there is one.
-
-    Raises:
-        FaceDiffError: if the folder given holds no list.
-    """
+    """The lists of vertices in the folder given, else in ``regions/`` of the raw folder if there is one."""
     folder = chosen or next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
     files = [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
     if chosen is not None and not files:

@@ -73,9 +73,6 @@ def plan(
             ``filtered``, which first removes the frequencies that would alias
         dtype: of the motion on disk
         regions: folder with lists of vertices; regions/ of the raw folder if not given
-
-    Raises:
-        FaceDiffError: if a file is missing or is not what it should be, or no clip is complete.
     """
     if frame_rate == 60 and decimate != "every_second":
         raise FaceDiffError(f"--decimate {decimate}: nothing is decimated at 60 frames a second; omit it")
@@ -134,9 +131,6 @@ def prepare_clip(
     """Write one clip and return its number of frames.
 
     As many frames are used as both the map and the sound have, as in VOCA.
-
-    Raises:
-        FaceDiffError: if a row is missing or holds NaN, or the sound cannot be used.
     """
     from facediff.speech.audio import to_speech
 
@@ -177,9 +171,6 @@ def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], fl
     """Samples (S,) or (S, channels) in -1 … 1 and sample rate of an entry ``{"audio": …, "sample_rate": …}``.
 
     Whole numbers are 16-bit samples, whatever their type; so are floats beyond -1 … 1.
-
-    Raises:
-        FaceDiffError: if the entry is something else.
     """
     if not isinstance(entry, dict) or not {"audio", "sample_rate"} <= set(entry):
         raise FaceDiffError(f'{where}: expected a dict with "audio" and "sample_rate" in {AUDIO}')
