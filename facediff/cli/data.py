@@ -1,4 +1,4 @@
-"""``facediff data``: preparing, checking, packing and importing corpora."""
+"""``facediff data``: prepare, check, pack and import corpora."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import inspect
 import json as json_format
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -26,8 +28,55 @@ if TYPE_CHECKING:
 Root = Annotated[Path, Option(reads=True)]
 Packed = Annotated[str, Option(reads=True)]
 """A folder, or the address of a packed corpus, such as ``s3://bucket/corpus.zarr``."""
+NewFolder = Annotated[Path, Option(writes="folder")]
 
-# ``facediff data check``
+SHOWN = 20
+"""Lines of a list on the screen; the whole list is in the manifest."""
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """Where the work is done.
+
+    Attributes:
+        workers: clips at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        quiet: no progress bars
+    """
+
+    workers: Workers = None
+    scheduler: Scheduler = None
+    quiet: bool = False
+
+
+USUAL_WORK = WorkOptions()
+
+
+def require_folder(source: str | Path, expected: str) -> None:
+    """Refuse what is neither a folder nor an address, before anything heavy is imported."""
+    if "://" not in str(source) and not Path(source).expanduser().is_dir():
+        raise FaceDiffError(f"{source}: no such folder; expected {expected}")
+
+
+def find_own_module(corpus: str | None) -> None:
+    """Let ``--corpus module.Class`` import a module of the working folder."""
+    if corpus and "." in corpus:
+        sys.path.append(os.getcwd())
+
+
+@contextmanager
+def resumable(out: Path) -> Iterator[None]:
+    """Say on Ctrl-C that the work can be continued."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"\nstopped; the same command continues where {printable(out)} was left", file=sys.stderr)
+        raise
+
+
+def shortened(lines: Sequence[str], rest: str) -> list[str]:
+    """The first lines of a long list, and what is said of the rest, in which {} is the number of lines left out."""
+    return [*lines[:SHOWN], *([rest.format(len(lines) - SHOWN)] if len(lines) > SHOWN else [])]
 
 
 def check(
@@ -37,29 +86,25 @@ def check(
     split: Annotated[str | None, Option(metavar="NAME")] = None,
     quick: bool = False,
     json: bool = False,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    quiet: bool = False,
+    work: WorkOptions = USUAL_WORK,
 ) -> int:
-    """Report what a corpus folder is, what is there, what is missing and what is wrong in it.
+    """Report which corpus a folder holds, what is missing and what is wrong in it.
 
     Nothing is changed. Exit status: 0 sound (warnings allowed), 1 not sound, 2 wrong usage.
 
     Args:
         root: the corpus folder, or a packed corpus: its folder or its address
-        corpus: what it is: biwi, vocaset, mead3d, puppet, or package.module.Class
-        split: totals of one way to split the corpus only (3DMEAD: sentence, identity)
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, or package.module.Class
+        split: count the clips of one way to split the corpus only (3DMEAD: sentence, identity)
         quick: read headers only, and compare files by size
         json: machine-readable: one object
-        workers: clips at a time (default: as many as processors if there is much to read)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
-        quiet: no progress bar
+        work: where the work is done
 
     Returns:
         0 if the folder is sound, 1 if not.
     """
-    refuse_no_folder(root, "a corpus folder")
-    check_scheduler(scheduler)
+    require_folder(root, "a corpus folder")
+    check_scheduler(work.scheduler)
     from facediff.data.check import check as check_folder
     from facediff.data.check import text
 
@@ -69,35 +114,19 @@ def check(
         corpus,
         split=split,
         quick=quick,
-        workers=workers,
-        scheduler=scheduler,
-        progress=not (json or quiet),
+        workers=work.workers,
+        scheduler=work.scheduler,
+        progress=not (json or work.quiet),
     )
-    if json:
-        tell(*json_format.dumps(report.state(), indent=2, allow_nan=False).split("\n"))
-    else:
-        tell(*text(report).split("\n"))
+    lines = json_format.dumps(report.state(), indent=2, allow_nan=False) if json else text(report)
+    tell(*lines.split("\n"))
     return 0 if report.sound else 1
-
-
-def refuse_no_folder(source: str, expected: str) -> None:
-    """Refuse what is neither a folder nor an address, before anything heavy is imported."""
-    if "://" not in source and not Path(source).expanduser().is_dir():
-        raise FaceDiffError(f"{source}: no such folder; expected {expected}")
-
-
-def find_own_module(corpus: str | None) -> None:
-    """Let a data module of one's own be a file of the working folder."""
-    if corpus and "." in corpus:
-        sys.path.append(os.getcwd())
 
 
 # ``facediff data prepare``: the options of a corpus are the keyword parameters of its plan.
 
 CORPORA = ("biwi", "vocaset", "mead3d")
 """Modules of :mod:`facediff.data.prepare`; each has a ``plan(raw, *, …)`` whose keyword parameters are its options."""
-SHOWN = 20
-"""Lines of a list on the screen; the whole list is in the manifest."""
 PREPARE = """usage: facediff data prepare <corpus> RAW OUT [options]
 
 Write a corpus folder from a data set as its authors distribute it. A run that was stopped is continued by the same
@@ -116,7 +145,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
 
 def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], PreparationPlan], dict[str, Any]]:
-    """What makes the plan of a raw folder, and the arguments of :func:`prepare`, from a command line."""
+    """A function that plans a raw folder, and the arguments of :func:`prepare`, from a command line."""
     corpus, *remaining = arguments
     if corpus not in CORPORA:
         raise FaceDiffError(f'there is no corpus "{corpus}" to prepare: {choices(corpus, CORPORA)}')
@@ -124,8 +153,8 @@ def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], Preparation
     title = (module.__doc__ or "").partition("\n")[0]
     values = parse(options_of(module.plan), remaining, f"facediff data prepare {corpus}", title)
     own = {name: values.pop(name) for name in plan_options(module.plan)}
-    if "quiet" in inspect.signature(module.plan).parameters:  # a scan that takes long has a progress bar
-        own["quiet"] = values["quiet"]
+    if "quiet" in inspect.signature(module.plan).parameters:  # a long scan has a progress bar
+        own["quiet"] = values["work"].quiet
     return partial(module.plan, **own), values
 
 
@@ -137,73 +166,51 @@ def plan_options(plan: Callable[..., PreparationPlan]) -> dict[str, Parameter | 
 def options_of(plan: Callable[..., PreparationPlan]) -> Parameters:
     """The options of ``facediff data prepare`` for a corpus."""
 
-    def common(
-        raw: Root,
-        out: Annotated[Path, Option(writes="folder")],
-        *,
-        workers: Workers = None,
-        scheduler: Scheduler = None,
-        quiet: bool = False,
-    ) -> None:
+    def common(raw: Root, out: NewFolder, *, work: WorkOptions = USUAL_WORK) -> None:
         """Prepare.
 
         Args:
             raw: the raw data set, unpacked
             out: folder to write: a new one, or one that this command has begun
-            workers: clips at a time (default: as many as processors)
-            scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm
-                (docs/cluster.md)
-            quiet: no progress bars
+            work: where the work is done
         """
 
     return {**parameters_of(common), **plan_options(plan)}
 
 
 def prepare(
-    make_plan: Callable[[Path], PreparationPlan],
-    *,
-    raw: Path,
-    out: Path,
-    workers: int | None,
-    scheduler: str | None = None,
-    quiet: bool,
+    make_plan: Callable[[Path], PreparationPlan], *, raw: Path, out: Path, work: WorkOptions = USUAL_WORK
 ) -> int:
-    """Prepare a data set and print what came of it."""
+    """Prepare a data set and print a report."""
     from facediff.data.prepare.runner import prepare as carry_out
 
-    check_scheduler(scheduler)
-    source, target = raw.resolve(), out.resolve()
-    if target == source or source in target.parents:  # the next run would find what is written as raw data
+    check_scheduler(work.scheduler)
+    if out.resolve().is_relative_to(raw.resolve()):  # the next run would read what is written as raw data
         raise FaceDiffError(f"{out}: lies in the raw folder {raw}; choose a folder outside it to write to")
-    if not raw.is_dir():
-        raise FaceDiffError(f"{raw}: no such folder; expected the raw data set, unpacked")
-    try:
-        report = carry_out(make_plan(raw), out, workers=workers, scheduler=scheduler, reads=[raw], quiet=quiet)
-    except KeyboardInterrupt:
-        print(f"\nstopped; the same command continues where {printable(out)} was left", file=sys.stderr)
-        raise
+    require_folder(raw, "the raw data set, unpacked")
+    with resumable(out):
+        report = carry_out(make_plan(raw), out, reads=[raw], **vars(work))
     tell(*describe(report))
     return 0 if report.sound else 1
 
 
 def describe(report: PreparationReport) -> list[str]:
     """The report as lines for the screen."""
-    totals = report.totals
+    totals, manifest = report.totals, report.out / "manifest.json"
     lines = [
         f"{report.out}: {totals['clips']} clips, {totals['frames']} frames, {totals['seconds'] / 60:.1f} min, "
         f"{totals['bytes'] / 1e9:.2f} GB; {report.written} written now"
     ]
     for title, entries in (("missing", report.missing), ("failed", report.failed)):
         if entries:
-            listed = grouped(entries)
-            lines += [f"{title}: {len(entries)}", *(f"  {line}" for line in listed[:SHOWN])]
-            if len(listed) > SHOWN:
-                lines.append(f"  … and more, see {report.out / 'manifest.json'}")
-    lines += [f"note: {note}" for note in report.notes[:SHOWN]]
-    if len(report.notes) > SHOWN:
-        lines.append(f"note: … and {len(report.notes) - SHOWN} more, see {report.out / 'manifest.json'}")
-    lines.append(f"Next: facediff data check {report.out}")
-    return lines
+            listed = [f"  {line}" for line in grouped(entries)]
+            lines += [f"{title}: {len(entries)}", *shortened(listed, f"  … and {{}} more, see {manifest}")]
+    notes = [f"note: {note}" for note in report.notes]
+    return [
+        *lines,
+        *shortened(notes, f"note: … and {{}} more, see {manifest}"),
+        f"Next: facediff data check {report.out}",
+    ]
 
 
 def grouped(entries: dict[str, str]) -> list[str]:
@@ -224,7 +231,7 @@ def grouped(entries: dict[str, str]) -> list[str]:
 
 def pack(
     root: Root,
-    out: Annotated[Path, Option(writes="folder")],
+    out: NewFolder,
     *,
     corpus: Corpus = None,
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.01,
@@ -232,11 +239,9 @@ def pack(
     exact: Literal["test", "none"] = "test",
     unit: Annotated[str | None, Option(metavar="U")] = None,
     chunk_seconds: Annotated[ranges.ChunkLength, Option(metavar="S")] = 0.5,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    quiet: bool = False,
+    work: WorkOptions = USUAL_WORK,
 ) -> None:
-    """Pack a corpus into one Zarr store, about a sixth of its size, that is also read from an address.
+    """Pack a corpus into one Zarr store, about a sixth of its size, that can also be read from an address.
 
     Every data module reads it: --data.root=OUT.zarr, or the address that it was copied to. A run that was stopped is
     continued by the same command.
@@ -244,23 +249,21 @@ def pack(
     Args:
         root: the corpus folder
         out: packed corpus to write, a name that ends in .zarr: a new one, or one that this command has begun
-        corpus: what the folder is: biwi, vocaset, mead3d, puppet, or package.module.Class
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, or package.module.Class
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
         exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
         unit: the corpus's unit of length, m, cm, mm or a number of metres (default: that of its manifest.json, or the
             corpus's own)
         chunk_seconds: motion is read in pieces of this length
-        workers: processes (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
-        quiet: no progress bar
+        work: where the work is done
     """
-    refuse_no_folder(str(root), "a corpus folder")
-    check_scheduler(scheduler)
+    require_folder(root, "a corpus folder")
+    check_scheduler(work.scheduler)
     from facediff.data.packed.packing import pack as pack_folder
 
     find_own_module(corpus)
-    try:
+    with resumable(out):
         report = pack_folder(
             root.expanduser(),
             out,
@@ -270,46 +273,30 @@ def pack(
             exact=exact,
             unit=unit,
             chunk_seconds=chunk_seconds,
-            workers=workers,
-            scheduler=scheduler,
-            quiet=quiet,
+            **vars(work),
         )
-    except KeyboardInterrupt:
-        print(f"\nstopped; the same command continues where {printable(out)} was left", file=sys.stderr)
-        raise
-    left = [f"note: left out, since no clip has it: {name}" for name in report.left_out[:SHOWN]]
-    if len(report.left_out) > SHOWN:
-        left.append(f"note: … and {len(report.left_out) - SHOWN} more")
+    left_out = [f"note: left out, since it belongs to no clip: {name}" for name in report.left_out]
     tell(
         f"{out}: {report.clips} clips, {report.seconds / 60:.1f} min, {report.after / 1e9:.3g} GB of "
         f"{report.before / 1e9:.3g} GB, {report.gb_an_hour:.2f} GB an hour; {report.written} shards written now",
-        *left,
+        *shortened(left_out, "note: … and {} more"),
         f"Next: facediff data check {out}",
     )
 
 
-def unpack(
-    packed: Packed,
-    out: Annotated[Path, Option(writes="folder")],
-    *,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    quiet: bool = False,
-) -> None:
-    """Write the corpus folder that a packed corpus holds.
+def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions = USUAL_WORK) -> None:
+    """Write a packed corpus back as a corpus folder.
 
     Args:
         packed: folder of a packed corpus (.zarr), or its address
         out: folder to make
-        workers: processes (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
-        quiet: no progress bar
+        work: where the work is done
     """
-    refuse_no_folder(packed, "a packed corpus, as `facediff data pack` writes it, or its address")
-    check_scheduler(scheduler)
+    require_folder(packed, "a packed corpus, as `facediff data pack` writes it, or its address")
+    check_scheduler(work.scheduler)
     from facediff.data.packed.unpacking import unpack as unpack_folder
 
-    clips = unpack_folder(packed, out, workers=workers, scheduler=scheduler, quiet=quiet)
+    clips = unpack_folder(packed, out, **vars(work))
     tell(f"{out}: {clips} clips", f"Next: facediff data check {out}")
 
 
@@ -346,17 +333,17 @@ def import_person(
         output: folder to make
         frame_rate: frames a second of MOTION
         corpus_frame_rate: frames a second of the corpus; needed if ROOT has no manifest.json that says it
-        template: neutral face (.obj, .ply, .npy) in MOTION's unit; without it, found where the person is silent and
-            still
-        stable: text file with the indices of vertices that move with the skull only, or
-            FLAME_masks.pkl:scalp+forehead; without it, the vertices that are found to move least
+        template: neutral face (.obj, .ply, .npy) in MOTION's unit (default: the median of frames in which the person
+            is silent and still)
+        stable: text file with the indices of vertices that move with the skull only, or FLAME_masks.pkl:scalp+forehead
+            (default: the vertices that move least)
         flame: your FLAME model file, for FLAME parameters
-        scale: corpus units to a unit of MOTION, e.g. 0.001; measured by default
-        clip_seconds: length of a clip, about
+        scale: corpus units to a unit of MOTION, e.g. 0.001 (default: measured)
+        clip_seconds: approximate length of a clip
         quiet: no progress bar
     """
-    needed = (("MOTION", motion, "file or folder"), ("--audio", audio, "sound file"), ("--corpus", corpus, "folder"))
-    for option, path, kind in needed:
+    required = (("MOTION", motion, "file or folder"), ("--audio", audio, "sound file"), ("--corpus", corpus, "folder"))
+    for option, path, kind in required:
         if not path.exists():
             raise FaceDiffError(f"{option} {path}: no such {kind}")
     from facediff.data.corpus import read_manifest
@@ -392,23 +379,23 @@ def regions(
     upper_face: FileOrList = None,
     size: Size = 640,
 ) -> None:
-    """Draw a corpus's lips and upper face, the vertices that LVE and FDD look at, on its mesh.
+    """Draw a corpus's lips and upper face, the vertices over which LVE and FDD are computed, on its mesh.
 
     Each region's name, vertex count and hash are written below. Needs the corpus's mesh and region files, no clips.
 
     Args:
         root: the corpus folder
         output: the picture (.png)
-        corpus: what the folder is: biwi, vocaset, mead3d, puppet, or package.module.Class
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, or package.module.Class
         lips: file in the folder, e.g. regions/lve.txt or FLAME_masks.pkl:lips (default: the corpus's own)
-        upper_face: likewise, e.g. FLAME_masks.pkl:forehead+eye_region
+        upper_face: file in the folder, e.g. regions/fdd.txt or FLAME_masks.pkl:forehead+eye_region (default: the
+            corpus's own)
         size: height of each view in pixels
     """
     if output.suffix.lower() != ".png":
         raise FaceDiffError(f'--output {output}: unknown suffix "{output.suffix}"; expected a picture .png')
     root = root.expanduser()
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
+    require_folder(root, "a corpus folder with a mesh and regions/")
     from facediff.data.packed.stores import is_packed
     from facediff.evaluation.figures.regions import draw_regions
 

@@ -376,7 +376,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return by_speaker
 
     def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
-        """The samples of a split: whole clips with fixed references, or (``training``) random windows and references."""
+        """Samples of a split: whole clips with fixed references, or in training random windows and references."""
         clips = self.clips(split)
         if not clips:
             raise FaceDiffError(
@@ -450,7 +450,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return self._assets
 
     def eyelid_pairs(self) -> Tensor | None:
-        """Pairs of an upper and a lower eyelid vertex (P, 2) by which blinks are seen; None if nobody has listed any."""
+        """Pairs of an upper and a lower eyelid vertex (P, 2), to detect blinks; None if the corpus has no list."""
         file = self.eyelid_file or EYELID_PAIRS
         pairs = self.corpus.read_pairs(file)
         if pairs is None and self.eyelid_file is not None:

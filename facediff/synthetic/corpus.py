@@ -22,9 +22,8 @@ from facediff.synthetic.speech import SENTENCES, SpokenPhoneme, speak
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder
-from facediff.utils.jobs import is_cluster, run_tasks
+from facediff.utils.jobs import in_order, is_cluster, run_tasks
 from facediff.utils.plain_files import read_json, write_json, write_table
-from facediff.utils.workers import WorkerDied
 
 FORMAT = 1
 GENERATOR = "1.1"
@@ -64,6 +63,9 @@ class SyntheticClip:
     def name(self) -> str:
         """Name of the clip and stem of its files, such as ``"F1_e01"``."""
         return f"{self.identity}_{self.sentence}"
+
+    def __str__(self) -> str:
+        return self.name
 
 
 def clips(drawn: int = 0) -> tuple[SyntheticClip, ...]:
@@ -238,7 +240,6 @@ def _write_clips(
     folder: Path, chosen: Sequence[SyntheticClip], seed: int, workers: int | None, scheduler: str | None, progress: bool
 ) -> int:
     """Write all clips and return how many frames they have together."""
-    total = 0
     results = run_tasks(
         partial(_write_clip, folder, seed=seed),
         chosen,
@@ -248,11 +249,7 @@ def _write_clips(
         progress="Puppet corpus" if progress else "",
     )
     with closing(results):
-        for clip, frames in results:
-            if isinstance(frames, WorkerDied):
-                raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
-            total += frames
-    return total
+        return sum(frames for _, frames in in_order(results, chosen))
 
 
 def _write_clip(folder: Path, clip: SyntheticClip, seed: int) -> int:

@@ -45,11 +45,10 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.speech.audio import open_sound
 from facediff.utils.arrays import open_vertices
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
-from facediff.utils.jobs import run_tasks
+from facediff.utils.jobs import in_order, run_tasks
 from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.units import metres_per_unit
-from facediff.utils.workers import WorkerDied
 
 if TYPE_CHECKING:
     from facediff.data.check.layouts import View
@@ -400,11 +399,8 @@ def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str
         progress="" if quiet else "packing",
     )
     with closing(results):
-        for task, died in results:
-            if isinstance(died, WorkerDied):
-                raise FaceDiffError(
-                    f"{out / task.target}: writing it killed its process, perhaps for lack of memory; try --workers 1"
-                )
+        for _ in in_order(results, tasks):
+            pass
     record = _finish(plan, out)
     return _report(plan, record, out, sum(bool(task.coding) for task in tasks))
 
@@ -552,7 +548,7 @@ def _exact(
 
 
 def encode_speech(path: Path) -> bytes:
-    """A recording as FLAC streams after a line of JSON that says where they lie; kept as it is where FLAC would lose."""
+    """A line of JSON, then the recording as FLAC streams; as the file itself where FLAC would lose something."""
     import soundfile
 
     with open_sound(path) as file:

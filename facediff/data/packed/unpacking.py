@@ -17,9 +17,9 @@ from facediff.data.packed.reader import PackedCorpus
 from facediff.errors import FaceDiffError
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import atomic_folder
-from facediff.utils.jobs import PerWorker, run_tasks
+from facediff.utils.jobs import PerWorker, in_order, run_tasks
 from facediff.utils.plain_files import write_json
-from facediff.utils.workers import WorkerDied, processors
+from facediff.utils.workers import processors
 
 
 def unpack(
@@ -61,11 +61,8 @@ def unpack(
             progress="" if quiet else "unpacking",
         )
         with closing(results):
-            for name, died in results:
-                if isinstance(died, WorkerDied):
-                    raise FaceDiffError(
-                        f"clip {name}: writing it killed its process, perhaps for lack of memory; try --workers 1"
-                    )
+            for _ in in_order(results, packed.names()):
+                pass
         _correct_manifest(folder, packed, workers)
     return len(packed.names())
 
