@@ -1,9 +1,9 @@
-"""Speech of training clips as other voices, rooms and microphones would have it, while the motion stays the truth.
+"""Augmentations of training speech: other voices, rooms, microphones and noise, while the motion stays the same.
 
-A model that has only heard a speech synthesiser takes the synthesiser's voice for speech itself. What is changed here
-is what a face does not depend on: pitch and formants, loudness, the spectrum of a microphone or a telephone, the room,
-noise and hum. Two entries change the motion as well: :class:`Speed`, and :class:`Pauses`, which teaches that no speech
-means a mouth at rest, however loud the noise.
+A model that is trained on few voices, or on a speech synthesiser, overfits to them. The augmentations change properties
+that facial motion does not depend on: pitch and formants, loudness, the spectrum of a microphone or a telephone, the
+room, noise and hum. Two change the motion as well: :class:`Speed`, and :class:`Pauses`, which teaches that silence means
+a mouth at rest, however loud the noise.
 
 They are registered under the kind ``augmentation`` and chosen by name with their options::
 
@@ -55,7 +55,7 @@ class Example:
         speech: (S,) at 16 kHz.
         motion: (T, V, 3) offsets from the template, over the same time.
         frame_rate: of the motion.
-        rest: (V, 3) the speaker's face when nothing is said.
+        rest: (V, 3) the speaker's face in silence.
         mouth: (V,) which vertices speech moves, 0 to 1; the others keep their motion in a pause.
     """
 
@@ -74,7 +74,7 @@ class Augmentation(ABC):
     """
 
     moves: bool = False
-    """Whether it changes the number of frames, so that speech and motion are no longer those of the corpus's frames."""
+    """Whether it changes the number of frames, so that windows and pairs of clips no longer fit the corpus's frames."""
 
     def __init__(self, *, share: Share = 0.5) -> None:
         self.share = share
@@ -90,8 +90,8 @@ class Augmentation(ABC):
         """The changed clip; its speech has as many samples as its frames last."""
 
 
-class OfSpeech(Augmentation):
-    """A change of the speech alone."""
+class SpeechAugmentation(Augmentation):
+    """An augmentation that changes the speech alone."""
 
     def __call__(self, example: Example, random: np.random.Generator) -> Example:
         """The clip with other speech of the same length."""
@@ -102,7 +102,7 @@ class OfSpeech(Augmentation):
 
     @abstractmethod
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Other speech (S',), whose samples go with those of the speech; cut or filled up where it is not as long."""
+        """Changed speech (S',), in time with ``speech``; it is cut or padded to the same length afterwards."""
 
 
 class Augmenter:
@@ -150,16 +150,16 @@ def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
 
 
 @augmentation.register("voice")
-class Voice(OfSpeech):
+class Voice(SpeechAugmentation):
     """Another speaker's pitch and formants, each by a random amount.
 
     The pitch is shifted by a phase vocoder and resampling, the spectral envelope is warped along frequency (vocal-tract
-    length), so that the two do not depend on one another; the times of sounds stay.
+    length), so that the two are independent; the timing of sounds stays.
 
     Args:
         share: of the augmented clips.
-        semitones: the pitch goes up or down by up to so many.
-        formants: the formants go up or down by up to this share of their frequency.
+        semitones: largest change of the pitch, up or down.
+        formants: largest change of the formants, up or down, as a share of their frequency.
     """
 
     def __init__(
@@ -186,11 +186,11 @@ class Voice(OfSpeech):
 
 @augmentation.register("speed")
 class Speed(Augmentation):
-    """Quicker or slower speech of the same pitch, and the motion with it.
+    """Faster or slower speech of the same pitch, and the motion with it.
 
     Args:
         share: of the augmented clips.
-        ratio: speech is quicker or slower by up to this share.
+        ratio: largest change of the speed, faster or slower, as a share.
     """
 
     moves = True
@@ -218,8 +218,8 @@ class Speed(Augmentation):
 
 
 @augmentation.register("loudness")
-class Loudness(OfSpeech):
-    """Loudness that drifts, as of a speaker who turns away from the microphone.
+class Loudness(SpeechAugmentation):
+    """Loudness that drifts, as if the speaker turned away from the microphone.
 
     Args:
         share: of the augmented clips.
@@ -239,13 +239,13 @@ class Loudness(OfSpeech):
 
 
 @augmentation.register("tilt")
-class Tilt(OfSpeech):
-    """Another balance of low and high: a straight tilt, and a smooth curve over it.
+class Tilt(SpeechAugmentation):
+    """Another balance of low and high frequencies: a linear tilt, and a smooth curve over it.
 
     Args:
         share: of the augmented clips.
         decibels: most by which an octave differs from the one below it.
-        curve: most by which the curve adds or takes, anywhere.
+        curve: largest gain of the curve in either direction.
     """
 
     def __init__(self, *, share: Share = 0.5, decibels: Decibels = 4.0, curve: Decibels = 6.0) -> None:
@@ -262,8 +262,8 @@ class Tilt(OfSpeech):
 
 
 @augmentation.register("band")
-class Band(OfSpeech):
-    """A band of the spectrum, as small microphones and telephones leave of it.
+class Band(SpeechAugmentation):
+    """A limited band of the spectrum, as of small microphones and telephones.
 
     Args:
         share: of the augmented clips.
@@ -294,8 +294,8 @@ class Band(OfSpeech):
 
 
 @augmentation.register("codec")
-class Codec(OfSpeech):
-    """What a codec leaves of speech: a telephone's 8 bits at 8 kHz, or Vorbis at a low rate.
+class Codec(SpeechAugmentation):
+    """Lossy compression: a telephone's 8 bits at 8 kHz, or Vorbis at a low rate.
 
     Args:
         share: of the augmented clips.
@@ -316,7 +316,7 @@ class Codec(OfSpeech):
 
 
 @augmentation.register("room")
-class Room(OfSpeech):
+class Room(SpeechAugmentation):
     """A room: the direct sound, and noise that decays exponentially after it (Moorer 1979).
 
     Args:
@@ -336,7 +336,7 @@ class Room(OfSpeech):
         self.seconds, self.direct = seconds, direct
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Convolve with a random impulse response, whose direct sound comes without delay."""
+        """Convolve with a random impulse response without delay: the direct sound comes at time 0."""
         from scipy.signal import fftconvolve
 
         decay = random.uniform(0.08, max(0.08, self.seconds))
@@ -353,7 +353,7 @@ class Room(OfSpeech):
 
 
 @augmentation.register("noise")
-class Noise(OfSpeech):
+class Noise(SpeechAugmentation):
     """Noise of a random colour, from white to brown, and of a level that may change slowly.
 
     Args:
@@ -374,7 +374,7 @@ class Noise(OfSpeech):
 
 
 @augmentation.register("hum")
-class Hum(OfSpeech):
+class Hum(SpeechAugmentation):
     """Mains hum: 50 or 60 Hz with its harmonics.
 
     Args:
@@ -403,14 +403,14 @@ class Hum(OfSpeech):
 
 @augmentation.register("pauses")
 class Pauses(Augmentation):
-    """Nothing is said for a while, or in the whole clip, and the mouth comes to rest.
+    """Silence for a while, or in the whole clip, during which the mouth comes to rest.
 
     Put it before rooms, noise and hum, so that these go on in the pause. The rest of the face keeps its motion.
 
     Args:
         share: of the augmented clips.
         seconds: longest pause.
-        silent: share of the changed clips in which nothing is said at all, but for noise where ``noise`` follows.
+        silent: share of the changed clips that become silent as a whole, but for noise where ``noise`` follows.
     """
 
     def __init__(
@@ -437,7 +437,7 @@ class Pauses(Augmentation):
         motion = example.motion + weight * (example.rest - example.motion)
         times = np.arange(len(example.speech)) / SAMPLE_RATE
         said = 1 - np.clip(np.minimum((times - first) / 0.02, (last - times) / 0.02), 0, 1)
-        # Faint and not zero, so that a ratio of speech to noise has something to stand on.
+        # Faint and not zero: `noise` and `hum` scale with the power of the speech and would vanish otherwise.
         faint = 10 ** (-random.uniform(50, 90) / 20) * random.standard_normal(len(times))
         speech = example.speech * said + faint * float(np.abs(example.speech).max(initial=0))
         return replace(example, motion=motion, speech=speech.astype(np.float32))
@@ -449,7 +449,7 @@ def _step(values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     return cast(npt.NDArray[np.floating], inside * inside * (3 - 2 * inside))
 
 
-# What they are made of.
+# Signal processing.
 
 
 def gain_for(speech: npt.NDArray[np.floating], noise: npt.NDArray[np.floating], ratio: float) -> float:
@@ -482,7 +482,8 @@ def signal(spectrum: npt.NDArray[np.complexfloating], length: int) -> npt.NDArra
 
     frames = irfft(spectrum, SIZE, axis=1) * _WINDOW
     count, parts = len(frames), SIZE // HOP
-    # Every fourth frame lies behind the other without overlap: four rows, added with shifts.
+    # Frames SIZE / HOP = 4 apart do not overlap: each residue class is one contiguous row, so that four additions of
+    # whole rows replace one per frame.
     out = np.zeros((count + parts) * HOP, np.float32)
     for part in range(parts):
         some = frames[part::parts].reshape(-1)
@@ -503,7 +504,8 @@ def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
     share = np.clip(places - low, 0, 1)[:, None].astype(np.float32)
     size, angle = np.abs(spectrum), np.angle(spectrum)
     sizes = (1 - share) * size[low] + share * size[low + 1]
-    # The phase advances as it does from one spectrum to the next where the frame comes from.
+    # Flanagan and Golden's phase vocoder: each bin's phase advances by its instantaneous frequency, which is the bin's
+    # centre frequency plus the deviation measured between neighbouring spectra, wrapped to (-pi, pi].
     advance = (2 * np.pi * HOP / SIZE * np.arange(SIZE // 2 + 1)).astype(np.float32)
     turn = np.diff(angle, axis=0) - advance
     turn += advance - 2 * np.pi * np.round(turn / (2 * np.pi))
@@ -525,7 +527,7 @@ def shifted(speech: Wave, ratio: float) -> Wave:
 
 
 def warped(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
-    """Speech (S,) whose spectral envelope has every frequency times ``ratio`` while its pitch stays."""
+    """Speech (S,) with its spectral envelope scaled by ``ratio`` along frequency, at the same pitch."""
     from scipy.fft import irfft, rfft
 
     if abs(ratio - 1) < 0.01:

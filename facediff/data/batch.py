@@ -43,8 +43,8 @@ class Sample:
         style: a style vector to be used instead of encoding ``reference``.
         window: the first frame that counts and the one after the last, where ``motion`` has frames around a training
             window; None where all frames count.
-        partner_frames: for each frame that of the neighbour in the batch which goes with it, both counted in the
-            samples; −1 where it lies outside the neighbour's sample. None where the two were not aligned.
+        partner_frames: for each frame the corresponding frame of the neighbour in the batch, which speaks the same
+            sentence; −1 where it lies outside the neighbour's sample. None where the two were not aligned.
     """
 
     audio: Float[Tensor, " samples"]
@@ -68,8 +68,7 @@ class Sample:
 class Batch:
     """Several clips, padded to the longest.
 
-    The fields are those of :class:`Sample`, where they are explained, with a batch dimension; what only some of the
-    clips have is None. The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of
+    The fields are those of :class:`Sample` with a batch dimension; a field that only some of the clips have is None. The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of
     ``audio``.
     """
 
@@ -274,7 +273,7 @@ class Assets:
         """The neutral face of an identity."""
         if identity not in self.templates:
             raise FaceDiffError(
-                f'identity: there is no "{identity}"; the checkpoint knows {", ".join(sorted(self.templates))}'
+                f'identity: there is no "{identity}"; the checkpoint has {", ".join(sorted(self.templates))}'
             )
         return self.templates[identity]
 
@@ -298,7 +297,7 @@ class Assets:
 
         Raises:
             FaceDiffError: naming the field that is missing, of another type, or does not fit the others. A checkpoint
-                may come from anybody, and these fields reach meshes, file names and sizes of arrays.
+                may be hostile, and these fields reach meshes, file names and sizes of arrays.
         """
         expected = {attribute.name for attribute in fields(cls)}
         if not isinstance(state, dict) or state.keys() != expected:

@@ -62,7 +62,7 @@ class Clip:
     Attributes:
         name: the name of its files.
         identity: who speaks.
-        sentence: what is spoken; clips of equal sentence have the same words.
+        sentence: name of the sentence; clips of one sentence have the same words.
         attributes: further columns of ``clips.csv``, or of the name, e.g. the mood.
         root: the corpus folder that holds its files.
     """
@@ -80,7 +80,7 @@ class Clip:
 
     @property
     def words(self) -> str:
-        """What is said: the words of the column ``text`` of ``clips.csv`` if there is one, else the sentence."""
+        """The words of the column ``text`` of ``clips.csv`` if there is one, else the sentence's name."""
         spoken = re.findall(r"[^\W_]+", self.attributes.get("text", "").casefold())
         return " ".join(spoken) or self.sentence
 
@@ -233,19 +233,19 @@ class Corpus:
         return torch.from_numpy(self._storages[clip.root].speech(clip.name, first, length, self.store))
 
     def fingerprint(self, clips: Sequence[Clip]) -> str:
-        """Changes when the motion of these clips, or a template, changes; nothing is opened but what is small.
+        """A hash that changes when the motion of these clips, or a template, changes; only small files are opened.
 
         It is made of each folder's ``manifest.json``, which holds the checksums of a prepared corpus, and, since not
         every folder has one, of the sizes and times of its files.
         """
-        told: list[object] = [clip.name for clip in clips]
+        facts: list[object] = [clip.name for clip in clips]
         for root in sorted({clip.root for clip in clips}):
             own = self._storages[root]
             manifest = root / "manifest.json"
-            told += [sha256(manifest) if manifest.is_file() else "", self._strides[root]]
-            told += [sha256(root / "templates.pkl")]
-            told += [own.version(clip.name) for clip in clips if clip.root == root]
-        return hashlib.sha256("\0".join(map(str, told)).encode()).hexdigest()
+            facts += [sha256(manifest) if manifest.is_file() else "", self._strides[root]]
+            facts += [sha256(root / "templates.pkl")]
+            facts += [own.version(clip.name) for clip in clips if clip.root == root]
+        return hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()
 
     def read_mesh(self, files: Sequence[str]) -> Mesh | None:
         """The first mesh file that exists, in the folder itself or in ``templates/``; None if there is none."""
@@ -307,7 +307,7 @@ def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
     """One entry of ``templates.pkl`` as a neutral face (V, 3).
 
     Raises:
-        ValueError: saying what is wrong with it.
+        ValueError: with the reason, to be completed by the file's name.
     """
     try:
         entry = np.asarray(value)

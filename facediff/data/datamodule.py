@@ -64,7 +64,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     Class attributes:
         corpus_name: what the corpus is called, in tables and checkpoints.
-        synthetic: whether a program made it.
+        synthetic: whether it is synthetic.
         unit: unit of length; ``unit`` in a prepared folder's ``manifest.json`` overrides it.
         frame_rate: motion frames per second that the models see.
         stored_frame_rate: motion frames per second of circulating copies, where that differs.
@@ -75,8 +75,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         region_help: where to get such files.
         reference_attributes: what a style reference shares with its target where possible.
         score_attributes: columns of the table of test scores of single clips; ``reference_attributes`` unless stated.
-        compared_speakers: among whom generation metrics look for the nearest speaker and for another's references; all
-            with a template if None.
+        compared_speakers: speakers among whom the generation metrics look for the nearest speaker and for references
+            of another speaker; all with a template if None.
         licence: the terms under which the corpus is distributed.
         commercial_use: whether these terms allow it: ``allowed``, ``forbidden`` or ``unknown``.
         licence_source: where the terms stand, without ``https://``.
@@ -88,7 +88,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             pairs sets it in its ``setup``.
         window_context: frames before and after a training window that samples come with; a model that sees further
             than the window sets it in its ``setup``.
-        aligner: lets the windows of two neighbours that speak the same sentence begin at the same sound; set likewise.
+        aligner: lets the windows of two neighbours that speak the same sentence begin at the same sound; a model sets
+            it in its ``setup``, too.
 
     Args:
         root: the corpus folder; or a packed corpus, its folder or an address such as ``s3://bucket/corpus.zarr``.
@@ -115,8 +116,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         upper_face: the same for the upper face.
         eyelid_pairs: file that lists pairs of an upper and a lower eyelid vertex, for blinks;
             ``regions/eyelid_pairs.txt`` if None.
-        face: the same for the face, of which a model may be asked to see nothing else, e.g.
-            ``FLAME_masks.pkl:face``; the corpus has no such region if None.
+        face: the same for the face, to which a model can be restricted, e.g. ``FLAME_masks.pkl:face``; the corpus has
+            no such region if None.
     """
 
     corpus_name: ClassVar[str]
@@ -248,7 +249,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The labels of everything that is trained on: the corpus, and every imported speaker."""
         return merged([self.corpus_licence()], map(person_licence, self.people))
 
-    # What a corpus adds.
+    # Methods that a corpus overrides.
 
     @abstractmethod
     def split_of(self, clip: Clip) -> str | None:
@@ -269,18 +270,19 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return {}
 
     def words_of(self, clip: Clip) -> str:
-        """What a clip says: clips of which it is equal have the same words, so that they can be aligned in time."""
+        """The text of a clip; clips with equal text have the same words and can be aligned in time."""
         return clip.words
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]] | None:
-        """What gives further speech (S,) at 16 kHz by number, without motion; None if there is no more, as here.
+        """A function that returns further speech (S,) at 16 kHz by number, without motion; None if there is no more.
 
-        An audio encoder may learn from it to hear more than the corpus's sentences (:mod:`facediff.models.hearing`).
+        The audio encoder can be distilled on it, which needs more speech than the corpus's sentences
+        (:mod:`facediff.models.hearing`).
         """
         return None
 
     def default_reference(self, clips: list[Clip]) -> Clip:
-        """The one of an identity's clips whose style is used when no other is chosen."""
+        """The clip that gives an identity's style when no other is chosen."""
         return clips[0]
 
     def prepare_data(self) -> None:
@@ -402,11 +404,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         )
 
     def _mouth(self) -> npt.NDArray[np.float32]:
-        """Which vertices speech moves (V,): 1 for all but the upper face."""
+        """Mask of the vertices that speech moves (V,): 1 for all but the upper face."""
         if self.features.reader is not None:
             raise FaceDiffError(
-                "data.augmentations: speech features that were computed before training are those of the recordings "
-                "as they are; omit the callback that caches them, or the augmentations"
+                "data.augmentations: speech features are cached before training, from speech that is not augmented; "
+                "omit the callback that caches them, or the augmentations"
             )
         moving = [change for change in (self.augmenter.augmentations if self.augmenter else []) if change.moves]
         if moving and (self.window is not None or self.pair_sentences):
@@ -420,7 +422,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return mouth
 
     def assets(self) -> Assets:
-        """What a checkpoint keeps of this corpus; the motion scale is measured by :meth:`motion_scale`."""
+        """The part of a checkpoint that describes this corpus, still without :meth:`motion_scale`."""
         if self._assets is None:
             corpus = self.corpus
             mesh = corpus.read_mesh(self.mesh_files)
@@ -457,7 +459,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             raise FaceDiffError(f"data.eyelid_pairs: {self.root / file}: no such file; expected pairs of vertices")
         return pairs
 
-    # What is measured on the training motion before training: see facediff.data.measuring.
+    # Statistics of the training motion, computed before training: see facediff.data.measuring.
 
     def motion_scale(self) -> float:
         """Factor that gives the training motion unit variance: one over the root mean square of its coordinates.
@@ -471,7 +473,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         Args:
             count: components.
-            weights: factors on the coordinates (3V,) whose components are taken; None for all alike.
+            weights: factors on the coordinates (3V,) before the decomposition; None for equal weights.
 
         Returns:
             the mean (3V,), and components (at most ``count``, 3V), each as long as its standard deviation, the largest

@@ -37,7 +37,7 @@ class FeatureSlot:
 
 
 class CachedFeatures:
-    """Reads the features of clips whose speech has been encoded before.
+    """Reads features of speech that was encoded before training.
 
     Args:
         store: the folder that holds them.
@@ -67,10 +67,10 @@ class CachedFeatures:
         return None if stored is None else torch.from_numpy(np.array(stored, np.float32))
 
 
-# Which clips make a batch, on which process, with which random numbers.
+# Batching: which clips form a batch, on which process, with which random numbers.
 
 BUCKETS = 32
-"""Into how many lengths a frame budget is divided for bucketing."""
+"""Number of length buckets that a frame budget is divided into."""
 
 
 @dataclass(frozen=True)
@@ -156,12 +156,12 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
 
     def _pick(self, place: int) -> tuple[int, int]:
-        """The clip at a place, and the seed of its random choices: places past the clips' number are their copies."""
+        """The clip at a place, and the seed of its random choices; place i + n · clips is the n-th copy of clip i."""
         copy, index = divmod(place, len(self.lengths))
         return index, self._hash(f"{index}:{copy}" if copy else index) if self.training else 0
 
     def _units(self, generator: torch.Generator) -> list[list[int]]:
-        """Clips, or pairs of them, in the order in which batches take them; a copy of a clip has a place of its own."""
+        """Clips, or pairs of them, in the order in which batches are filled; each copy of a clip has its own place."""
         count = len(self.lengths)
         if not self.training:
             return [[index] for index in range(count)]
@@ -233,7 +233,7 @@ class ResumableLoader(DataLoader[list[Sample]]):
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:
-    """The shuffled clips in pairs of one group (each clip has one), in random order; always equally many pairs."""
+    """The shuffled clips in pairs of the same group, in random order; the number of pairs does not depend on the order."""
     members: dict[str, list[int]] = {}
     for index in order:
         members.setdefault(groups[index], []).append(index)
@@ -244,19 +244,22 @@ def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generat
     for clips in pools:
         pairs += [clips[i : i + 2] for i in range(0, len(clips) - 1, 2)]
         if len(clips) % 2:
+            # Left over: it joins a clip that has a partner already; if it is alone in its pool, any other clip of the
+            # epoch; if the epoch has no other clip, itself.
             others = clips[:-1] or [index for index in order if index != clips[-1]] or clips
             pairs.append([clips[-1], others[0]])
     return [pairs[i] for i in torch.randperm(len(pairs), generator=generator).tolist()]
 
 
 def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
-    """The same clips in a number of batches that ``world_size`` divides, some repeated if too few to split."""
+    """The same clips in a number of batches that ``world_size`` divides; some clips repeat if there are too few."""
     batches = list(batches)
     clips = sum(map(len, batches))
     if not clips:
         return batches
     up = -(-len(batches) // world_size) * world_size
     if clips >= up:
+        # Halving the largest batch costs least: no clip is scored twice, and memory never grows.
         while len(batches) < up:
             largest = max(batches, key=len)
             place, half = batches.index(largest), len(largest) // 2
@@ -272,12 +275,12 @@ ReferenceChoice = Literal["same_subject", "any_mood", "self"]
 
 @dataclass(frozen=True)
 class ReferencePolicy:
-    """Which clip gives a target its style reference.
+    """Chooses the clip that a target takes its style reference from.
 
     Attributes:
-        candidates: clips that may serve, by identity; never a clip of an evaluated split where there are others.
+        candidates: possible references by identity; never a clip of an evaluated split where there are others.
         same: clip attributes that target and reference share where possible, e.g. the mood.
-        choice: another clip of the same speaker or, in training only, such a clip whatever its mood
+        choice: another clip of the same speaker (``same_subject``); in training also such a clip of any mood
             (``any_mood``), or the target itself (``self``).
         max_frames: longest reference; longer clips are cut to a window.
     """
@@ -288,13 +291,13 @@ class ReferencePolicy:
     max_frames: int
 
     def check(self, targets: Sequence[Clip]) -> None:
-        """Find out before training that a clip has no style reference."""
+        """Fail before training if a clip has no style reference."""
         for clip in targets:
             if len(self.candidates.get(clip.identity, [])) < 2:
                 self.eligible(clip)
 
     def eligible(self, target: Clip, *, any_mood: bool = False) -> list[Clip]:
-        """The clips that may serve ``target``, never ``target`` itself; the best matching ones unless ``any_mood``."""
+        """Possible references of ``target``, never ``target`` itself; those that match best unless ``any_mood``."""
         others = [clip for clip in self.candidates.get(target.identity, []) if clip.name != target.name]
         if not others:
             raise FaceDiffError(
@@ -307,14 +310,14 @@ class ReferencePolicy:
         return alike or others
 
     def evaluated(self, target: Clip) -> Clip:
-        """The one that serves ``target`` in evaluation; it follows from the target's name."""
+        """The reference of ``target`` in evaluation; it depends on the target's name only."""
         eligible = self.eligible(target)
         return eligible[zlib.crc32(target.name.encode()) % len(eligible)]
 
 
 Aligner = Callable[[Tensor, int, Tensor, int], Tensor]
-"""For each frame of one recording that of another which goes with it, indices (frames,). It takes the speech
-(samples,) and the number of frames of the one and of the other."""
+"""Aligns two recordings of the same words: from speech (samples,) and number of frames of both, it returns for each frame
+of the first the corresponding frame of the second, indices (frames,)."""
 
 
 FeatureReader = Callable[[Clip], Tensor | None]
@@ -335,7 +338,7 @@ class MotionDataset(Dataset[Sample]):
         policy: how style references are chosen.
         training: random windows and references.
         window: longest training window in frames; whole clips if None.
-        decoys: give every clip the speech of another sentence in addition to its own.
+        decoys: add the speech of another sentence to every clip, for the evaluation with shuffled audio.
         features: returns cached features of the speech, if there are any.
         texts: what each clip says, where that is not its sentence; clips of equal text can be aligned.
         context: frames before and after a training window that are read with it.
@@ -418,7 +421,7 @@ class MotionDataset(Dataset[Sample]):
         return torch.from_numpy(changed.speech), torch.from_numpy(changed.motion)
 
     def says(self, index: int) -> str:
-        """What a clip says: clips of which it is equal have the same words."""
+        """The text of a clip, or its sentence: clips for which it is equal have the same words and can be aligned."""
         return self.clips[index].sentence if self.texts is None else self.texts[index]
 
     def pair(self, one: Pick, other: Pick) -> list[Sample]:

@@ -1,4 +1,4 @@
-"""``manifest.json`` of a corpus folder: what wrote it, of which format it is, and facts that readers rely on."""
+"""``manifest.json`` of a corpus folder: its version, its format, and facts such as the frame rate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORMAT = 1
 REMEDY = "prepare the folder again, or remove the file"
 TEXTS = ("corpus", "person", "unit")
 LONGEST = 200
-"""Characters of such a text, or of an identity's name, which messages, checkpoints and files' names repeat."""
+"""Longest such text or name of an identity, in characters: they are repeated in messages, checkpoints and file names."""
 
 
 def load_manifest(path: Path, *, name: str = "", remedy: str = REMEDY) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def cache_root(seed: int, drawn_speakers: int = 0) -> Path:
 
 
 def made_root(seed: int) -> Path | None:
-    """A folder of :func:`cache_root` that is there, with or without drawn speakers; None if there is none."""
+    """An existing folder of :func:`cache_root`, with or without drawn speakers; None if there is none."""
     usual = cache_root(seed)
     folders = [usual, *sorted(usual.parent.glob(f"{usual.name}-drawn*"))]
     return next((folder for folder in folders if folder.is_dir()), None)
@@ -57,7 +57,7 @@ class Puppet(SpeechMotionDataModule):
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
         drawn_speakers: how many speakers with random voice, face and speaking style also say the training sentences.
-            What is tested does not change.
+            The test splits do not change.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
     """
@@ -96,7 +96,7 @@ class Puppet(SpeechMotionDataModule):
         )
         self.seed = seed
         self.drawn_speakers = drawn_speakers
-        # The first identity is the one that is animated unless another is named: one that people know.
+        # The first identity is animated unless another is named, so it is one of the eight, not a drawn one.
         drawn = drawn_names(drawn_speakers)
         self.identities = [*(name for name in self.identities if name not in drawn), *drawn]
 
@@ -107,7 +107,7 @@ class Puppet(SpeechMotionDataModule):
             puppet.generate(self.root, seed=self.seed, drawn=self.drawn_speakers, workers=workers)
 
     def eyelid_pairs(self) -> Tensor | None:
-        """Those of the corpus folder, or of the mesh itself where the folder was made before it had such a file."""
+        """The corpus folder's pairs, or the mesh's own where the folder comes from a version without such a file."""
         pairs = super().eyelid_pairs()
         return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1)) if pairs is None else pairs
 
@@ -121,7 +121,7 @@ class Puppet(SpeechMotionDataModule):
         return "train" if clip.number in puppet.TRAIN_SENTENCES else "val"
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
-        """Words in random order by the speakers who are trained on."""
+        """Random words by the training speakers."""
         return partial(further_speech, identities=tuple(self.identities))
 
     def default_reference(self, clips: list[Clip]) -> Clip:

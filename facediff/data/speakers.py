@@ -1,4 +1,4 @@
-"""What recordings say of each speaker's motion: the mean face of a speaker, and the mean motion of each recording."""
+"""Statistics of speakers: the mean face of each speaker, and the mean motion of each recording."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from facediff.data.datamodule import SpeechMotionDataModule
 
 MOST = 64
-"""Recordings of a speaker that are read at most, evenly spread over their names; those of corpora with more of them
-would take minutes to read, and say no more."""
+"""Most recordings of a speaker that are read, evenly spread over their names: more would take minutes and change the
+mean little."""
 
 
 class MeanFaces:
@@ -34,7 +34,7 @@ class MeanFaces:
         for clip in data.clips("train"):
             by_speaker.setdefault(clip.identity, []).append(clip)
         if not by_speaker:
-            raise FaceDiffError(f"{data.root}: no training clip, of which the speakers' mean faces are made")
+            raise FaceDiffError(f"{data.root}: no training clip; expected some, to compute the speakers' mean faces")
         self.faces: dict[str, Tensor] = {}
         for speaker, clips in by_speaker.items():
             total, frames = torch.zeros(data.n_vertices, 3, dtype=torch.float64), 0
@@ -65,7 +65,9 @@ def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str]) -> Sp
             means.append(data.corpus.read_motion(clip).mean(0))
             numbers.append(number)
     if len({*numbers}) < 2:
-        raise FaceDiffError(f"{data.root}: recordings outside the test splits are of less than two speakers")
+        raise FaceDiffError(
+            f"{data.root}: has recordings outside the test splits of fewer than two speakers; expected at least two"
+        )
     return SpeakerGallery(torch.stack(means), tuple(numbers))
 
 

@@ -1,4 +1,4 @@
-"""Where the motion and the speech of clips lie: in a folder of files here, in a packed corpus elsewhere."""
+"""Storage of motion and speech of clips: a folder of files; :mod:`facediff.data.packed` has the other one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from facediff.utils.arrays import ArrayStore, in_range, open_vertices
 from facediff.utils.limits import COORDINATE, quoted
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
-"""Where projects keep absolute vertices; the second is ProbTalk3D's."""
+"""Folders with absolute vertices, in order of preference; the second is ProbTalk3D's."""
 
 CHUNK = 8
 """Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
@@ -45,7 +45,7 @@ class ClipStorage(Protocol):
         """Samples of a clip's speech at 16 kHz (length,), filled with zeros past its end."""
 
     def version(self, name: str) -> object:
-        """Changes when the clip's motion changes."""
+        """A value that changes when the clip's motion changes."""
 
 
 class ClipFolder:
@@ -130,7 +130,7 @@ def within(picks: Sequence[int], frames: int) -> Sequence[int]:
 
 
 def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int], source: object) -> None:
-    """Refuse absolute vertices (T, V, 3) that are no numbers, or so large that squares of them are infinite.
+    """Refuse absolute vertices (T, V, 3) that are not finite, or so large that their squares are infinite in float32.
 
     Args:
         vertices: the frames.
@@ -146,6 +146,6 @@ def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int
 
 
 def motion_path(root: Path, name: str) -> Path:
-    """Where a clip's vertices lie; the usual place if they are nowhere."""
+    """The file with a clip's vertices; the usual place if there is none."""
     paths = [root / folder / f"{name}.npy" for folder in MOTION_FOLDERS]
     return next((path for path in paths if path.is_file()), paths[0])

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.augmentation import Augmenter, Example, OfSpeech, read_augmentations
+from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, read_augmentations
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
@@ -147,7 +147,7 @@ def learn_voices(
         FaceDiffError: if nothing of the encoder can be trained, or an augmentation is unknown.
     """
     augmentations = read_augmentations(options.augmentations)
-    if moving := [each for each in augmentations if not isinstance(each, OfSpeech)]:
+    if moving := [each for each in augmentations if not isinstance(each, SpeechAugmentation)]:
         raise FaceDiffError(
             f"augmentations: {type(moving[0]).__name__.lower()} changes the motion with the speech, so that no "
             f"recording says what is to be heard; omit it"

@@ -26,7 +26,7 @@ Faces of different speakers differ by some hundredths; vertices in another order
 """
 SAME_UNIT = 1.2  # a speaker's face and the corpus's mean face differ in size by less than this factor
 MIN_STABLE = 10
-STILL = 1e-6  # motion whose fastest frame moves by less than this share of the face's size is none
+STILL = 1e-6  # of the face's size: slower motion counts as none
 SAME_SIZE = 1.1  # template and motion must agree in size to this factor
 SMOOTHING = 0.2  # seconds over which loudness is averaged
 NEUTRAL_SHARE = 0.05  # share of the frames that the neutral face is the median of
@@ -38,7 +38,7 @@ NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
 
 @dataclass(frozen=True)
 class TargetCorpus:
-    """What a new speaker must match in a corpus: mean (V, 3) of its templates, triangles (F, 3), rate, unit."""
+    """The properties that a new speaker must match: mean (V, 3) of the templates, triangles (F, 3), rate, unit."""
 
     root: Path
     mean: Array
@@ -53,7 +53,7 @@ class TargetCorpus:
 
 
 def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> TargetCorpus:
-    """Read what a new speaker must match; ``frame_rate`` is needed where ``manifest.json`` does not record it."""
+    """Read the corpus that a speaker joins; ``frame_rate`` is needed where ``manifest.json`` does not record it."""
     if not root.is_dir():
         raise FaceDiffError(f"--corpus {root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
     templates = read_templates(root / "templates.pkl")
@@ -96,7 +96,7 @@ def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
 
 
 def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
-    """Whether faces could be compared with the corpus's."""
+    """Whether faces could be compared with the corpus's; an error if they differ."""
     if faces is None or target.faces is None:
         return False
     differing = differing_faces(faces, target.faces)
@@ -109,7 +109,7 @@ def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
 
 
 def lay_onto_corpus(path: Path, face: Array, target: TargetCorpus) -> tuple[Similarity, float]:
-    """The similarity from a face to the corpus's mean face, and what is left as a share of the face's size."""
+    """The similarity transform from a face to the corpus's mean face, and its residual as a share of the face's size."""
     map_ = robust_align(face, target.mean, scale=True)
     residual = relative_residual(map_.apply(face), target.mean)
     if not residual < RESIDUAL_LIMIT:
@@ -320,7 +320,7 @@ def loudness(speech: Speech, frames: int, frame_rate: float) -> Array:
 def neutral_frames(loud: Array, speed: Array) -> npt.NDArray[np.int64]:
     """The twentieth of the frames in which speech is quiet and the face is still, both; sorted indices.
 
-    Frames are ranked by loudness and by speed; those whose worse rank is best are chosen.
+    Frames are ranked by loudness and by speed; the frames with the lowest maximum of both ranks are chosen.
     """
     worse = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud, speed)))
     least, most = NEUTRAL_FRAMES

@@ -83,7 +83,7 @@ def import_person(
         progress: whether to show a progress bar.
 
     Returns:
-        what was done.
+        the report of the import.
 
     Raises:
         FaceDiffError: for anything that is wrong with files or arguments; nothing is left behind then.
@@ -178,14 +178,18 @@ def _check_output(path: Path) -> None:
 
 def _check_lengths(motion: Path, audio: Path, samples: int, frames: int, frame_rate: float) -> list[str]:
     """Warnings about the lengths of speech and motion; an error if they are too short, or differ by over a tenth."""
-    heard, seen = samples / SAMPLE_RATE, frames / frame_rate
-    lengths = f"the motion lasts {seen:.2f} s ({frames} frames at {frame_rate:g}/s) and the sound {heard:.2f} s"
-    if abs(heard - seen) > MISMATCH * max(heard, seen):
+    sound_seconds, motion_seconds = samples / SAMPLE_RATE, frames / frame_rate
+    lengths = (
+        f"the motion lasts {motion_seconds:.2f} s ({frames} frames at {frame_rate:g}/s) and the sound "
+        f"{sound_seconds:.2f} s"
+    )
+    difference = abs(sound_seconds - motion_seconds)
+    if difference > MISMATCH * max(sound_seconds, motion_seconds):
         raise FaceDiffError(f"{motion} and {audio}: {lengths}; expected the same stretch of video; check --frame-rate")
-    if min(heard, seen) < MIN_SECONDS:
+    if min(sound_seconds, motion_seconds) < MIN_SECONDS:
         raise FaceDiffError(f"{motion}: {lengths}; expected at least {MIN_SECONDS:g} s, and better about a minute")
-    if abs(heard - seen) > 2 / frame_rate + 0.1:
-        return [f"{lengths}; what one has over the other is left out at the end"]
+    if difference > 2 / frame_rate + 0.1:
+        return [f"{lengths}; the end of the longer one is left out"]
     return []
 
 
@@ -257,7 +261,7 @@ def splits(clips: int) -> list[str]:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import did. Lengths are in the unit of the corpus unless said otherwise."""
+    """The outcome of an import. Lengths are in the unit of the corpus unless said otherwise."""
 
     name: str
     frames: int  # frames that were read
@@ -274,7 +278,7 @@ class ImportReport:
     jitter: float  # root-mean-square distance of the stable vertices from their median, head motion removed
     scale: float  # corpus units to a unit of the motion, as used
     measured_scale: float  # the same, as measured between the speaker's neutral face and the corpus's mean face
-    topology_residual: float  # what is left between these two, as a share of the face's size
+    topology_residual: float  # residual between these two faces, as a share of the face's size
     faces_compared: bool
     template_source: str  # how the neutral face was obtained
     template_frames: list[int]  # the frames it is the median of; empty if it was given
@@ -286,7 +290,7 @@ class ImportReport:
     notes: list[str] = field(default_factory=list)  # other remarks
 
     def lines(self, unit: str | None) -> list[str]:
-        """The report in words.
+        """The report as lines of text.
 
         Args:
             unit: the corpus's unit of length; "corpus units" if None.

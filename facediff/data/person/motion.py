@@ -210,7 +210,7 @@ def differing_faces(one: Faces, other: Faces) -> int:
     return int(np.count_nonzero(counts == 1))
 
 
-# What is shared with the other steps of an import.
+# Helpers that the other steps of an import use as well.
 
 
 def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
