@@ -2,8 +2,8 @@
 
 A model that is trained on few voices, or on a speech synthesiser, overfits to them. The augmentations change properties
 that facial motion does not depend on: pitch and formants, loudness, the spectrum of a microphone or a telephone, the
-room, noise and hum. Two change the motion as well: :class:`Speed`, and :class:`Pauses`, which teaches that silence means
-a mouth at rest, however loud the noise.
+room, noise and hum. Two change the motion as well: :class:`Speed`, and :class:`Pauses`, which teaches that silence
+means a mouth at rest, however loud the noise.
 
 They are registered under the kind ``augmentation`` and chosen by name with their options::
 

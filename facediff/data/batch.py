@@ -68,8 +68,8 @@ class Sample:
 class Batch:
     """Several clips, padded to the longest.
 
-    The fields are those of :class:`Sample` with a batch dimension; a field that only some of the clips have is None. The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of
-    ``audio``.
+    The fields are those of :class:`Sample` with a batch dimension; a field that only some of the clips have is None.
+    The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of ``audio``.
     """
 
     audio: Float[Tensor, "batch samples"]

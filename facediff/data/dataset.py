@@ -233,7 +233,7 @@ class ResumableLoader(DataLoader[list[Sample]]):
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:
-    """The shuffled clips in pairs of the same group, in random order; the number of pairs does not depend on the order."""
+    """The shuffled clips in pairs of one group, in random order; the number of pairs is always the same."""
     members: dict[str, list[int]] = {}
     for index in order:
         members.setdefault(groups[index], []).append(index)
@@ -316,8 +316,8 @@ class ReferencePolicy:
 
 
 Aligner = Callable[[Tensor, int, Tensor, int], Tensor]
-"""Aligns two recordings of the same words: from speech (samples,) and number of frames of both, it returns for each frame
-of the first the corresponding frame of the second, indices (frames,)."""
+"""Aligns two recordings of the same words: from speech (samples,) and number of frames of both, it returns for each
+frame of the first the corresponding frame of the second, indices (frames,)."""
 
 
 FeatureReader = Callable[[Clip], Tensor | None]

@@ -15,7 +15,8 @@ FORMAT = 1
 REMEDY = "prepare the folder again, or remove the file"
 TEXTS = ("corpus", "person", "unit")
 LONGEST = 200
-"""Longest such text or name of an identity, in characters: they are repeated in messages, checkpoints and file names."""
+"""Longest such text or name of an identity, in characters: they are repeated in messages, checkpoints and file
+names."""
 
 
 def load_manifest(path: Path, *, name: str = "", remedy: str = REMEDY) -> dict[str, Any]:

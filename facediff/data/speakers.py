@@ -66,7 +66,7 @@ def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str]) -> Sp
             numbers.append(number)
     if len({*numbers}) < 2:
         raise FaceDiffError(
-            f"{data.root}: has recordings outside the test splits of fewer than two speakers; expected at least two"
+            f"{data.root}: has recordings outside the test splits of fewer than two speakers; expected two or more"
         )
     return SpeakerGallery(torch.stack(means), tuple(numbers))
 

@@ -1,4 +1,4 @@
-"""What a packed corpus consists of, and the record in its ``zarr.json`` that says so.
+"""The format of a packed corpus, and the record in its ``zarr.json``.
 
 A packed corpus is a Zarr (version 3) group. Its attribute ``facediff`` is the record below, its arrays are
 
@@ -36,7 +36,7 @@ RECORD = "facediff"
 METADATA = "zarr.json"
 SUFFIX = ".zarr"
 STATE = "pack.json"
-"""In the store while packing runs or was interrupted; ``zarr.json`` of the group appears last."""
+"""Exists while packing runs or after it was interrupted; ``zarr.json`` of the group appears last."""
 
 Type = np.dtype[np.signedinteger[Any]]
 QUANTISED: dict[str, Type] = {"int16": np.dtype("<i2"), "int32": np.dtype("<i4")}
@@ -44,9 +44,9 @@ EXACT: dict[str, Type] = {"float16": np.dtype("<i2"), "float32": np.dtype("<i4")
 CODINGS: dict[str, Type] = {**QUANTISED, **EXACT}
 """Type of the stored whole numbers by the coding of a motion array."""
 ROOM = 250.0
-"""Millimetres that offsets stored in 16 bits can reach at least; else they take 32."""
+"""Offsets are stored in 16 bits if these can hold as many millimetres; else in 32."""
 SHARD_BYTES = 64 << 20
-"""Bytes of a shard before compression, about: some twelve megabytes as an object in a store."""
+"""Approximate bytes of a shard before compression: some twelve megabytes as an object in a store."""
 BLOB_CHUNK = 1 << 16
 """Bytes of a chunk of speech and files."""
 BLOB_SHARD = 1 << 25
@@ -59,7 +59,7 @@ DAMAGED = "the packed corpus is damaged, " + REMEDY
 
 @dataclass(frozen=True)
 class PackedSound:
-    """Where the speech of a clip lies.
+    """The place and form of a clip's speech.
 
     Attributes:
         first: its first byte in ``speech``.
@@ -82,7 +82,7 @@ class PackedSound:
 
 @dataclass(frozen=True)
 class PackedClip:
-    """Where a clip lies.
+    """The place of a clip in the arrays.
 
     Attributes:
         name: the clip's name.
@@ -115,7 +115,7 @@ class PackedFile:
 
 @dataclass(frozen=True)
 class ArrayFacts:
-    """Shape and division of an array, of which the first axis is divided.
+    """Shape and chunks of an array, which is divided along its first axis.
 
     Attributes:
         dtype: type of its numbers.
@@ -151,7 +151,7 @@ class Record:
         tolerance: millimetres by which a coordinate may differ from what was packed; 0 for lossless packing.
         step: what one step of the stored offsets is, in the corpus's unit; 0 for lossless packing.
         unit: the corpus's unit of length.
-        chunk_seconds: length of a chunk, as asked.
+        chunk_seconds: the requested length of a chunk.
         identities: rows of ``templates``.
         clips: every clip, by name.
         files: every other file, by path.
@@ -181,7 +181,7 @@ class Record:
 
 
 def read_record(text: bytes, source: str) -> Record:
-    """The record in a group's ``zarr.json``, of which nothing is believed before it is checked.
+    """The record in a group's ``zarr.json``; every field is checked, since the file may be hostile.
 
     Raises:
         FaceDiffError: if it is no packed corpus, of a later format, or declares what cannot be.
@@ -300,7 +300,7 @@ def _array(name: str, plain: Mapping[str, Any], checks: _Checks, coordinates: in
             checks.whole({"bytes of a shard": size}, "bytes of a shard", 4) for size in checks.items(plain, "shards")
         ),
     )
-    # What one chunk may expand to is bounded here; decoding compares each chunk with it.
+    # This bounds the memory that a hostile record can demand: decoding refuses a chunk of any other size.
     check_array(f"{checks.source}: {name}", (facts.chunk, max(1, width)), np.dtype(dtype).itemsize)
     if len(facts.shards) != math.ceil(facts.rows / (facts.chunk * facts.chunks)):
         raise checks.refuse(f"{name} has {len(facts.shards)} shards, which do not hold {facts.rows} rows")
@@ -311,7 +311,7 @@ def _clip(plain: Mapping[str, Any], checks: _Checks, arrays: Mapping[str, ArrayF
     sound = plain["sound"]
     pieces = checks.items(sound, "pieces")
     samples = checks.whole(sound, "samples", 1)
-    heard = PackedSound(
+    packed_sound = PackedSound(
         first=checks.whole(sound, "first"),
         pieces=tuple(checks.whole({"piece": size}, "piece", 1) for size in pieces),
         form=checks.text(sound, "form", ["flac", "wav"]),
@@ -327,7 +327,7 @@ def _clip(plain: Mapping[str, Any], checks: _Checks, arrays: Mapping[str, ArrayF
         dtype=checks.text(plain, "dtype", list(EXACT)),
         first=checks.whole(plain, "first"),
         frames=checks.whole(plain, "frames", 1, LIMITS.frames),
-        sound=heard,
+        sound=packed_sound,
     )
     _relative(f"{clip.name}.npy", checks)
     if "/" in clip.name:
@@ -335,11 +335,11 @@ def _clip(plain: Mapping[str, Any], checks: _Checks, arrays: Mapping[str, ArrayF
     facts = arrays.get(f"motion_{clip.coding}")
     if facts is None or clip.first % facts.chunk or clip.first + clip.frames > facts.rows:
         raise checks.refuse(f"clip {clip.name} lies beyond its array")
-    LIMITS.check("seconds", samples / heard.rate, f"{checks.source}: clip {clip.name}")
-    if heard.form == "flac" and heard.bits not in (16, 24):
-        raise checks.refuse(f"the speech of clip {clip.name} has {heard.bits} bits")
-    count = math.ceil(samples / (PIECE_SECONDS * heard.rate)) if heard.form == "flac" else 1
-    if len(heard.pieces) != count or heard.first + sum(heard.pieces) > _rows(arrays, "speech"):
+    LIMITS.check("seconds", samples / packed_sound.rate, f"{checks.source}: clip {clip.name}")
+    if packed_sound.form == "flac" and packed_sound.bits not in (16, 24):
+        raise checks.refuse(f"the speech of clip {clip.name} has {packed_sound.bits} bits")
+    count = math.ceil(samples / (PIECE_SECONDS * packed_sound.rate)) if packed_sound.form == "flac" else 1
+    if len(packed_sound.pieces) != count or packed_sound.first + sum(packed_sound.pieces) > _rows(arrays, "speech"):
         raise checks.refuse(f"the speech of clip {clip.name} lies beyond its array")
     return clip
 

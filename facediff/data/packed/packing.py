@@ -1,4 +1,4 @@
-"""Packing a corpus folder: what is packed, in which tasks, and how an interrupted run is continued."""
+"""Packing a corpus folder: the plan, the tasks, and how an interrupted run is continued."""
 
 from __future__ import annotations
 
@@ -54,27 +54,27 @@ if TYPE_CHECKING:
     from facediff.data.check.layouts import View
 
 Exact = Literal["test", "none"]
-"""Clips of which every bit is kept: those that scores are computed from, or none."""
+"""Clips that are stored without loss: those that scores are computed from, or none."""
 
 LOCK = ".pack.lock"
 PARTS = "parts"
 """Folder in the store with the encoded speech of single clips, while packing runs."""
 MARGIN = 0.99
-"""Of the tolerance that steps may use; the rest is for the rounding of vertices to single precision."""
+"""Share of the tolerance for quantisation; the rest is for the rounding of vertices to single precision."""
 FINEST = 0.001
-"""Millimetres of the smallest tolerance: single precision rounds the vertices of a face by some hundred-thousandths."""
+"""Smallest tolerance in millimetres: single precision rounds the vertices of a face by some hundred-thousandths."""
 BITS = {"PCM_16": 16, "PCM_24": 24, "PCM_S8": 16, "PCM_U8": 16}
-"""Bits of FLAC samples that hold those of a recording exactly, by the recording's form."""
+"""Bits of FLAC samples that hold a recording's samples exactly, by its form."""
 FLAC_CHANNELS, FLAC_RATE = 8, 655_350
 BLOCK = 1 << 20
 """Bytes that are compressed together."""
-FRAMES = 8  # that are quantised at a time
+FRAMES = 8  # that are quantised at a time, so that they stay in the processor's cache
 REMEDY = "run `facediff data check` on the folder, and correct or remove the clip"
 
 
 @dataclass(frozen=True)
 class PackingReport:
-    """What packing did.
+    """The outcome of packing.
 
     Attributes:
         out: the packed corpus.
@@ -83,7 +83,7 @@ class PackingReport:
         before: bytes of the folder's motion and speech.
         after: bytes of the packed corpus.
         written: shards written by this run.
-        left_out: files that no clip has: motion without speech, or speech without motion.
+        left_out: files that belong to no clip: motion without speech, or speech without motion.
     """
 
     out: Path
@@ -204,7 +204,7 @@ def require_zarr(purpose: str) -> None:
 
 @dataclass(frozen=True)
 class PackingPlan:
-    """What is packed, found by a look at every file's header.
+    """The contents of a packed corpus, from the headers of all files.
 
     Attributes:
         root: the corpus folder.
@@ -226,7 +226,7 @@ class PackingPlan:
     def of(
         cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float, exact: Exact
     ) -> PackingPlan:
-        """Look through a corpus folder."""
+        """Scan a corpus folder."""
         from facediff.data.check.layouts import view_of
 
         view = view_of(root, corpus)
@@ -300,7 +300,7 @@ class PackingPlan:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """What decides what is written; a run may be resumed only with the same."""
+        """All that determines the output; a run may be resumed only with the same."""
         record = self.record
         return {
             **{name: getattr(record, name) for name in ("made_by", "corpus", "n_vertices", "frame_rate")},
@@ -335,7 +335,7 @@ class PackingPlan:
 
 
 def scored_clips(root: Path, view: View) -> frozenset[str]:
-    """Clips that scores are computed from: those of the test splits, and the style reference of each."""
+    """Clips that scores are computed from: the test splits and the style references of their clips."""
     from facediff.data.check.layouts import by_name, instance
 
     scored: set[str] = set()
@@ -416,7 +416,7 @@ def _finished(plan: PackingPlan, out: Path) -> PackingReport:
 
 
 def _check_written(folder: Path, facts: ArrayFacts) -> None:
-    """Refuse an array whose files are not those that were written, by their sizes; `data check` reads every byte."""
+    """Refuse an array with files of other sizes than were written; `data check` reads every byte."""
     sizes = {folder / shard_key(number, facts.width): size for number, size in enumerate(facts.shards)}
     sizes[folder / METADATA] = len(encoded(facts, None))
     for path, size in sizes.items():
@@ -434,7 +434,7 @@ def _report(plan: PackingPlan, record: Record, out: Path, written: int) -> Packi
 
 
 def _finish(plan: PackingPlan, out: Path) -> Record:
-    """Write speech, files and templates from what is there, and the record last."""
+    """Join the encoded speech, add files and templates, and write the record last."""
     clips, place = {}, 0
     for name, clip in plan.record.clips.items():
         with (out / PARTS / name).open("rb") as stream:
@@ -495,9 +495,12 @@ def _write(out: Path, root: Path, record: Record, task: Task) -> None:
             )
             last = part.row + part.stop - part.start
             padded = -(-last // facts.chunk) * facts.chunk
-            rows[last:padded] = rows[last - 1]  # which compresses to nothing
+            # The end of a clip's last chunk repeats its last frame: the differences below are zero there.
+            rows[last:padded] = rows[last - 1]
         for first in range(0, len(rows), facts.chunk):
             chunk = rows[first : first + facts.chunk]
+            # Differences between frames are small and compress well; each chunk starts with a whole row, so that it can
+            # be decoded alone.
             chunk[1:] = chunk[1:] - chunk[:-1]
         content = encoded(facts, rows)
     with atomic(out / task.target) as temporary:
@@ -511,7 +514,7 @@ def _quantised(
     record: Record,
     dtype: np.dtype[Any],
 ) -> npt.NDArray[Any]:
-    """Offsets from the template in whole steps (frames, 3V)."""
+    """Offsets from the template in whole quantisation steps (frames, 3V)."""
     stored = vertices[part.start : part.stop]
     steps = np.empty((len(stored), stored.shape[1] * 3), dtype)
     limit = np.iinfo(dtype).max
@@ -577,13 +580,13 @@ def encode_speech(path: Path) -> bytes:
 
 
 def write_blob(out: Path, name: str, size: int, contents: Iterable[bytes]) -> ArrayFacts:
-    """Write an array of bytes, of which no more than a shard is in memory.
+    """Write an array of bytes; no more than a shard is in memory.
 
     Args:
         out: the packed corpus.
         name: the array's name.
-        size: of all contents together.
-        contents: what it holds, in order.
+        size: of all parts together.
+        contents: its parts, in order.
     """
     chunks = max(1, min(BLOB_SHARD, size + BLOB_CHUNK - 1) // BLOB_CHUNK)
     facts = ArrayFacts("uint8", size, 0, BLOB_CHUNK, chunks, ())
@@ -615,10 +618,9 @@ def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
         chunks=(facts.chunk, *width),
         dtype=facts.dtype,
         compressors=[
-            # Of differences the upper bits are all alike and the lowest are noise: sorted by bits, most of what zstd
-            # sees is either one byte repeated or kept as it is, and decodes in a fraction of the time that bytes sorted
-            # by place take. Smaller blocks take more room; level 5 takes a twentieth less than level 1, is decoded as
-            # quickly, and packs at a hundred times the speed of the recording.
+            # The upper bits of differences are alike and the lowest are noise. After a bit shuffle, zstd sees either
+            # one repeated byte or noise that it stores, and decodes in a fraction of the time that a byte shuffle
+            # takes. Smaller blocks take more room; level 5 takes 5 % less room than level 1 and decodes as quickly.
             BloscCodec(
                 typesize=itemsize,
                 cname="zstd",

@@ -1,4 +1,4 @@
-"""Reading a packed corpus: its small files as a folder, its clips as every data module reads them."""
+"""Reading a packed corpus: its small files as a folder, its clips as a :class:`~facediff.data.storage.ClipStorage`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from facediff.utils.workers import processors
 Floats = npt.NDArray[np.float32]
 
 MOST_THREADS = 4
-"""Threads that decode the chunks of a window; more wait for memory."""
+"""Threads that decode the chunks of a window; more are limited by memory bandwidth."""
 
 
 class PackedCorpus:
@@ -68,7 +68,7 @@ class PackedCorpus:
 
     @property
     def places(self) -> list[Path]:
-        """Folders that other machines must see to read it: its own, or none where it is at an address."""
+        """Folders that workers on other machines must see: its own, or none for an address."""
         return [] if address_of(self.source) else [Path(self.source)]
 
     # Its small files.
@@ -91,7 +91,9 @@ class PackedCorpus:
         for file in self.record.files.values():
             content = self._arrays["files"].read(file.first, file.first + file.bytes).tobytes()
             if hashlib.sha256(content).hexdigest() != file.sha256:
-                raise FaceDiffError(f"{self.source}: its file {file.path} is not what was packed; {DAMAGED}")
+                raise FaceDiffError(
+                    f"{self.source}: its file {file.path} has another checksum than when it was packed; {DAMAGED}"
+                )
             path = folder / file.path
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
@@ -101,7 +103,7 @@ class PackedCorpus:
         rows = self._arrays["templates"].read(0, len(self.record.identities))
         return {name: row.reshape(-1, 3) for name, row in zip(self.record.identities, rows, strict=True)}
 
-    # Its clips: what ClipStorage asks for.
+    # Its clips: the methods of ClipStorage.
 
     def names(self) -> list[str]:
         """Every clip, sorted."""
@@ -113,14 +115,14 @@ class PackedCorpus:
         return PackedMotion(self.source, self.record, clip, self._arrays[f"motion_{clip.coding}"])
 
     def version(self, name: str) -> object:
-        """The same for all clips: that of the whole record, which holds the size of every shard."""
+        """The hash of the whole record, which holds the size of every shard: the same for all clips."""
         return self.identity
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> Floats:
         """Samples of a clip's speech at 16 kHz (length,), filled with zeros past its end.
 
-        Of speech that is 16 kHz mono only the streams that hold the samples are read. Any other is decoded as a whole
-        once and kept in ``store``, as that of a folder is.
+        Of 16 kHz mono speech only the streams that hold the samples are read. Any other speech is converted as a whole
+        once and cached in ``store``, like the speech of a folder.
         """
         sound = self.record.clips[name].sound
         if sound.form == "flac" and sound.rate == SAMPLE_RATE and sound.channels == 1:
@@ -161,12 +163,12 @@ class PackedCorpus:
         return samples >> (32 - sound.bits)
 
     def recording(self, name: str) -> bytes:
-        """The file of a recording that was kept as it was."""
+        """The original file of a recording that FLAC cannot hold."""
         sound = self.record.clips[name].sound
         return self._arrays["speech"].read(sound.first, sound.first + sum(sound.pieces)).tobytes()
 
     def _decoded(self, encoded: bytes, name: str, expected: int, low: int, high: int) -> npt.NDArray[np.int32]:
-        """Samples ``low`` to ``high`` of a stream that has ``expected``; what lies around them is not decoded."""
+        """Samples ``low`` to ``high`` of a stream of ``expected`` samples; the samples around them are not decoded."""
         sound = self.record.clips[name].sound
         with open_sound(io.BytesIO(encoded), self._speech_of(name)) as file:
             declared = (file.format, file.frames, file.channels, file.samplerate)
@@ -177,7 +179,7 @@ class PackedCorpus:
                 piece: npt.NDArray[np.int32] = file.read(high - low, dtype="int32", always_2d=True)
                 if len(piece) == high - low:
                     return piece
-        raise FaceDiffError(f"{self._speech_of(name)} is not what the record says; {REMEDY}")
+        raise FaceDiffError(f"{self._speech_of(name)} differs from its entry in the record; {REMEDY}")
 
     def _speech_of(self, name: str) -> str:
         return f"{self.source}: speech of clip {name}"
@@ -234,20 +236,24 @@ class PackedMotion:
         return offsets
 
     def _decode(self, number: int, encoded: memoryview, row_places: list[tuple[int, int]], motion: Floats) -> None:
-        """Decode a chunk, and write the rows that are wanted to their places."""
+        """Decode a chunk, and write the requested rows to their places in ``motion``."""
         chunk = self.array.decode(number, encoded)
         exact = np.dtype(self.clip.coding) if self.clip.coding in EXACT else None
         step = np.float32(self.record.step)
         places: dict[int, list[int]] = {}
         for row, place in row_places:
             places.setdefault(row, []).append(place)
-        row = chunk[0]  # summed up in place: whole numbers that wrap around, so that nothing is ever lost
+        # Rows are stored as differences from the row before, in whole numbers that wrap around, so the running sum is
+        # exact. It is taken row by row up to the last requested one: a window needs few rows of a chunk, and a
+        # cumulative sum over the whole chunk would write each of them to memory.
+        row = chunk[0]
         for inner in range(max(places) + 1):
             if inner:
                 row += chunk[inner]
             for place in places.get(inner, ()):
                 if exact is None:
-                    np.copyto(motion[place], row)  # and then in place: a fifth quicker than at once
+                    # Convert, then scale in place: a fifth faster than `row * step`, which allocates an array.
+                    np.copyto(motion[place], row)
                     motion[place] *= step
                 else:
                     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
@@ -268,7 +274,7 @@ class PackedMotion:
 
 
 def _neighbours(numbers: Sequence[int]) -> list[list[int]]:
-    """Numbers in groups of which each is one more than the one before."""
+    """Groups of consecutive numbers."""
     groups: list[list[int]] = []
     for number in numbers:
         if groups and groups[-1][-1] == number - 1:
@@ -279,7 +285,7 @@ def _neighbours(numbers: Sequence[int]) -> list[list[int]]:
 
 
 def _threads() -> int:
-    """Threads that may decode at the same time: processors that no other loader process uses."""
+    """Threads that may decode at the same time: this loader process's share of the processors."""
     from torch.utils.data import get_worker_info
 
     worker: Any = get_worker_info()
@@ -290,7 +296,7 @@ _pools: dict[int, ThreadPoolExecutor] = {}
 
 
 def _pool() -> ThreadPoolExecutor:
-    """The threads of this process that decode; those of the process that it was forked from did not come along."""
+    """The threads of this process that decode; threads do not survive the fork of a loader process."""
     if os.getpid() not in _pools:
         _pools.clear()
         _pools[os.getpid()] = ThreadPoolExecutor(_threads(), "facediff-packed")

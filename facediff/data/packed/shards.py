@@ -1,7 +1,8 @@
-"""Chunks of a sharded array, each fetched and decoded for itself, within bounds that are known beforehand.
+"""Reading single chunks of a sharded array, with memory bounded beforehand.
 
-The zarr package could read them as well. It would obey whatever codecs the metadata name, believe a chunk's own size,
-and take some milliseconds of event loop for each window, in threads that do not survive the forks of a data loader.
+The zarr package could read them as well. But it runs any codec that the metadata name, trusts the size in a chunk's
+header, and spends some milliseconds in its event loop for each window, in threads that do not survive the forks of a
+data loader.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class ShardedArray:
     Args:
         store: where it lies.
         name: the array's name.
-        facts: what the record says of it.
+        facts: its entry in the record.
     """
 
     def __init__(self, store: ByteStore, name: str, facts: ArrayFacts) -> None:
@@ -48,11 +49,11 @@ class ShardedArray:
         self._lock, self._scratch = Lock(), local()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Locks do not go to other processes."""
+        """Leave out locks, which cannot be pickled."""
         return {name: value for name, value in self.__dict__.items() if name not in ("_lock", "_scratch", "_codecs")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make new ones."""
+        """Make new locks."""
         self.__dict__.update(state)
         self._reset()
 
@@ -91,7 +92,7 @@ class ShardedArray:
         return encoded
 
     def decode(self, number: int, encoded: memoryview) -> npt.NDArray[Any]:
-        """A chunk (rows, width), or (rows,), in memory that the thread's next chunk overwrites."""
+        """A chunk (rows, width), or (rows,), in memory that the thread's next call overwrites."""
         blosc, crc32c = self._codecs
         body = encoded[:-CHECKSUM]
         if len(encoded) < HEADER.size + CHECKSUM or crc32c.value(bytes(body)) != int.from_bytes(
@@ -156,12 +157,12 @@ class ShardedArray:
 
 
 def shard_key(shard: int, width: int) -> str:
-    """Where a shard lies below its array, by Zarr's default encoding of keys."""
+    """Path of a shard below its array, by Zarr's default encoding of keys."""
     return f"c/{shard}/0" if width else f"c/{shard}"
 
 
 def chunks_of(rows: Sequence[int], chunk: int) -> dict[int, list[tuple[int, int]]]:
-    """For each chunk the rows in it that are wanted, in order, with their place in the result.
+    """For each chunk its requested rows, in order, with their place in the result.
 
     Example:
         >>> chunks_of(range(24, 27), 25)

@@ -1,4 +1,4 @@
-"""Where the bytes of a packed corpus come from: a folder, or any address that fsspec knows, kept on disk once read."""
+"""Byte access to a packed corpus in a folder or at any address that fsspec knows, with a cache on disk."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from facediff.utils.limits import brief
 
 VARIABLE = "FACEDIFF_PACKED_CACHE_GB"
 USUAL_GB = 50.0
-"""Gigabytes of disk that chunks read from addresses may take, unless the variable says otherwise."""
+"""Default size of the cache in gigabytes."""
 TOUCHED = 3600.0
 """Seconds after which reading a kept chunk marks it as used; marking it each time would cost a write each time."""
 ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
@@ -27,7 +27,7 @@ Range = tuple[int, int]
 
 
 def address_of(source: str | Path) -> str | None:
-    """A text, or a path made of one, as the address that it is; None for a path of this machine.
+    """The address in a text, or in a path made of one; None for a path of this machine.
 
     Example:
         >>> address_of("https://lab.example/biwi.zarr"), address_of("data/biwi.zarr")
@@ -66,7 +66,7 @@ def open_store(source: str | Path, identity: str = "") -> ByteStore:
 
     Args:
         source: folder or address.
-        identity: what the kept chunks of an address are filed under; nothing is kept if empty.
+        identity: key of the cache for an address; nothing is cached if empty.
     """
     address = address_of(source)
     if address is not None:
@@ -108,11 +108,11 @@ class LocalStore:
 
 
 class RemoteStore:
-    """A packed corpus at an address; what was read once is read from the disk afterwards.
+    """A packed corpus at an address; ranges that were read once come from a cache on disk.
 
     Args:
         address: of the group, as fsspec has it.
-        cache: keeps what was read; None keeps nothing.
+        cache: of the ranges; None for no cache.
     """
 
     def __init__(self, address: str, cache: ChunkCache | None) -> None:
@@ -124,7 +124,7 @@ class RemoteStore:
         self._base = ""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Connections do not go to other processes."""
+        """Leave out connections, which belong to their process."""
         return {**self.__dict__, "_system": None}
 
     def whole(self, key: str) -> bytes:
@@ -132,12 +132,12 @@ class RemoteStore:
         return bytes(self._fetch(key, None, None))
 
     def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
-        """Ranges of an object: kept ones from the disk, the others fetched, neighbours in one request."""
+        """Ranges of an object: from the cache, or fetched, with neighbours in one request."""
         parts: dict[Range, memoryview] = {}
         for byte_range in dict.fromkeys(byte_ranges):
-            kept = None if self.cache is None else self.cache.get(key, byte_range)
-            if kept is not None:
-                parts[byte_range] = kept
+            cached = None if self.cache is None else self.cache.get(key, byte_range)
+            if cached is not None:
+                parts[byte_range] = cached
         for run in runs([byte_range for byte_range in dict.fromkeys(byte_ranges) if byte_range not in parts]):
             start, end = run[0][0], run[-1][0] + run[-1][1]
             for byte_range, part in zip(
@@ -186,7 +186,7 @@ class RemoteStore:
 
 
 def runs(byte_ranges: Sequence[Range]) -> list[list[Range]]:
-    """Ranges in groups of which each follows the one before without a gap.
+    """Groups of adjacent ranges, which one read or request can fetch.
 
     Example:
         >>> runs([(0, 4), (4, 2), (9, 1)])
@@ -213,7 +213,7 @@ def split(content: bytes | bytearray, run: Sequence[Range], source: object) -> l
 
 
 class ChunkCache:
-    """Ranges that were read from addresses, one file each, of which the least recently used are removed.
+    """A cache on disk for ranges read from addresses, one file each; the least recently used are removed.
 
     Several processes may use it at the same time; anything in it may be removed at any time.
 
@@ -226,14 +226,14 @@ class ChunkCache:
         self.folder = folder
         self.identity = identity
         self.limit = limit_bytes()
-        # Looking through the folder costs time: it is done at first, and whenever a tenth of the limit was added.
+        # Scanning the folder is slow: it is done at first, and whenever a tenth of the limit was added.
         self._unseen = self.limit
 
     def _path(self, key: str, byte_range: Range) -> Path:
         return self.folder / self.identity / "chunks" / key.replace("/", ".") / f"{byte_range[0]}-{byte_range[1]}"
 
     def get(self, key: str, byte_range: Range) -> memoryview | None:
-        """The bytes of a range; None if they are not kept."""
+        """The bytes of a range; None if they are not in the cache."""
         if not self.limit:
             return None
         path = self._path(key, byte_range)
@@ -246,7 +246,7 @@ class ChunkCache:
         return memoryview(content) if len(content) == byte_range[1] else None
 
     def put(self, key: str, byte_range: Range, content: memoryview) -> None:
-        """Keep the bytes of a range, if the disk takes them."""
+        """Store the bytes of a range, if the disk has room."""
         if not self.limit:
             return
         try:
@@ -282,7 +282,7 @@ class ChunkCache:
 
 
 def limit_bytes() -> float:
-    """Bytes that the cache may take, as the environment says."""
+    """Size limit of the cache in bytes, from the environment."""
     text = os.environ.get(VARIABLE, str(USUAL_GB))
     try:
         limit = float(text)

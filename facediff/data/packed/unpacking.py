@@ -1,4 +1,4 @@
-"""The corpus folder that a packed corpus holds."""
+"""Unpacking: from a packed corpus back to a corpus folder."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def unpack(
 ) -> int:
     """Write the corpus folder that was packed; returns the number of its clips.
 
-    Motion is what was packed within the tolerance, and bit for bit where it was packed without loss; speech has the
-    same samples, every other file the same bytes. Checksums in ``manifest.json`` are those of what is written.
+    Motion differs from the original by no more than the tolerance, and not at all where it was packed without loss;
+    speech has the same samples, every other file the same bytes. Checksums in ``manifest.json`` are updated.
 
     Args:
         source: folder or address of the packed corpus.
@@ -103,7 +103,7 @@ def _correct_manifest(folder: Path, packed: PackedCorpus, workers: int | None) -
     files = manifest.get("files")
     if not isinstance(files, dict):
         return
-    # Names are compared with those that were written, since an untrusted manifest may name files elsewhere.
+    # An untrusted manifest may name files outside the folder: only files that were just written are described.
     ours = {*packed.record.files, *(name for clip in packed.names() for name in _places(clip))}
     there = [name for name in files if name in ours]
     written = describe_files(folder, there, workers=workers or processors(), progress="")

@@ -1,7 +1,7 @@
-"""Ranges of objects on a web server, over connections that stay open.
+"""Ranges of objects on a web server, over persistent connections.
 
-fsspec reads them as well, and whatever this module leaves to it. For a window of motion its event loop and its copies
-take longer than the transfer from a near server.
+fsspec could read them as well, and reads all that this module does not handle. But for a window of motion its event
+loop and its copies take longer than the transfer from a near server.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from urllib.parse import SplitResult, quote, urlsplit
 from urllib.request import getproxies, proxy_bypass
 
 QUICK = getattr(socket, "TCP_QUICKACK", None)
-"""Linux's option to confirm at once what has come; it wears off.
+"""Linux's option to acknowledge data without delay; the kernel resets it, so it is set again for every read.
 
-Without it a simple server, which keeps its last bytes back until all others are confirmed, and this machine, which
-waits for more before it confirms, can wait 40 ms for each other.
+Without it, Nagle's algorithm at a simple server, which holds its last bytes back until all others are acknowledged, and
+delayed acknowledgements on this machine can wait 40 ms for each other.
 """
 BLOCK = 1 << 20
 """Bytes that are received at a time."""
@@ -52,11 +52,11 @@ class WebServer:
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Connections do not go to other processes."""
+        """Leave out connections, which belong to their process."""
         return {"address": self.address}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Connect anew."""
+        """Start without connections."""
         self.__init__(**state)  # type: ignore[misc]
 
     @staticmethod
@@ -71,7 +71,7 @@ class WebServer:
         return bool(plain and (parts.scheme not in getproxies() or proxy_bypass(parts.netloc)))
 
     def get(self, key: str, start: int | None, stop: int | None) -> bytes | bytearray | None:
-        """Bytes ``start`` to ``stop`` of an object, or all; None for whatever is not a plain answer.
+        """Bytes ``start`` to ``stop`` of an object, or all; None for any other answer than a plain one.
 
         Raises:
             FileNotFoundError: if the server says that there is no such object.
@@ -102,7 +102,7 @@ class WebServer:
             if start is not None and stop is not None and answer.length == stop - start:
                 return _filled(connection, answer, stop - start)
         status = answer.status
-        self._forget()  # what is left of the answer may be long
+        self._forget()  # the unread rest of the answer may be long
         if status == 404:
             raise FileNotFoundError(key)
         return None
@@ -122,7 +122,7 @@ class WebServer:
             self._open.connection = connection
             self._all.append(connection)
             connection.connect()
-            # Requests are small, and nothing is gained by waiting for more to send.
+            # Requests are small: Nagle's algorithm would only delay them.
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return connection
 

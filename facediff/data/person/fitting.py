@@ -109,7 +109,7 @@ def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
 
 
 def lay_onto_corpus(path: Path, face: Array, target: TargetCorpus) -> tuple[Similarity, float]:
-    """The similarity transform from a face to the corpus's mean face, and its residual as a share of the face's size."""
+    """The similarity transform from a face to the corpus's mean face, and its residual as a share of the size."""
     map_ = robust_align(face, target.mean, scale=True)
     residual = relative_residual(map_.apply(face), target.mean)
     if not residual < RESIDUAL_LIMIT:
