@@ -1,4 +1,4 @@
-"""``facediff demo``: from nothing to a talking face."""
+"""``facediff demo``: make a corpus, train, test and render, without downloads."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def demo(
     epochs: Annotated[ranges.Epochs | None, Option(metavar="N")] = None,
     data_root: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
 ) -> None:
-    """Make a corpus, train, test and render a talking face.
+    """Make a corpus, train a model on it, test it and render a talking face.
 
-    Makes the built-in synthetic corpus, trains the small dual-path model on it, lets it learn to hear other voices and
-    rooms, scores it on sentences that were not in training, and writes videos of truth next to prediction. About ten
-    minutes on two CPU cores.
+    Makes the built-in synthetic corpus, trains the small dual-path model on it, distils its audio encoder for
+    other voices and rooms, scores it on sentences that were not in training, and writes videos of truth next to
+    prediction. About ten minutes on two CPU cores.
 
     Args:
         output: folder for all results
-        fast: train for a minute or two, to see that all works; the face moves, but does not speak well
+        fast: train for a minute or two, to see that everything works; the lips follow the speech only roughly
         epochs: training epochs (default: the config's)
         data_root: where the corpus is kept (default: the user's cache folder)
     """
@@ -64,8 +64,8 @@ def demo(
     checkpoint = output / "puppet.ckpt"
     fitted.trainer.save_checkpoint(checkpoint)
     if not fast:
-        tell(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now it learns to hear other voices")
-        hear(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
+        tell(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now its audio encoder is adapted to other
+        voices") hear(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
     tell(f"facediff demo: ready after {time.monotonic() - started:.0f} s; now the test")
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])

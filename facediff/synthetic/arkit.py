@@ -1,4 +1,4 @@
-"""ARKit's 52 shapes for the built-in puppet's face, for those who have no blendshapes of their own."""
+"""ARKit's 52 shapes for the built-in puppet's face, for users without blendshapes of their own."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SIDED = {
     "cheekSquint": "cheek_raise",
     "noseSneer": "nose_wrinkle",
 }
-"""Controls that act on both sides, of which two shapes are made."""
+"""Controls that act on both sides; each makes two shapes."""
 
 LOOK_SIDEWAYS, LOOK_UP = 30.0, 25.0  # Degrees by which an eyeball is turned at weight 1
 BLEND = 0.005  # Half the width in metres of the strip about the midline over which a side's share goes from 0 to 1

@@ -72,7 +72,7 @@ def clips(drawn: int = 0) -> tuple[SyntheticClip, ...]:
     """All clips, speaker by speaker.
 
     Moods take turns, shifted by one from speaker to speaker, so that every speaker has every mood equally
-    often in training and every sentence is heard in every mood.
+    often in training and every sentence is spoken in every mood.
 
     Args:
         drawn: How many drawn speakers there are besides the eight. They say the training sentences only.
@@ -151,8 +151,9 @@ def generate_clip(clip: SyntheticClip, seed: int = 0) -> tuple[NDArray[np.int16]
     samples = samples[: frames * _SAMPLES_PER_FRAME]
     end = frames / FRAME_RATE
     phonemes = _in_quiet(spoken.phonemes, before / SAMPLE_RATE, end)
-    everybody = (*SPEAKERS, *drawn_names(MOST_DRAWN))
-    random = np.random.default_rng([seed, everybody.index(clip.identity), clip.number])
+    # The index of a speaker seeds the random part, so it must not depend on how many speakers are drawn.
+    speakers = (*SPEAKERS, *drawn_names(MOST_DRAWN))
+    random = np.random.default_rng([seed, speakers.index(clip.identity), clip.number])
     weights = generate_weights(
         segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.style, clip.mood, random
     )
@@ -218,8 +219,8 @@ def _write_common(folder: Path, chosen: Sequence[SyntheticClip]) -> None:
     for name in ("wav", "vertices_npy", "phonemes", "regions"):
         (folder / name).mkdir()
     mesh = build_face()
-    everybody = dict.fromkeys((*SEEN_IDENTITIES, *UNSEEN_IDENTITIES, *(clip.identity for clip in chosen)))
-    templates = {identity: np.array(rig_of(identity).neutral) for identity in everybody}
+    speakers = dict.fromkeys((*SEEN_IDENTITIES, *UNSEEN_IDENTITIES, *(clip.identity for clip in chosen)))
+    templates = {identity: np.array(rig_of(identity).neutral) for identity in speakers}
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
     mean = np.mean([templates[identity] for identity in SEEN_IDENTITIES], axis=0)

@@ -1,7 +1,7 @@
 """Speech without motion, in any amount: words in random order by the speakers of the built-in corpus.
 
-What only learns to hear needs no motion, but more than two dozen sentences: it would know these by heart, and not how
-sounds follow one another elsewhere.
+An audio encoder that is distilled needs no motion, but more than two dozen sentences, or it overfits to their sequences
+of sounds.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from facediff.synthetic.speakers import speaker_of
 from facediff.synthetic.speech import speak
 from facediff.utils import SAMPLE_RATE
 
-# Chosen for this corpus, so that every English sound comes in several places of a word; no word that bears meaning is
-# one of the test sentences'.
+# Chosen for this corpus, so that every English sound occurs in several places of a word; no content word is in the test
+# sentences.
 _WORDS = """
 apple arm beach begin below bench bird bite black blanket blood blow bone bottle bread bridge bring bubble
 build burn butter cabin camel candle car carpet catch chair cheap cheese chimney choice church circle climb

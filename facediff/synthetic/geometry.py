@@ -1,4 +1,4 @@
-"""What the puppet's head is made with: curves and hills, a triangulation, and meshes of which one half is built."""
+"""Geometry of the puppet's head: curves and hills, a triangulation, and meshes mirrored from one half."""
 
 from __future__ import annotations
 

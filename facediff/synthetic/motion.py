@@ -209,7 +209,7 @@ class Viseme:
     strength: float = 1.0
     reach: float = 1.0  # How far its influence spreads in time, as a factor
     closes: bool = False  # Whether the lips meet
-    firm: tuple[str, ...] = ()  # Controls on which it dominates fully, whatever its `strength`
+    firm: tuple[str, ...] = ()  # Controls on which it dominates fully, at any `strength`
 
 
 _ALL = (

@@ -31,7 +31,7 @@ class Speaker:
 def _read_speakers() -> dict[str, Speaker]:
     text = resources.files(__package__).joinpath("speakers.toml").read_text(encoding="utf-8")
     tables: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(text)
-    # The constructors refuse a number that they do not know, so a misspelt name cannot go unnoticed.
+    # The constructors refuse unknown keywords, so a misspelt name cannot go unnoticed.
     return {
         name: Speaker(name, EspeakVoice(**table["voice"]), Shape(**table["shape"]), SpeakingStyle(**table["style"]))
         for name, table in tables.items()

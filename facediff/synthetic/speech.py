@@ -2,7 +2,7 @@
 
 espeak-ng arrives with ``espeakng_loader`` (library and data in one wheel) and is driven through ctypes. It
 keeps state from one utterance to the next, so that a second call in one process gives another waveform with
-other times whatever is reset, and its noise is seeded by the clock. Therefore the noise is given a seed, and the
+other times, even after a reset, and its noise is seeded by the clock. Therefore the noise is given a seed, and the
 library is loaded for each utterance and unloaded again. Where it cannot be unloaded (because the process uses it
 elsewhere, or the C library never unloads), a new interpreter speaks the utterance. Both ways give the same bits.
 """
@@ -190,7 +190,7 @@ def _speak_here(text: str, voice: EspeakVoice) -> tuple[int, bytes, list[tuple[i
         # Breathy voices mix noise in, which is seeded by the clock unless a seed is set.
         library.espeak_ng_SetRandSeed(ctypes.c_long(_NOISE_SEED))
         if library.espeak_SetVoiceByName(voice.name.encode()) != 0:
-            raise FaceDiffError(f"espeak-ng knows no voice {voice.name!r}; use one like 'en-us+f2'")
+            raise FaceDiffError(f"espeak-ng has no voice {voice.name!r}; use one like 'en-us+f2'")
         library.espeak_SetSynthCallback(callback)
         for parameter, value in (
             (_RATE, voice.rate),

@@ -1,4 +1,4 @@
-"""What a corpus folder is, and whether it is sound: ``facediff data check``."""
+"""Recognising and checking corpus folders: ``facediff data check``."""
 
 from facediff.data.check.check import check
 from facediff.data.check.report import CheckReport, Finding, text

@@ -1,4 +1,4 @@
-"""Checking a corpus folder: what is there, what is missing and what is wrong."""
+"""Checking a corpus folder: contents, missing clips and defects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from facediff.data.corpus import Clip, Corpus
 
 WORTH_IT = 64 << 20
-"""Bytes of motion from which on starting processes pays."""
+"""From so many bytes of motion on, starting processes pays."""
 REFERENCES = "none"
 """The split of clips that give style references only."""
 
@@ -80,7 +80,7 @@ def check(
         progress: show a progress bar on standard error.
 
     Raises:
-        FaceDiffError: if there is no such folder, corpus or split. What is wrong in the folder is in the report.
+        FaceDiffError: if there is no such folder, corpus or split. Defects of the folder are in the report.
         MissingExtraError: if soundfile or trimesh is not installed.
     """
     packed = None
@@ -236,7 +236,7 @@ def _examine_all(
 
 
 def _check_names(view: View, folder: CorpusFolder, clips: Mapping[str, Clip], findings: Findings) -> None:
-    """Names that are none of the corpus's, subjects that no split knows, files that nothing reads."""
+    """Report names not of the corpus's form, subjects in no split, and files that are not read."""
     unknown = [name for name in folder.names if view.parse(name) is None]
     hubert = facexhubert_names(unknown) if view.corpus == "biwi" else []
     if hubert:
@@ -253,7 +253,7 @@ def _check_names(view: View, folder: CorpusFolder, clips: Mapping[str, Clip], fi
     if foreign := _without_split(view, clips):
         subjects = dict.fromkeys(clips[name].identity for name in foreign)
         message = (
-            f"{counted(len(foreign), 'clip')} of subjects that no split of {view.corpus} knows ({few(subjects)}), so "
+            f"{counted(len(foreign), 'clip')} of subjects in no split of {view.corpus} ({few(subjects)}), so "
             f"not trained or scored on: {few(foreign)}"
         )
         findings.warning("unknown_subject", "wav, vertices_npy", message)
@@ -262,12 +262,12 @@ def _check_names(view: View, folder: CorpusFolder, clips: Mapping[str, Clip], fi
         findings.warning("leftover", folder.leftovers[0], message)
     if folder.strays:
         files = counted(len(folder.strays), "file")
-        message = f"{files} that nothing reads (expected .wav and .npy): {few(folder.strays)}"
+        message = f"{files} of other types, which are not read (expected .wav and .npy): {few(folder.strays)}"
         findings.note("stray_file", folder.strays[0], message)
 
 
 def _without_split(view: View, clips: Mapping[str, Clip]) -> list[str]:
-    """Clips of subjects that none of the corpus's splits knows."""
+    """Clips of subjects that are in none of the corpus's splits."""
     identities = set(view.identities)
     identities |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
     for clip in clips.values():

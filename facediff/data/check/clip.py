@@ -33,11 +33,11 @@ NEARER = 0.5
 """Motion belongs to another subject if that subject's template is nearer than this share of the own distance."""
 
 BLOCK = 1 << 16  # samples of all channels together that are decoded at a time
-SLIGHT = 0.1  # seconds by which the lengths of speech and motion may differ without a remark
+SLIGHT = 0.1  # seconds by which the lengths of speech and motion may differ without a finding
 MUCH = (0.5, 0.1)
 """Speech and motion that differ by more than so many seconds and by more than this share do not belong together."""
 LENGTHS = ("length", "speech_shorter", "speech_longer")
-"""Kinds of findings about motion and speech that do not last equally long."""
+"""Kinds of findings about motion and speech of different length."""
 
 Array = npt.NDArray[np.floating]
 
@@ -54,7 +54,7 @@ class ClipFiles:
 
 @dataclass(frozen=True)
 class Rules:
-    """What every clip is compared with, and whether headers only are read (``quick``)."""
+    """The expected properties of every clip, and whether headers only are read (``quick``)."""
 
     root: Path
     n_vertices: int
@@ -65,7 +65,7 @@ class Rules:
 
 @dataclass
 class ClipFacts:
-    """What one clip holds; None for what cannot be used."""
+    """The properties of one clip; None for those that cannot be read."""
 
     name: str
     frames: int | None = None  # on disk
@@ -78,7 +78,7 @@ class ClipFacts:
 
 
 def examine(rules: Rules, clip: ClipFiles) -> ClipFacts:
-    """Check one clip; whatever goes wrong becomes a finding."""
+    """Check one clip; every exception becomes a finding."""
     facts = ClipFacts(clip.name)
     try:
         if clip.motion is not None:
@@ -257,7 +257,7 @@ def _decode(findings: Findings, file: Any, where: str) -> None:  # noqa: ANN401 
 
 
 def compare_lengths(facts: ClipFacts, frame_rate: float, frames: int, seconds: float) -> None:
-    """Remark on motion and speech that do not last equally long."""
+    """Report motion and speech of different length."""
     motion = frames / frame_rate
     difference = abs(motion - seconds)
     if difference <= SLIGHT:

@@ -1,4 +1,4 @@
-"""What a folder is: a corpus, a person's folder, a raw distribution, or nothing that is known."""
+"""Recognising a folder: a corpus, a person's folder, a raw distribution, or none of these."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STATE = "prepare.json"
 SPLITS = ("train", "val", "test_a", "test_b")
 
 PROBED = 8  # files of motion whose header is read to find the topology
-HALF = 0.5  # share of the names that a corpus must know to be recognised by them
+HALF = 0.5  # share of the names that must be of a corpus's form to recognise it
 FACEXHUBERT = re.compile(r"[FM]\d_(\d\d)(_cut)?")
 """BIWI's clips in FaceXHuBERT's preparation: NN for a neutral sequence, NN + 40 for an emotional one."""
 
@@ -47,7 +47,7 @@ RAW_FILES = {
         "datasets/mead/param/*.npy",
     ),
 }
-"""Files that a raw distribution has, by the name under which ``facediff data prepare`` knows it."""
+"""Files of raw distributions, by their name in ``facediff data prepare``."""
 BASES = 100  # folders in the raw folder that are searched: an archive may have been unpacked to one of them
 
 
@@ -84,7 +84,7 @@ class CorpusFolder:
 
 @dataclass(frozen=True)
 class View:
-    """What the check needs to know about a corpus, from its data module or from a person's own folder."""
+    """The facts about a corpus that the check needs, from its data module or from a person's own folder."""
 
     corpus: str
     data_module: str | None  # import path; None for a person's folder
@@ -149,7 +149,7 @@ def identify(
 
 
 def view_of(root: Path, corpus: str | None) -> View:
-    """What a corpus folder is.
+    """Recognise a corpus folder.
 
     Args:
         root: the folder.
@@ -169,7 +169,7 @@ def view_of(root: Path, corpus: str | None) -> View:
     return view
 
 
-# What lies in the folder.
+# The files of the folder.
 
 
 def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
@@ -225,7 +225,7 @@ def _raw_distribution(root: Path) -> tuple[str, str] | None:
     return None
 
 
-# Which data module reads it.
+# The data module that reads it.
 
 
 def by_name(name: str, n_vertices: int | None) -> Module:
@@ -302,7 +302,7 @@ def _import(path: str) -> Module:
 
 
 def _most_names(modules: Sequence[Module], names: Sequence[str]) -> Module | None:
-    """The data module that knows most of the names, and at least half of them."""
+    """The data module that parses most of the names, and at least half of them."""
 
     def knows(module: Module, name: str) -> bool:
         clip = module.parse_name(name)
@@ -320,7 +320,7 @@ def _own_names(module: Module) -> bool:
     return module.parse_name.__func__ is not SpeechMotionDataModule.parse_name.__func__  # type: ignore[attr-defined]
 
 
-# What the check needs to know of it.
+# The facts that the check needs.
 
 
 def _view_of_module(module: Module, root: Path, split: str | None) -> View:

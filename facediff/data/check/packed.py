@@ -1,4 +1,4 @@
-"""Checking what is packed: every chunk of motion and every stream of speech is decoded."""
+"""Checking a packed corpus: every chunk of motion and every stream of speech is decoded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def check_packed(packed: PackedCorpus, n_vertices: int, templates: Mapping[str, Array], findings: Findings) -> None:
-    """Compare what the record says with the corpus that it was taken for, and the faces with those of the file."""
+    """Compare the record with the recognised corpus, and the packed templates with ``templates.pkl``."""
     record = packed.record
     if record.n_vertices != n_vertices:
         message = f"was packed with {record.n_vertices} vertices, expected {n_vertices}; name the corpus with --corpus"
@@ -36,7 +36,7 @@ def check_packed(packed: PackedCorpus, n_vertices: int, templates: Mapping[str, 
 
 
 def examine_packed(rules: Rules, packed: PackedCorpus, clip: ClipFiles) -> ClipFacts:
-    """Check one clip; whatever goes wrong becomes a finding."""
+    """Check one clip; every exception becomes a finding."""
     facts = ClipFacts(clip.name)
     findings, stored = facts.findings, packed.record.clips[clip.name]
     facts.n_vertices = packed.record.n_vertices

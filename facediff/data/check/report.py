@@ -22,13 +22,13 @@ SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "none": "(style reference
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark."""
+    """One finding."""
 
     # error: training or scores would fail or be wrong; warning: it works, and something is lost; note: good to know
     severity: Severity
-    kind: str  # a word for remarks of this sort; stable, for programs
+    kind: str  # identifier of findings of this kind; stable, for programs
     where: str  # the file or the field, relative to the corpus folder
-    message: str  # what is the matter, and what to do
+    message: str  # the problem, and its remedy
 
 
 class Findings(list[Finding]):
@@ -48,7 +48,7 @@ class Findings(list[Finding]):
 
     @contextmanager
     def guard(self, kind: str, path: Path, root: Path) -> Iterator[None]:
-        """Turn whatever goes wrong with a file into an error: the folder is not trusted.
+        """Turn every exception about a file into an error of the report: the folder is not trusted.
 
         Raises:
             MissingExtraError: unchanged, since that is not the folder's fault.
@@ -66,7 +66,7 @@ class Findings(list[Finding]):
 
 @dataclass
 class CheckReport:
-    """What a folder is and what is wrong in it."""
+    """The corpus in a folder, its contents and its defects."""
 
     root: Path | str  # an address of a packed corpus is a text
     quick: bool = False  # whether headers only were read
@@ -107,7 +107,7 @@ class CheckReport:
         return {"format": FORMAT, "sound": self.sound, **asdict(self), "root": str(self.root)}
 
 
-# The words of findings.
+# Texts of findings.
 
 
 def relative(path: Path, root: Path) -> str:

@@ -1,4 +1,4 @@
-"""Checking what the clips of a folder share: manifest, templates, mesh and regions."""
+"""Checking the files that all clips share: manifest, templates, mesh and regions."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ TEMPLATES = {
     "biwi": {"606284c0": "FaceFormer and TalkingStyle", "d436309f": "FaceDiffuser and DiffSpeaker"},
     "vocaset": {"2fc95570": "TalkingStyle and DiffSpeaker"},
 }
-"""``templates.pkl`` in the repositories of which projects, by the beginning of the file's git blob id."""
+"""Projects whose repositories hold a ``templates.pkl``, by the beginning of the file's git blob id."""
 
 UNIT_AREA = {"biwi"}
-"""Corpora whose circulating templates have a surface area of one."""
+"""Corpora with circulating templates of a surface area of one."""
 AREA_TOLERANCE = 1e-3  # float32 templates are within 1e-6
 
 FLAME_REGIONS = {
@@ -45,10 +45,10 @@ REGIONS = {
     "vocaset": FLAME_REGIONS,
     "mead3d": FLAME_REGIONS,
 }
-"""Number of distinct vertices in the lists that circulate."""
+"""Number of distinct vertices in the circulating lists."""
 
 
-# What ``facediff data prepare`` has recorded, and whether the files are still those.
+# The records of ``facediff data prepare``, and whether the files still agree with them.
 
 
 def check_ended(root: Path, corpus: str | None, findings: Findings) -> bool:
@@ -144,7 +144,7 @@ def check_templates(root: Path, view: View, findings: Findings) -> tuple[dict[st
 
 
 def _origin(view: View, blob: str, findings: Findings) -> str | None:
-    """Whose templates these are; None for corpora of which nothing circulates."""
+    """The project that the templates come from; None for corpora without circulating copies."""
     circulating = TEMPLATES.get(view.corpus)
     if circulating is None:
         return None
@@ -163,7 +163,7 @@ def _origin(view: View, blob: str, findings: Findings) -> str | None:
 def check_areas(
     view: View, unit: object, templates: dict[str, Array], faces: npt.NDArray[np.int32], findings: Findings
 ) -> dict[str, float] | None:
-    """Surface area of every template, which must be one in a corpus whose unit is defined by it; None in others.
+    """Surface area of every template, which defines the unit of some corpora and must be one there; None in others.
 
     ``unit`` is that in ``manifest.json``, if it has one.
     """

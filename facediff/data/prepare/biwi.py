@@ -248,7 +248,7 @@ def _n_vertices(templates: dict[str, Path]) -> int:
 
 
 def _frame_numbers(folder: Path) -> list[int]:
-    """Frame numbers of a sequence; what is wrong with them is reported when the clip is written."""
+    """Frame numbers of a sequence; errors in them are reported when the clip is written."""
     try:
         return list(frame_files(folder))
     except FaceDiffError:
@@ -286,7 +286,7 @@ def frame_files(folder: Path) -> dict[int, Path]:
 
 
 def gaps(numbers: list[int]) -> list[str]:
-    """What is missing in a numbering that should begin with 1 (or 0), e.g. ``["5", "9 to 12"]``."""
+    """The gaps in a numbering that should begin with 1 (or 0), e.g. ``["5", "9 to 12"]``."""
     missing = []
     for before, after in zip([0, *numbers], numbers, strict=False):
         if after - before > 1:

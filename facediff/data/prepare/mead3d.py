@@ -116,8 +116,9 @@ def plan(
         raw: EMOTE's or ProbTalk3D's folder, or a folder above it.
         flame: the user's own FLAME model file; FLAME 2020's, as the parameters are for that model.
         audio: folder with MEAD's sound; the raw folder if None.
-        shape: whose shape the vertices of a clip have: the speaker's mean, as the template has, so that offsets from
-            the template are motion alone; or the clip's own, as in EMOTE, so that they differ by identity too.
+        shape: shape parameters of a clip's vertices: the speaker's mean (``subject``), as in the template, so that
+            offsets from the template are motion alone; or the clip's own (``clip``), as in EMOTE, so that offsets
+            contain differences of shape.
         dtype: of the motion on disk.
         subjects: only these speakers; all that are there if None.
         regions: folder with ``lve.txt`` and ``fdd.txt``; ``regions/`` of the raw folder if None.
@@ -180,7 +181,7 @@ def prepare_clip(
 
 
 def refuse(problem: str, out: Path) -> NoReturn:
-    """The work for a clip whose parameters cannot be read."""
+    """The job of a clip with unreadable parameters: it fails when the clips are written, like any other."""
     raise FaceDiffError(problem)
 
 
@@ -214,7 +215,7 @@ def _survey(
 
 
 def _compare_speakers(speakers: list[str], base: Path, missing: dict[str, str]) -> list[str]:
-    """Record which of the data set's speakers are missing; returns a note on those who are not the data set's."""
+    """Record which speakers of the data set are missing; returns a note on speakers of no published split."""
     from facediff.data.mead3d import TEST, TRAIN, VALIDATION
 
     everyone = sorted((*TRAIN, *VALIDATION, *TEST))
@@ -252,7 +253,7 @@ def _write_shared(
 
 
 def _refuse_other_templates(templates: dict[str, Array], out: Path) -> None:
-    """A speaker's clips must all have the shape that the template has; more raw clips would change it."""
+    """Refuse templates of another mean shape than the clips that are there: more raw clips change the mean."""
     if not (out / "templates.pkl").is_file():
         return
     before = load_pickle(out / "templates.pkl")
@@ -271,7 +272,7 @@ def _refuse_other_templates(templates: dict[str, Array], out: Path) -> None:
 
 @dataclass
 class RawDistribution:
-    """What a raw folder holds: clips, those that lack parameters, and the folder above the speakers or ``param/``."""
+    """The clips of a raw folder, those without parameters, and the folder above the speakers or ``param/``."""
 
     base: Path
     recordings: list[MeadRecording] = field(default_factory=list)

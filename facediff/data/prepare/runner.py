@@ -1,4 +1,4 @@
-"""Writing a corpus folder: what a plan is, how it is carried out and resumed, and how the files are written."""
+"""Writing a corpus folder: the plan, its execution and resumption, and the writers of the files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Precision = Literal["float32", "float64"]
 STATE = "prepare.json"
 """In the output folder while preparation is running or was interrupted."""
 MANIFEST = "manifest.json"
-"""In the output folder when preparation has ended: what was written, what is missing, what failed."""
+"""In the output folder when preparation has ended: the files, and the clips that are missing or failed."""
 LOCK = ".prepare.lock"
 CLIP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,199}")
 WAV_HEADER = 44  # bytes
@@ -70,19 +70,19 @@ class Job:
 
 @dataclass(frozen=True)
 class PreparationPlan:
-    """What is to be written, found by a quick scan of the raw folder."""
+    """The clips and files to write, from a quick scan of the raw folder."""
 
     corpus: str  # biwi, vocaset or mead3d
     frame_rate: float  # motion frames a second, as written
     unit: str  # unit of the written vertices
     n_vertices: int  # vertices of every frame
-    # plain values that decide what is written, dtype among them; a resumed run must have the same
+    # plain values that determine the output, dtype among them; a resumed run must have the same
     options: dict[str, Any]
     jobs: list[Job]  # one for each clip
     # writes what clips share (templates.pkl, mesh, regions/, clips.csv) and returns the paths of those files, relative
     # to the output folder. Runs in the calling process; may run again
     shared: Callable[[Path], list[str]]
-    # what the raw folder lacks: clip or file, and what was expected where
+    # clips and files that the raw folder lacks, and what was expected where
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # other remarks for the user, one sentence each
 
@@ -93,20 +93,20 @@ class PreparationPlan:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """What decides the bytes that are written; a run may be resumed only with the same."""
+        """All that determines the bytes of the output; a run may be resumed only with the same."""
         options = parse_json(json.dumps(self.options), "options")  # as the manifest will hold them: lists, no tuples
         return {"facediff": version(), "format": FORMAT, "corpus": self.corpus, "options": options}
 
 
 @dataclass(frozen=True)
 class PreparationReport:
-    """What preparation did."""
+    """The outcome of a preparation."""
 
     out: Path
     clips: dict[str, int]  # frames of every clip that is there now
     written: int  # number of clips written by this run; the others were there
-    failed: dict[str, str]  # what went wrong, by clip
-    missing: dict[str, str]  # what the raw folder lacks, and what was expected where
+    failed: dict[str, str]  # reasons by clip
+    missing: dict[str, str]  # clips and files that the raw folder lacks, and what was expected where
     notes: list[str]
     totals: dict[str, Any]  # counts, as in the manifest
 
@@ -237,11 +237,11 @@ def version() -> str:
         return "unknown"
 
 
-# What an earlier run has left in the folder.
+# The folder as an earlier run has left it.
 
 
 def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mapping[str, Any]) -> int | None:
-    """Frames of a clip whose motion and speech are both there and whole; None for any other.
+    """Frames of a clip whose motion and speech were both written completely; None for any other.
 
     Files that an earlier manifest records have the sizes that it records.
     """
@@ -282,7 +282,7 @@ def _read_record(path: Path) -> dict[str, Any] | None:
 
 
 def _refuse_other_recipe(plan: PreparationPlan, out: Path, record: dict[str, Any]) -> None:
-    """Refuse to mix what was written with other options, or by another version, with what this plan writes."""
+    """Refuse to mix clips that were written with other options or by another version with those of this plan."""
 
     def settings(recipe: Mapping[str, Any]) -> dict[str, Any]:
         options = {f"--{name.replace('_', '-')}": value for name, value in dict(recipe["options"]).items()}
@@ -310,7 +310,7 @@ def _refuse_foreign(out: Path) -> None:
 
 
 def _refuse_strays(plan: PreparationPlan, out: Path) -> None:
-    """A clip that the raw folder no longer has would be read as part of the corpus without being in the manifest."""
+    """Refuse clips that the raw folder no longer has: training would read them, but no manifest lists them."""
     names = {job.name for job in plan.jobs}
     for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
         if not path.name.startswith(".") and path.stem not in names:
@@ -422,7 +422,7 @@ def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str
     return written
 
 
-# Looking into a raw folder, which may hold the data set itself or the folder that an archive unpacked to.
+# Scanning a raw folder, which holds the data set itself or the folder that an archive unpacked to.
 
 
 def bases(raw: Path) -> list[Path]:
@@ -457,7 +457,7 @@ def find_regions(raw: Path, chosen: Path | None) -> list[Path]:
 def choose_subjects(subjects: Sequence[str] | None, available: Sequence[str], holder: str) -> list[str]:
     """The subjects that ``--subjects`` names, in the order in which they are known; all if None."""
     if subjects is not None and not subjects:
-        raise FaceDiffError(f"--subjects: names nobody; expected e.g. {','.join(available[:2])}")
+        raise FaceDiffError(f"--subjects: is empty; expected e.g. {','.join(available[:2])}")
     for subject in subjects or ():
         if subject not in available:
             raise FaceDiffError(f'--subjects: {holder} has no "{subject}": {choices(subject, available)}')

@@ -49,7 +49,7 @@ Array = npt.NDArray[np.float64]
 
 
 class VocasetRecording(NamedTuple):
-    """One clip: row of every frame in ``data_verts.npy``, entry of ``raw_audio_fixed.pkl``, how errors call it."""
+    """One clip: row of every frame in ``data_verts.npy``, entry of ``raw_audio_fixed.pkl``, name in messages."""
 
     rows: npt.NDArray[np.int64]
     audio: object
@@ -170,7 +170,7 @@ def halved(motion: npt.NDArray[np.floating], decimate: Decimation) -> npt.NDArra
 def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], float]:
     """Samples (S,) or (S, channels) in -1 … 1 and sample rate of an entry ``{"audio": …, "sample_rate": …}``.
 
-    Whole numbers are 16-bit samples, whatever their type; so are floats beyond -1 … 1.
+    Whole numbers of any type, and floats beyond -1 … 1, are 16-bit samples.
     """
     if not isinstance(entry, dict) or not {"audio", "sample_rate"} <= set(entry):
         raise FaceDiffError(f'{where}: expected a dict with "audio" and "sample_rate" in {AUDIO}')
