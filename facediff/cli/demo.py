@@ -21,7 +21,7 @@ CONFIG = "configs/experiment/puppet.yaml"
 SHEET = 12
 """Frames on a contact sheet."""
 FAST = ("--data.drawn_speakers=0", "--trainer.max_epochs=8", "--model.warmup_steps=20")
-"""What ``--fast`` changes: the lips follow the speech by then, and little else does."""
+"""Options of ``--fast``: the shortest training after which the lips follow the speech."""
 
 
 def demo(
@@ -54,33 +54,35 @@ def demo(
     from facediff.models.hearing import HearingOptions
 
     started = time.monotonic()
+
+    def report(step: str) -> None:
+        tell(f"facediff demo, {time.monotonic() - started:.0f} s: {step}")
+
     options = [f"--data.root={data_root}"] if data_root else []
     options += [f"--trainer.max_epochs={epochs}"] if epochs else []
     options += FAST if fast else []
-    briefly = "; --fast, far too short for the quality that the manual shows" if fast else ""
-    tell(f"facediff demo: training on the built-in synthetic corpus ({CONFIG}{briefly})")
+    briefly = "; --fast is far too short for the quality that the manual shows" if fast else ""
+    report(f"training on the built-in synthetic corpus ({CONFIG}{briefly})")
     logger = [f"--trainer.logger.save_dir={output}", "--trainer.logger.name=training"]
     fitted = run_cli("fit", ["--config", CONFIG, *logger, *options])
     checkpoint = output / "puppet.ckpt"
     fitted.trainer.save_checkpoint(checkpoint)
     if not fast:
-        tell(f"facediff demo: trained in {time.monotonic() - started:.0f} s; now its audio encoder is adapted to other
-        voices") hear(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
-    tell(f"facediff demo: ready after {time.monotonic() - started:.0f} s; now the test")
+        report("adapting the audio encoder to other voices and rooms")
+        hear(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
+    report("scoring sentences that were not in training")
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])
+    report("rendering truth next to prediction")
     videos = write_videos(output, tested.model, tested.datamodule)
-    tell("", f"facediff demo: done in {time.monotonic() - started:.0f} s. Look at:")
+    tell("", f"facediff demo: done in {time.monotonic() - started:.0f} s. Results:")
     for path in (*videos, output / "test_scores.csv", checkpoint):
         tell(f"  {path}")
     tell(f"Next: facediff animate speech.wav --checkpoint {checkpoint} --identity F1 -o speech.mp4")
 
 
 def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModule) -> list[Path]:
-    """Truth next to prediction of the first test clip of a seen speaker and of an unseen one.
-
-    A video with sound, and a sheet of frames.
-    """
+    """Videos with sound, and sheets of frames, of truth next to prediction: the first clip of each test split."""
     import torch
 
     from facediff.animation import Animation
