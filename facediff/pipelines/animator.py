@@ -6,7 +6,7 @@ what speech may be given as.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Unpack, cast, overload
 
@@ -73,12 +73,6 @@ def load(source: str | Path, device: str = "auto", commercial_only: bool = False
 def import_checkpoint(
     paths: str | Path | Sequence[str | Path],
     *,
-    dataset: str | None = None,
-    identities: Sequence[str] | None = None,
-    templates: str | Path | Mapping[str, Any] | None = None,
-    regions: str | Path | None = None,
-    mesh: str | Path | None = None,
-    audio_config: str | Path | Mapping[str, Any] | None = None,
     device: str = "auto",
     **options: Any,  # noqa: ANN401
 ) -> Animator:
@@ -86,14 +80,9 @@ def import_checkpoint(
 
     Args:
         paths: the file, or the files of a method with several stages.
-        dataset: ``vocaset``, ``biwi`` or ``multiface``; by the number of vertices if None.
-        identities: training identities in the order of the training command; the data set's usual ones if None.
-        templates: neutral faces by speaker: the project's ``templates.pkl``, or arrays (V, 3) or (3V,) by name.
-        regions: folder with ``lve.txt`` and ``fdd.txt``, the vertices of lips and upper face.
-        mesh: the data set's mesh, for triangles.
-        audio_config: ``config.json`` of an audio encoder of unusual size, or its content.
         device: as :func:`load` takes it.
-        options: of the model or its audio encoder, such as ``num_heads=4``; see docs/methods.md.
+        options: fields of :class:`~facediff.models.published.import_options.ImportOptions`, such as ``templates``; and
+            options of the model or its audio encoder, such as ``num_heads=4``.
 
     Raises:
         FaceDiffError: if a file cannot be read, is of no known method, or lacks something that is not given.
@@ -103,20 +92,10 @@ def import_checkpoint(
         >>> model.animate("speech.wav", condition=model.identities[2]).save("speech.npy")  # doctest: +SKIP
         [PosixPath('speech.npy')]
     """
-    from facediff.models.published.importing import import_files
+    from facediff.models import import_checkpoint as import_model
 
-    made = import_files(
-        paths,
-        dataset=dataset,
-        identities=identities,
-        templates=templates,
-        regions=regions,
-        mesh=mesh,
-        audio_config=audio_config,
-        **options,
-    )
     first = Path(paths) if isinstance(paths, str | Path) else Path(next(iter(paths)))
-    return Animator(made.model.to(usable_device(device)), first)
+    return Animator(import_model(paths, **options).to(usable_device(device)), first)
 
 
 class Animator:

@@ -23,7 +23,7 @@ from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.base import LongSpeech, PublishedModel
-from facediff.models.published.importing import Found, Weights
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts
 from facediff.utils.ranges import Range
 
 Loop = Literal["cached", "literal"]
@@ -452,14 +452,14 @@ class AutoregressiveNetwork(SpokenDecoder):
 # What the authors' checkpoints of these methods share.
 
 
-def decoder_sizes(weights: Weights, prefix: str, dim: int) -> dict[str, Any]:
+def decoder_sizes(weights: AuthorsWeights, prefix: str, dim: int) -> dict[str, Any]:
     """The decoder's options by the shapes of its tensors."""
     layers = {name.removeprefix(f"{prefix}layers.").split(".")[0] for name in weights.names(f"{prefix}layers.")}
     hidden, _ = weights.shape(f"{prefix}layers.0.linear1.weight")
     return {"dim": dim, "num_layers": len(layers), "feed_forward_dim": hidden}
 
 
-def read_period(weights: Weights, name: str, found: Found) -> int:
+def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts) -> int:
     """The period of a table of positions, which must be what the formula gives and fit the data set.
 
     Raises:
@@ -475,10 +475,10 @@ def read_period(weights: Weights, name: str, found: Found) -> int:
             f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
             f"is of a variant of the method"
         )
-    if period != round(found.frame_rate):
+    if period != round(facts.frame_rate):
         raise FaceDiffError(
-            f"--dataset {found.dataset}: the positions of {weights.source} repeat every {period} frames, and "
-            f"{found.dataset} has {found.frame_rate:g} a second; give the data set that it was trained on"
+            f"--dataset {facts.dataset}: the positions of {weights.source} repeat every {period} frames, and "
+            f"{facts.dataset} has {facts.frame_rate:g} a second; give the data set that it was trained on"
         )
     weights.ignore(name, "the table of positions is computed by its formula")
     return period

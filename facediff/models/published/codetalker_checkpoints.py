@@ -13,7 +13,7 @@ from facediff.errors import FaceDiffError
 from facediff.models.published.autoregressive import decoder_sizes, read_period
 from facediff.models.published.codetalker import CodeTalker
 from facediff.models.published.faceformer import LAYER_NAMES
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 
 HALF_NAMES = (
     ("squasher.0.0", "smooth"),
@@ -30,7 +30,7 @@ BLOCK_NAMES = (
 """The same for attention and feed-forward layers, which take turns in the authors' numbering."""
 
 
-def convert_prior(weights: Weights, prefix: str = "") -> dict[str, Any]:
+def convert_prior(weights: AuthorsWeights, prefix: str = "") -> dict[str, Any]:
     """The first stage's tensors under the names of this file, and its options."""
     codes, token_dim = weights.shape(f"{prefix}quantize.embedding.weight")
     dim, _ = weights.shape(f"{prefix}encoder.vertice_mapping.0.weight")
@@ -63,7 +63,7 @@ def convert_prior(weights: Weights, prefix: str = "") -> dict[str, Any]:
     weights.move_all(f"{prefix}decoder.decoder_linear_embedding_pre.net.", "prior.from_tokens.")
     weights.move_all(f"{prefix}decoder.vertice_map_reverse.", "prior.motion_out.")
     weights.move(f"{prefix}quantize.embedding.weight", "prior.codebook")
-    blocks = [name for name in weights.made if name.startswith("prior.encoder.blocks.")]
+    blocks = [name for name in weights.renamed if name.startswith("prior.encoder.blocks.")]
     return {
         "prior_dim": dim,
         "prior_layers": 1 + max(int(name.split(".")[3]) for name in blocks),
@@ -73,11 +73,11 @@ def convert_prior(weights: Weights, prefix: str = "") -> dict[str, Any]:
         "token_dim": token_dim,
         "codes": codes,
         "token_maps": maps,
-        "out_bias": "prior.motion_out.bias" in weights.made,
+        "out_bias": "prior.motion_out.bias" in weights.renamed,
     }
 
 
-def check_positions(weights: Weights, name: str) -> None:
+def check_positions(weights: AuthorsWeights, name: str) -> None:
     """Leave out a table of positions, of which the published code uses the first row, once it is seen to be one.
 
     Raises:
@@ -96,7 +96,7 @@ def check_positions(weights: Weights, name: str) -> None:
     weights.ignore(name, "the table of positions is computed by its formula")
 
 
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """CodeTalker's tensors of both stages, and its options."""
     stage_one = [name for prefix in ("encoder.", "decoder.", "quantize.") for name in weights.names(prefix)]
     inside = bool(weights.names("autoencoder."))
@@ -110,11 +110,11 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         )
     options = convert_prior(weights, "autoencoder." if inside else "")
     dim, _ = weights.shape("audio_feature_map.weight")
-    period = read_period(weights, "PPE.pe", found)
+    period = read_period(weights, "PPE.pe", facts)
     encoder = weights.backbone(
         "audio_encoder.",
         kind="wav2vec2",
-        request=request,
+        facts=facts,
         **CodeTalker.encoder_settings(),
     )
     for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("feat_map", "out")):
@@ -125,7 +125,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
     return {**options, "audio_encoder": encoder, **sizes, "period": period}
 
 
-def convert_stage_one(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert_stage_one(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """A prior alone, on which a predictor can be trained."""
     return {"stage": "prior", **convert_prior(weights)}
 
@@ -135,7 +135,7 @@ LICENCE: dict[str, Any] = {
     "licence_source": "github.com/Doubiiu/CodeTalker",
 }
 
-recogniser(
+register(
     Recogniser(
         method="CodeTalker",
         marks=("learnable_style_emb.weight", "feat_map.weight", "vertice_map.weight"),
@@ -146,7 +146,7 @@ recogniser(
         **LICENCE,
     )
 )
-recogniser(
+register(
     Recogniser(
         method="CodeTalker",
         marks=("quantize.embedding.weight", "encoder.vertice_mapping.0.weight", "decoder.vertice_map_reverse.weight"),

@@ -43,7 +43,7 @@ from facediff.models.published.diffusion import (
     space_of,
 )
 from facediff.models.published.faceformer import LAYER_NAMES
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.frame_clock import FrameClock
 from facediff.utils.ranges import Range
@@ -589,17 +589,17 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
 # The authors' checkpoints.
 
 
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """DiffSpeaker's tensors under the names of this file, and its options."""
     dim, _ = weights.shape("denoiser.audio_feature_map.weight")
     _, time_dim = weights.shape("denoiser.time_embedding.linear_1.weight")
-    period = round(found.frame_rate)
+    period = round(facts.frame_rate)
     if "denoiser.PPE.pe" in weights:
-        period = read_period(weights, "denoiser.PPE.pe", found)
+        period = read_period(weights, "denoiser.PPE.pe", facts)
     encoder = weights.backbone(
         "audio_encoder.",
         kind="wav2vec2",  # the published code makes this network of HuBERT's weights too
-        request=request,
+        facts=facts,
         **DiffSpeaker.encoder_settings(),
     )
     for old, new in (
@@ -619,11 +619,11 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         **decoder_sizes(weights, decoder, dim),
         "time_dim": time_dim,
         "period": period,
-        "smooth": found.dataset == "vocaset",
+        "smooth": facts.dataset == "vocaset",
     }
 
 
-recogniser(
+register(
     Recogniser(
         method="DiffSpeaker",
         marks=("denoiser.motion_decoder.weight", "denoiser.vertice_map.weight", "denoiser.obj_vector.weight"),

@@ -33,7 +33,7 @@ from facediff.models.published.diffusion import (
     features_graph,
     space_of,
 )
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.samplers import cosine_betas
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.frame_clock import FrameClock, Rule
@@ -393,7 +393,7 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
 # The authors' checkpoints.
 
 
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """FaceDiffuser's tensors under the names of this file, and its options."""
     dim, _ = weights.shape("cond_projection.weight")
     _, steps = weights.shape("time_mlp.0.weight")
@@ -405,7 +405,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         )
     layers = {name.split("encoder.layers.")[1].split(".")[0] for name in weights.names("audio_encoder.encoder.layers.")}
     settings = {**FaceDiffuser.encoder_settings(), "frozen_layers": min(2, len(layers))}
-    encoder = weights.backbone("audio_encoder.", kind="hubert", request=request, **settings)
+    encoder = weights.backbone("audio_encoder.", kind="hubert", facts=facts, **settings)
     for old, new in (
         ("cond_projection", "audio_map"),
         ("input_projection.0", "motion_in"),
@@ -416,7 +416,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         ("final_layer", "motion_out"),
     ):
         weights.move_all(f"{old}.", f"network.{new}.")
-    weights.made["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
+    weights.renamed["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
     return {
         "audio_encoder": encoder,
         "dim": dim,
@@ -425,7 +425,7 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
     }
 
 
-recogniser(
+register(
     Recogniser(
         method="FaceDiffuser",
         marks=("gru.weight_ih_l0", "input_projection.0.weight", "obj_vector.weight", "final_layer.weight"),

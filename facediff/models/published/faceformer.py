@@ -22,7 +22,7 @@ from facediff.models.published.autoregressive import (
     read_period,
 )
 from facediff.models.published.base import SpeakerTable, masked_mean
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 
 
@@ -81,24 +81,24 @@ LAYER_NAMES = (
 """What a decoder layer's tensors are called by PyTorch, and here."""
 
 
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """FaceFormer's tensors under the names of this file, and its options."""
     dim, _ = weights.shape("audio_feature_map.weight")
-    period = read_period(weights, "PPE.pe", found)
+    period = read_period(weights, "PPE.pe", facts)
     encoder = weights.backbone(
         "audio_encoder.",
         kind="wav2vec2",
-        request=request,
+        facts=facts,
         **FaceFormer.encoder_settings(),
     )
     for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("vertice_map_r", "motion_out")):
         weights.move_all(f"{old}.", f"network.{new}.")
-    weights.made["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
+    weights.renamed["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
     weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
     return {"audio_encoder": encoder, **decoder_sizes(weights, "transformer_decoder.", dim), "period": period}
 
 
-recogniser(
+register(
     Recogniser(
         method="FaceFormer",
         marks=("obj_vector.weight", "vertice_map_r.weight", "PPE.pe", "audio_feature_map.weight"),

@@ -34,7 +34,7 @@ from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
 from facediff.models.published.base import DirectModel, masked_mean
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, backbone_config, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, backbone_config, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
 
@@ -411,16 +411,16 @@ LIP_PARTS = ("text_encoder.", "lip_map.", "transformer.", "lm_head.")
 """How the names of the lip reader's tensors begin, and of those of the recogniser that it learns from."""
 
 
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """SelfTalk's tensors under the names of this file, and its options."""
-    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", request=request, **SelfTalk.encoder_settings())
+    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", facts=facts, **SelfTalk.encoder_settings())
     dim, width = weights.shape("audio_feature_map.weight")
     channels, _ = weights.shape("audio_encoder.feature_projection.projection.weight")
-    if "alignment" not in request.options and (width == 2 * channels) != (found.frame_rate == 25.0):
+    if "alignment" not in facts.model_options and (width == 2 * channels) != (facts.frame_rate == 25.0):
         heard = "pairs of steps of speech, as at 25" if width == 2 * channels else "single steps of speech, as at 30"
         raise FaceDiffError(
-            f"--dataset {found.dataset}: {weights.source} takes {heard} frames a second, and {found.dataset} has "
-            f"{found.frame_rate:g}; give the data set that it was trained on"
+            f"--dataset {facts.dataset}: {weights.source} takes {heard} frames a second, and {facts.dataset} has "
+            f"{facts.frame_rate:g}; give the data set that it was trained on"
         )
     hidden, _ = weights.shape("transformer_decoder.layers.0.linear1.weight")
     weights.move_all("audio_feature_map.", "network.audio_map.")
@@ -433,28 +433,28 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         "feed_forward_dim": hidden,
         "lip_reader": "none",
     }
-    if request.options.get("lip_reader") != "text":
+    if facts.model_options.get("lip_reader") != "text":
         for prefix in LIP_PARTS:
             weights.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")
         return made
-    return {**made, **convert_reader(weights, request, found)}
+    return {**made, **convert_reader(weights, facts)}
 
 
-def convert_reader(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert_reader(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """The lip reader's tensors and the recogniser's, and their options.
 
     Raises:
         FaceDiffError: if the vertices that the lip reader sees are not given; no file holds them.
     """
     _, columns = weights.shape("lip_map.weight")
-    given = request.options.get("lip_vertices")
-    if given is None and columns != 3 * found.n_vertices:
+    given = facts.model_options.get("lip_vertices")
+    if given is None and columns != 3 * facts.n_vertices:
         raise FaceDiffError(
             f"--option lip_reader=text: no file holds the {columns // 3} vertices that the lip reader sees; give them "
             f"in the authors' order as --option lip_vertices=[0,1,...], or omit the option, since animation needs none"
         )
     prefix = "text_encoder.wav2vec2."
-    config = backbone_config(weights, prefix, "wav2vec2", request.audio_config)
+    config = backbone_config(weights, prefix, "wav2vec2", facts.audio_config)
     if f"{prefix}masked_spec_embed" not in weights:
         config.update(mask_time_prob=0.0, mask_feature_prob=0.0)
     old = ("weight_g", "parametrizations.weight.original0"), ("weight_v", "parametrizations.weight.original1")
@@ -464,19 +464,19 @@ def convert_reader(weights: Weights, request: Request, found: Found) -> dict[str
     for part in LIP_PARTS[1:]:
         weights.move_all(part, f"reader.{part}")
     return {
-        "lip_vertices": list(range(found.n_vertices)) if given is None else given,
+        "lip_vertices": list(range(facts.n_vertices)) if given is None else given,
         "lip_layers": count_layers(weights, "transformer.encoder.layers."),
         "lip_feed_forward_dim": hidden,
         "text_config": config,
     }
 
 
-def count_layers(weights: Weights, prefix: str) -> int:
+def count_layers(weights: AuthorsWeights, prefix: str) -> int:
     """How many layers there are below such names."""
     return len({name.removeprefix(prefix).split(".")[0] for name in weights.names(prefix)})
 
 
-recogniser(
+register(
     Recogniser(
         method="SelfTalk",
         marks=("lip_map.weight", "vertice_map_r.weight", "audio_feature_map.weight"),

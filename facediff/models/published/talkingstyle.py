@@ -27,7 +27,7 @@ from facediff.models.published.autoregressive import (
 )
 from facediff.models.published.base import SpeakerTable, masked_mean
 from facediff.models.published.faceformer import LAYER_NAMES
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 
 StyleAttention = Literal["one_key", "components"]
@@ -142,18 +142,18 @@ class SpeakerStyle(nn.Module):
 # The authors' checkpoints.
 
 
-def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """TalkingStyle's tensors under the names of this file, and its options."""
     dim, _ = weights.shape("audio_feature_map.weight")
-    usual = len(dataset_facts()[found.dataset].identities)
-    if len(found.identities) != usual:
+    usual = len(dataset_facts()[facts.dataset].identities)
+    if len(facts.identities) != usual:
         weights.notes.append(
-            f"its table has {len(found.identities)} speakers, and {found.dataset} {usual}: it is run as one of "
-            f"{found.dataset}; if it is the authors' mead.pth, their code does not say how that is run, so nothing can "
+            f"its table has {len(facts.identities)} speakers, and {facts.dataset} {usual}: it is run as one of "
+            f"{facts.dataset}; if it is the authors' mead.pth, their code does not say how that is run, so nothing can "
             f"be compared with it"
         )
-    period = read_period(weights, "PPE.pe", found)
-    encoder = weights.backbone("audio_encoder.", kind="hubert", request=request, **TalkingStyle.encoder_settings())
+    period = read_period(weights, "PPE.pe", facts)
+    encoder = weights.backbone("audio_encoder.", kind="hubert", facts=facts, **TalkingStyle.encoder_settings())
     for old, new in (
         ("audio_feature_map.", "audio_map."),
         ("vertice_encoder.", "motion_in."),
@@ -166,13 +166,13 @@ def convert(weights: Weights, request: Request, found: Found) -> dict[str, Any]:
         ("style_encoder.attention.head.", "style.head."),
     ):
         weights.move_all(old, f"network.{new}")
-    weights.made["network.style.first.weight"] = weights.get("style_encoder.obj_vector.weight").T.contiguous()
+    weights.renamed["network.style.first.weight"] = weights.get("style_encoder.obj_vector.weight").T.contiguous()
     weights.move("style_encoder.my_obj_vector.weight", "network.style.second.weight")
     weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
     return {"audio_encoder": encoder, **decoder_sizes(weights, "transformer_decoder.", dim), "period": period}
 
 
-recogniser(
+register(
     Recogniser(
         method="TalkingStyle",
         marks=("style_encoder.my_obj_vector.weight", "vertice_decoder.weight", "PPE.pe", "audio_feature_map.weight"),

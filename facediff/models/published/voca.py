@@ -25,7 +25,7 @@ from facediff.models.deepspeech import DeepSpeechEncoder, network_of
 from facediff.models.graphs import Spoken
 from facediff.models.layers import Width, exporting, frame_mask, sliding
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
-from facediff.models.published.importing import Found, Recogniser, Request, Weights, dataset_facts, recogniser
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
 from facediff.speech.frame_clock import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
@@ -285,36 +285,36 @@ OPTIMISER = ("/Adam", "/Adam_1", "/Momentum", "/RMSProp", "/ExponentialMovingAve
 """How names of what the optimiser keeps end."""
 
 
-def convert(weights: Weights, request: Request, found: Found, *, scope: str) -> dict[str, Any]:
+def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> dict[str, Any]:
     """VOCA's variables under the names of this file, and its options."""
     encoder, shapes = f"{scope}{ENCODER}", f"{scope}{SHAPES}"
     for name in list(weights.tensors):
         last = name.rpartition("/")[2]
         if name.endswith(OPTIMISER) or last in ("global_step", "beta1_power", "beta2_power"):
             weights.ignore(name, "of the optimiser")
-    rate = found.frame_rate
+    rate = facts.frame_rate
     if PUBLISHED_RATE % rate:
         raise FaceDiffError(
             f"--option frame_rate={rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected a rate that "
             f"divides it, such as 30, which takes every second frame"
         )
-    usual = dataset_facts()[found.dataset].frame_rate
+    usual = dataset_facts()[facts.dataset].frame_rate
     if rate != usual:
         remedy = f"; to test it there, import it with --option frame_rate={usual:g}" * (PUBLISHED_RATE % usual == 0)
         weights.notes.append(
-            f"it animates at {rate:g} frames a second, and the corpus {found.dataset} has {usual:g}{remedy}"
+            f"it animates at {rate:g} frames a second, and the corpus {facts.dataset} has {usual:g}{remedy}"
         )
-    if request.graph is None:
+    if facts.graph is None:
         raise FaceDiffError(
             f"{weights.source}: holds VOCA without DeepSpeech, through whose logits it hears; give the graph "
             f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as --option deepspeech=output_graph.pb"
         )
-    if request.audio_config is not None:
+    if facts.audio_config is not None:
         raise FaceDiffError("--audio-config: DeepSpeech's graph says all of its sizes by itself; omit the option")
-    state, sizes, left = network_of(read_graph(request.graph), str(request.graph))
-    weights.made.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
-    weights.ignored.update({f"{request.graph.name}: {name}": "a constant of the graph" for name in left})
-    count, heard = len(found.identities), sizes["logits"]
+    state, sizes, left = network_of(read_graph(facts.graph), str(facts.graph))
+    weights.renamed.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
+    weights.ignored.update({f"{facts.graph.name}: {name}": "a constant of the graph" for name in left})
+    count, heard = len(facts.identities), sizes["logits"]
     channels = convert_convolutions(weights, encoder, heard, count)
     for old, new in (
         ("gamma", "weight"),
@@ -323,14 +323,14 @@ def convert(weights: Weights, request: Request, found: Found, *, scope: str) -> 
         ("moving_variance", "running_var"),
     ):
         weights.move(f"{encoder}batch_norm/{old}", f"network.norm.{new}")
-    weights.made["network.norm.num_batches_tracked"] = torch.tensor(0)
+    weights.renamed["network.norm.num_batches_tracked"] = torch.tensor(0)
     dense = weights.get(f"{encoder}fc1/weights")
-    weights.made["network.dense.weight"] = dense[:-count].T
-    weights.made["network.late_style.weight"] = dense[-count:]
+    weights.renamed["network.dense.weight"] = dense[:-count].T
+    weights.renamed["network.late_style.weight"] = dense[-count:]
     weights.move(f"{encoder}fc1/biases", "network.dense.bias")
     for old, new in ((f"{encoder}fc2/", "coefficients"), (shapes, "expression")):
         weights.shape(f"{old}weights")
-        weights.made[f"network.{new}.weight"] = weights.get(f"{old}weights").T
+        weights.renamed[f"network.{new}.weight"] = weights.get(f"{old}weights").T
         weights.move(f"{old}biases", f"network.{new}.bias")
     return {
         "audio_encoder": partial(DeepSpeechEncoder, config=sizes),
@@ -341,7 +341,7 @@ def convert(weights: Weights, request: Request, found: Found, *, scope: str) -> 
     }
 
 
-def convert_convolutions(weights: Weights, encoder: str, heard: int, count: int) -> list[int]:
+def convert_convolutions(weights: AuthorsWeights, encoder: str, heard: int, count: int) -> list[int]:
     """The convolutions, of which the first sees the speaker too, and their channels.
 
     Raises:
@@ -360,15 +360,15 @@ def convert_convolutions(weights: Weights, encoder: str, heard: int, count: int)
         kernel = weights.get(name)[:, 0]
         if number == 0:
             # (taps, identities, channels) as one row for each identity.
-            weights.made["network.early_style.weight"] = kernel[:, heard:].transpose(0, 1).flatten(1)
+            weights.renamed["network.early_style.weight"] = kernel[:, heard:].transpose(0, 1).flatten(1)
             kernel = kernel[:, :heard]
-        weights.made[f"network.convolutions.{number}.weight"] = kernel.permute(2, 1, 0)
+        weights.renamed[f"network.convolutions.{number}.weight"] = kernel.permute(2, 1, 0)
         weights.move(f"{encoder}conv{number + 1}/biases", f"network.convolutions.{number}.bias")
         channels.append(into)
     return channels
 
 
-def count_identities(weights: Weights, *, scope: str) -> int:
+def count_identities(weights: AuthorsWeights, *, scope: str) -> int:
     """Rows of the first dense layer beyond those of the last convolution, whose window is one row by then.
 
     Raises:
@@ -387,13 +387,13 @@ def count_identities(weights: Weights, *, scope: str) -> int:
     return count
 
 
-def count_vertices(weights: Weights, *, scope: str) -> int:
+def count_vertices(weights: AuthorsWeights, *, scope: str) -> int:
     """Vertices by the linear shapes."""
     return weights.shape(f"{scope}{SHAPES}weights")[1] // 3
 
 
 for each in SCOPES:
-    recogniser(
+    register(
         Recogniser(
             method="Voca",
             marks=(f"{each}{ENCODER}conv1/weights", f"{each}{ENCODER}fc1/weights", f"{each}{SHAPES}weights"),

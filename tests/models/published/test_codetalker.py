@@ -16,6 +16,7 @@ from facediff.cli.app import main
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, CodeTalker, import_checkpoint, load_model
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files
 from tests.fakes import codetalker, published
 from tests.fakes.published import COORDINATES, IDENTITIES, VERTICES, State
@@ -369,11 +370,13 @@ def test_the_stages_come_in_any_order_and_an_inner_prior_wins(tmp_path: Path) ->
         assert all(torch.equal(state[name], value) for name, value in states[0].items())
     made = import_files(
         [files["c"], files["d"]],
-        dataset="vocaset",
-        identities=IDENTITIES,
-        templates=templates(),
-        audio_config=published.AUDIO_CONFIG,
-        prior_heads=2,
+        ImportOptions(
+            dataset="vocaset",
+            identities=IDENTITIES,
+            templates=templates(),
+            audio_config=published.AUDIO_CONFIG,
+            model_options={"prior_heads": 2},
+        ),
     )
     assert "quantize.embedding.weight" in made.ignored
 

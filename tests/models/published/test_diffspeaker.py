@@ -14,6 +14,7 @@ from torch import Tensor
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DiffSpeaker, Style, import_checkpoint
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files
 from tests.fakes import diffspeaker, published
 from tests.fakes.published import COORDINATES, IDENTITIES
@@ -195,10 +196,9 @@ def test_what_is_not_needed_is_reported(tmp_path: Path) -> None:
     torch.save(state, tmp_path / "author.ckpt")
     made = import_files(
         tmp_path / "author.ckpt",
-        dataset="biwi",
-        identities=IDENTITIES,
-        templates=templates(),
-        audio_config=published.AUDIO_CONFIG,
+        ImportOptions(
+            dataset="biwi", identities=IDENTITIES, templates=templates(), audio_config=published.AUDIO_CONFIG
+        ),
     )
     assert set(made.ignored) == {"denoiser.PPE.pe", "_losses.total"}
     assert any(licence.commercial == "unknown" for licence in made.model.licences)

@@ -14,6 +14,7 @@ import torch
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import import_checkpoint
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files
 from tests.fakes import published
 from tests.fakes.published import IDENTITIES, VERTICES, write_author_files
@@ -105,7 +106,9 @@ def test_tensors_of_no_use_may_be_left_out_and_are_reported(tmp_path: Path) -> N
         tmp_path, lambda state: state.update({"extra.a": torch.ones(2), "extra.b": torch.ones(2)})
     )
     options: dict[str, Any] = {"templates": tmp_path / "faces.pkl", "audio_config": published.AUDIO_CONFIG}
-    made = import_files(path, dataset="vocaset", identities=IDENTITIES, ignore="extra.", **options)
+    made = import_files(
+        path, ImportOptions(dataset="vocaset", identities=IDENTITIES, **options, model_options={"ignore": "extra."})
+    )
     assert {"extra.a", "extra.b", "PPE.pe"} == set(made.ignored)
 
 

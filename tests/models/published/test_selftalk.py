@@ -16,6 +16,7 @@ from facediff.cli.app import main
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, SelfTalk, load_model
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files, save_model
 from tests.fakes import published
 from tests.fakes.published import COORDINATES, IDENTITIES, LIPS, VERTICES, write_author_files
@@ -121,9 +122,7 @@ def test_the_lip_reader_is_left_out_of_an_import_and_reported(tmp_path: Path) ->
     torch.save(state, tmp_path / "author.pth")
     made = import_files(
         tmp_path / "author.pth",
-        dataset="vocaset",
-        templates=templates(),
-        audio_config=published.AUDIO_CONFIG,
+        ImportOptions(dataset="vocaset", templates=templates(), audio_config=published.AUDIO_CONFIG),
     )
     parts = ("text_encoder.", "lip_map.", "transformer.", "lm_head.")
     assert set(made.ignored) == {name for name in state if name.startswith(parts)}

@@ -11,6 +11,7 @@ import torch
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import TalkingStyle
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files
 from tests.fakes import published
 from tests.fakes.published import IDENTITIES, VERTICES
@@ -96,10 +97,9 @@ def test_a_table_of_other_speakers_than_the_data_set_has_is_noted(tmp_path: Path
     torch.save(published.talkingstyle_state("vocaset"), tmp_path / "mead.pth")
     made = import_files(
         tmp_path / "mead.pth",
-        dataset="vocaset",
-        identities=IDENTITIES,
-        templates=templates(),
-        audio_config=published.AUDIO_CONFIG,
+        ImportOptions(
+            dataset="vocaset", identities=IDENTITIES, templates=templates(), audio_config=published.AUDIO_CONFIG
+        ),
     )
     assert any("mead.pth" in note for note in made.notes)
     assert set(made.ignored) == {"PPE.pe"}

@@ -22,6 +22,7 @@ from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import Voca, import_checkpoint, load_model
 from facediff.models.deepspeech import DeepSpeechEncoder, cepstra
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files, save_model
 from facediff.models.styles import read_styles
 from tests.fakes import tensorflow, voca
@@ -315,6 +316,6 @@ def test_what_is_not_needed_is_reported(tmp_path: Path) -> None:
     files = write_voca(tmp_path)
     state = voca.deepspeech_state() | {"other/table": np.ones(3, np.float32)}
     tensorflow.write_graph(files[1], state)
-    made = import_files(files, dataset="vocaset", identities=IDENTITIES, templates=templates())
+    made = import_files(files, ImportOptions(dataset="vocaset", identities=IDENTITIES, templates=templates()))
     assert "output_graph.pb: other/table" in made.ignored
     assert "VOCA/SpeechEncoder/conv1/weights/Adam_1" in made.ignored
