@@ -39,7 +39,7 @@ def test_the_pythons_that_are_tested_are_those_that_are_claimed() -> None:
     assert job["steps"][-1]["run"] == ".ci/run"
 
 
-@pytest.mark.parametrize("extra", ["train", "audio", "render", "prepare", "mesh", "figures", "docs"])
+@pytest.mark.parametrize("extra", ["metrics", "train", "render", "prepare", "mesh", "figures", "live", "serve", "docs"])
 def test_what_an_extra_needs_is_pinned(extra: str) -> None:
     needs = [re.split(r"[\[<>=]", need)[0] for need in PROJECT["project"]["optional-dependencies"][extra]]
     assert [need for need in needs if need not in {"facediff", *PINNED}] == []

@@ -32,7 +32,7 @@ from facediff.utils.ranges import Range, extras_of, range_of, shown
 MISSING = inspect.Parameter.empty
 LONGEST_NAME = 255  # Bytes of the name of a file on usual disks; a path may be longer
 
-RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed"}
+RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed", "--at-once": "--low-latency"}
 """Options of version 0.1 that have another name now; the error names it."""
 
 

@@ -42,7 +42,7 @@ def serve(
     if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
     if output is None:
-        require_server("serving a page")
+        require_server("serving a page", extra="serve")
     from facediff.runtime.folder import read_folder
     from facediff.runtime.onnxruntime_web import web_runtime
     from facediff.runtime.site import make_site, serve_site, write_site

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.errors import FaceDiffError, choices
 from facediff.runtime.folder import Arrays, Description, read_folder
 from facediff.runtime.sampling import NAME, RuntimeConditions, WindowSpeech, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, read_style
@@ -69,12 +69,9 @@ class RuntimeModel:
 
         Raises:
             FaceDiffError: naming the file that is missing or damaged.
-            MissingExtraError: if ONNX Runtime is not installed.
         """
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise MissingExtraError("onnxruntime", "runtime", "animating with an exported model") from error
+        import onnxruntime
+
         folder = Path(folder)
         description, arrays = read_folder(folder)
         options = onnxruntime.SessionOptions()

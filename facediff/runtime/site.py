@@ -206,5 +206,5 @@ def serve_site(
         FaceDiffError: if the address cannot be used.
         MissingExtraError: if the server's packages are not installed.
     """
-    require_server("serving a page")
+    require_server("serving a page", extra="serve")
     run_server(lambda _: make_app(site, names_of(host)), host=host, port=port, ready=ready)

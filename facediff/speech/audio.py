@@ -51,7 +51,7 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
     Raises:
         FaceDiffError: if the file is missing, empty, cut short, no sound file, too long, or holds values that are not
             finite.
-        MissingExtraError: if soundfile or soxr is not installed, or PyAV for a video.
+        MissingExtraError: if PyAV is not installed, which videos need.
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such sound file; expected {', '.join(SUFFIXES + CONTAINERS)}")
@@ -70,12 +70,9 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
 
     Raises:
         FaceDiffError: naming ``name``, if the samples hold values that are not finite.
-        MissingExtraError: if soxr is not installed.
     """
-    try:
-        import soxr
-    except ImportError as error:
-        raise MissingExtraError("soxr", "audio", "resampling speech") from error
+    import soxr
+
     if not np.isfinite(samples).all():
         raise FaceDiffError(f"{name}: holds samples that are not finite numbers; convert it again")
     peak = max(float(samples.max(initial=0)), -float(samples.min(initial=0)))
@@ -88,15 +85,9 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
 
 
 def resampler(rate: int) -> Callable[[npt.NDArray[np.float32], bool], npt.NDArray[np.float32]]:
-    """Converts pieces of a stream (n,) at any rate to 16 kHz; the second argument marks the last piece.
+    """Converts pieces of a stream (n,) at any rate to 16 kHz; the second argument marks the last piece."""
+    import soxr
 
-    Raises:
-        MissingExtraError: if soxr is not installed.
-    """
-    try:
-        import soxr
-    except ImportError as error:
-        raise MissingExtraError("soxr", "audio", "resampling speech") from error
     stream = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32", quality="HQ")
     return lambda piece, last: stream.resample_chunk(piece, last=last)
 
@@ -141,12 +132,9 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
 
     Raises:
         FaceDiffError: if it cannot be read, now or in the context.
-        MissingExtraError: if soundfile is not installed.
     """
-    try:
-        import soundfile
-    except ImportError as error:
-        raise MissingExtraError("soundfile", "audio", "reading speech") from error
+    import soundfile
+
     path = source if isinstance(source, Path) else Path(name)
     try:
         # As bytes, since a name need not be UTF-8.

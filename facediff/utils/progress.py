@@ -21,7 +21,7 @@ def progress_bar(
 ) -> Iterator[Callable[[], object]]:
     """A progress bar of ``total`` steps (None if that is not known), ``done`` of which have been done before.
 
-    Nothing is shown without a terminal or without the package rich.
+    Nothing is shown without a terminal.
 
     Yields:
         a function to be called after each step.
@@ -34,12 +34,9 @@ def progress_bar(
     if not shown or not sys.stderr.isatty():
         yield lambda: None
         return
-    try:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-    except ImportError:  # the work does not need it
-        yield lambda: None
-        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     bar = Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),

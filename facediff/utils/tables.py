@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TextIO
 
-from facediff.errors import MissingExtraError, printable
+from facediff.errors import printable
 
 UNLIMITED = 100_000  # width of a table that nothing cuts, in characters
 
@@ -38,16 +38,11 @@ def print_table(
     """Print a table: with bold titles and within the width of a terminal, or as plain text in full anywhere else.
 
     The arguments are those of :func:`format_table`; ``stream`` is standard output if None.
-
-    Raises:
-        MissingExtraError: if rich is not installed.
     """
-    try:
-        from rich.console import Console
-        from rich.table import Table
-        from rich.text import Text
-    except ImportError as error:
-        raise MissingExtraError("rich", "cli", "printing tables") from error
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     console = Console(file=stream, highlight=False)
     if not console.is_terminal:
         console = Console(file=stream, highlight=False, width=UNLIMITED, color_system=None)

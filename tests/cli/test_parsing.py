@@ -174,7 +174,7 @@ def test_mistakes_name_the_option(words: list[str], named: str) -> None:
 
 
 def test_renamed_options_name_the_new_one() -> None:
-    def renamed(*, samples: int = 1, controls_seed: int = 0) -> None:
+    def renamed(*, samples: int = 1, controls_seed: int = 0, low_latency: int = 0) -> None:
         """Nothing."""
 
     for old, new in RENAMED.items():

@@ -3,26 +3,45 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from facediff.cli.app import COMMANDS, GROUPS, main
+from facediff.cli.app import COMMANDS, GROUPS, RENAMED, main, usage
 from facediff.registry import KINDS
 
-SPY = (
-    "import sys; from facediff.cli.app import main; status = main(sys.argv[1:]); "
-    "print([m for m in ('torch', 'lightning', 'numpy', 'jsonargparse') if m in sys.modules]); sys.exit(status)"
-)
+# Every command line in one process; after each, whether anything heavy has been loaded.
+SPY = """
+import contextlib, io, json, sys
+from facediff.cli.app import main
+for line in json.loads(sys.argv[1]):
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            status = main(line.split())
+        except SystemExit as end:
+            status = end.code
+    heavy = [name for name in sys.argv[2:] if name in sys.modules]
+    print(json.dumps([status, heavy, len(errors.getvalue().splitlines())]))
+"""
 
 
-@pytest.mark.parametrize(("words", "status"), [(["--help"], 0), ([], 2), (["fitt"], 2), (["--version"], 0)])
-def test_the_top_level_imports_nothing_heavy(words: list[str], status: int) -> None:
-    done = subprocess.run([sys.executable, "-c", SPY, *words], capture_output=True, text=True, check=False)
-    assert done.returncode == status
-    assert done.stdout.splitlines()[-1] == "[]"
+def spied(lines: list[str], heavy: list[str], folder: Path) -> dict[str, tuple[int, list[str], int]]:
+    """Status, heavy modules and lines of errors by command line."""
+    command = [sys.executable, "-c", SPY, json.dumps(lines), *heavy]
+    run = subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder)
+    return dict(zip(lines, map(json.loads, run.stdout.splitlines()), strict=True))
+
+
+def test_the_top_level_imports_nothing_heavy(tmp_path: Path) -> None:
+    statuses = {"--help": 0, "": 2, "fitt": 2, "yardsticks": 2, "--version": 0}
+    rows = spied([*statuses], ["torch", "lightning", "numpy", "jsonargparse"], tmp_path)
+    assert {line: (status, heavy) for line, (status, heavy, _) in rows.items()} == {
+        line: (status, []) for line, status in statuses.items()
+    }
 
 
 MISTAKES = [
@@ -54,18 +73,24 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize("words", ["animate --help", "demo --help", *MISTAKES])
-def test_help_and_mistakes_import_nothing_heavy(words: str, tmp_path: Path) -> None:
-    spy = SPY.replace(
-        "status = main(sys.argv[1:])",
-        "import atexit; atexit.register(lambda: print([m for m in "
-        "('torch', 'lightning', 'numpy') if m in sys.modules])); status = main(sys.argv[1:])",
-    )
-    command = [sys.executable, "-c", spy, *words.split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == (0 if "--help" in words else 2)
-    assert done.stdout.splitlines()[-1] == "[]"
-    assert len(done.stderr.splitlines()) == (0 if "--help" in words else 1)
+def test_help_and_mistakes_import_nothing_heavy(tmp_path: Path) -> None:
+    rows = spied(["animate --help", "demo --help", *MISTAKES], ["torch", "lightning", "numpy"], tmp_path)
+    wrong = {line: row for line, row in rows.items() if row != ([0, [], 0] if line.endswith("--help") else [2, [], 1])}
+    assert not wrong
+
+
+def test_a_renamed_command_names_the_new_one(capsys: pytest.CaptureFixture[str]) -> None:
+    for old, new in RENAMED.items():
+        assert main([old, "--anything"]) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert f'"{old}" is now called "{new}"' in line
+
+
+@pytest.mark.parametrize("group", ["", *GROUPS])
+def test_the_help_keeps_names_and_texts_apart(group: str) -> None:
+    rows = usage(group).partition("commands:\n")[2].partition("\n\n")[0].splitlines()
+    assert [row for row in rows if re.fullmatch(r"  [a-z-]+( [a-z-]+)? {2,}\S.*", row) is None] == []
+    assert len({len(row) - len(re.sub(r"^  [a-z-]+( [a-z-]+)? {2,}", "", row)) for row in rows}) == 1
 
 
 def test_a_wrong_command_names_the_nearest_and_all(capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,10 +137,10 @@ def test_components_lists_every_kind(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_a_reader_that_has_had_enough_is_no_error() -> None:
-    command = [sys.executable, "-m", "facediff", "components"]
+    command = [sys.executable, "-m", "facediff", "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stderr is not None
-        process.stdout.close()  # before a word of it has been written
+        process.stdout.close()  # before anything has been written
         assert process.stderr.read() == ""
         assert process.wait(60) == 141

@@ -37,7 +37,7 @@ from facediff.data.check.shared import (
     check_templates,
 )
 from facediff.data.packed.stores import is_packed
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.utils.jobs import is_cluster, run_tasks
 from facediff.utils.workers import WorkerDied, processors
 
@@ -203,10 +203,6 @@ def _clips(opened: Corpus | None, view: View, folder: CorpusFolder, findings: Fi
 def _examine_all(
     rules: Rules, view: View, folder: CorpusFolder, *, workers: int | None, scheduler: str | None, progress: bool
 ) -> list[ClipFacts]:
-    try:
-        import soundfile  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("soundfile", "audio", "checking speech") from error
     tasks = [
         ClipFiles(name, clip.identity, folder.motions.get(name), folder.sounds.get(name))
         for name in folder.names

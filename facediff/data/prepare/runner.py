@@ -376,10 +376,8 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
 
     Reading it back gives ``round(32768 x) / 32768``: 16-bit speech at 16 kHz goes through unchanged.
     """
-    try:
-        import soundfile
-    except ImportError as error:
-        raise MissingExtraError("soundfile", "audio", "writing speech") from error
+    import soundfile
+
     from facediff.speech.audio import SAMPLE_RATE
 
     whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)

@@ -267,7 +267,7 @@ def pick_landmarks(
             cannot be used.
         MissingExtraError: if the server's packages are not installed.
     """
-    require_server("picking landmarks")
+    require_server("picking landmarks", extra="serve")
     begin = start if start is not None else file if file.exists() else None
     given = None
     if begin is not None:
