@@ -93,7 +93,7 @@ def facing(vertices: Array, upper: Indices, above: Array, lower: Indices, below:
 
 
 @dataclass(frozen=True)
-class Window:
+class SearchWindow:
     """A rectangle in which an opening is searched for, and how wide the opening is expected to be."""
 
     x: float
@@ -229,7 +229,7 @@ class Seen:
             kept &= skin[self.faces[:, 0]]
         return np.flatnonzero(kept)
 
-    def skin_at(self, window: Window) -> npt.NDArray[np.bool_] | None:
+    def skin_at(self, window: SearchWindow) -> npt.NDArray[np.bool_] | None:
         """(V,) the piece of which a window shows most; None where it shows nothing."""
         low = np.array([window.x - window.half_width, window.y - window.half_height])
         high = np.array([window.x + window.half_width, window.y + window.half_height])
@@ -241,7 +241,9 @@ class Seen:
         names, counts = np.unique(self.pieces[self.faces[seen, 0]], return_counts=True)
         return np.asarray(self.pieces == names[counts.argmax()])
 
-    def opening(self, window: Window, skin: npt.NDArray[np.bool_], highest: float, behind: float) -> Opening | None:
+    def opening(
+        self, window: SearchWindow, skin: npt.NDArray[np.bool_], highest: float, behind: float
+    ) -> Opening | None:
         """The opening in a window; None if the skin is whole there.
 
         Args:
@@ -404,7 +406,7 @@ def _following(valid: npt.NDArray[np.bool_], tall: int) -> Indices:
     return np.stack([rows[:-1][same], rows[1:][same], columns[1:][same]], axis=1)
 
 
-def _widest(pairs: Indices, columns: int, window: Window, step: float, low: Array) -> Indices | None:
+def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low: Array) -> Indices | None:
     """Which pairs are the opening: the chain of neighbouring ones that is widest and nearest to the middle."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -497,7 +499,7 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
     x, y, _ = known.centre
     skin, mouth = None, None
     for grown in (1.0, 1.6):
-        window = Window(x, y, 1.1 * width * grown, 0.55 * width * grown, width)
+        window = SearchWindow(x, y, 1.1 * width * grown, 0.55 * width * grown, width)
         skin = seen.skin_at(window)
         mouth = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
         if mouth is not None:
@@ -519,9 +521,9 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
             continue
         if place is None:
             sign = 2 * side - 1
-            window = Window(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)
+            window = SearchWindow(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)
         else:
-            window = Window(place.centre[0], place.centre[1], 0.85 * place.width, 0.75 * place.width, place.width)
+            window = SearchWindow(place.centre[0], place.centre[1], 0.85 * place.width, 0.75 * place.width, place.width)
         eye = seen.opening(window, skin, *OPEN_EYE)
         eyes.append(None if eye is None else seen.completed(eye, window.expected))
     codes = seen.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))
@@ -533,7 +535,7 @@ def _anywhere(seen: Seen) -> Opening | None:
     used = seen.vertices[np.unique(seen.faces)]
     low, high = used.min(axis=0), used.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    window = Window(middle[0], middle[1], half[0], half[1], 0.3 * float(min(2 * half[0], 2 * half[1])))
+    window = SearchWindow(middle[0], middle[1], half[0], half[1], 0.3 * float(min(2 * half[0], 2 * half[1])))
     skin = seen.skin_at(window)
     found = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
     return None if found is None else seen.completed(found, window.expected)

@@ -11,7 +11,7 @@ import numpy as np
 from facediff.animation import Animation, write_archive
 from facediff.animation.files import MotionWriter
 from facediff.animation.options import ExportOptions
-from facediff.export.format import Format, Space
+from facediff.export.format import FileSpace, Format
 from facediff.registry import export_format
 
 
@@ -27,7 +27,7 @@ class Vertices(Format):
         (animation,) = animations
         writer = MotionWriter(path, animation.template.shape)
         try:
-            for frame in Space.of(animation, options).frames(animation):
+            for frame in FileSpace.of(animation, options).frames(animation):
                 writer.write(frame[None])
         finally:
             writer.close()
@@ -45,7 +45,7 @@ class Archive(Format):
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write everything that the animation has, in another unit where one is chosen."""
         (animation,) = animations
-        space = Space.of(animation, options)
+        space = FileSpace.of(animation, options)
         if options.output_unit is not None:
             vertices = np.stack(list(space.frames(animation)))
             head = animation.head

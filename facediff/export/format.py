@@ -41,7 +41,7 @@ class Format(ABC):
         ...
         ...     def write(self, path, animations, options):
         ...         (animation,) = animations
-        ...         space = Space.of(animation, options)
+        ...         space = FileSpace.of(animation, options)
         ...         path.write_text("".join(f"{v.min(0)} {v.max(0)}" for v in space.frames(animation)))
         >>> Bounds().help
         'Text: the box around the vertices of every frame'
@@ -91,7 +91,7 @@ class Format(ABC):
 
 
 @dataclass(frozen=True)
-class Space:
+class FileSpace:
     """The unit of length and the axes of a file."""
 
     unit: str
@@ -100,7 +100,7 @@ class Space:
     factor: float  # what the animation's coordinates are multiplied by
 
     @classmethod
-    def of(cls, animation: Animation, options: ExportOptions, prescribed: str | None = None) -> Space:
+    def of(cls, animation: Animation, options: ExportOptions, prescribed: str | None = None) -> FileSpace:
         """The space that the user chose, else the format's prescribed unit, else the animation's, with y up."""
         unit = options.output_unit or prescribed or animation.unit
         metres = metres_per_unit(unit)
@@ -137,7 +137,7 @@ def check_animation(animation: Animation, *, needs_mesh: bool = True) -> None:
         _ = animation.triangles
 
 
-def facts(animation: Animation, space: Space) -> dict[str, object]:
+def facts(animation: Animation, space: FileSpace) -> dict[str, object]:
     """The facts that are written into every file which has room for text."""
     return {
         "name": animation.name,

@@ -5,35 +5,28 @@ Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks alon
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
-from facediff.errors import FaceDiffError
-from facediff.export.format import Format, Space, facts, linear_colours, normals_of, outward
+from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward
+from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
 from facediff.registry import export_format
-
-if TYPE_CHECKING:
-    from pygltflib import GLTF2
 
 Array = npt.NDArray[np.float32]
 
 BLOCK = 3000  # Coordinates that are processed together; bounds the memory for residuals
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-COMPONENT_TYPES = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123}
-LIMIT = 2**32 - 1  # The most bytes that the header of a .glb can count
+LINEAR = "LINEAR"  # Interpolation between keys
 
 
 @export_format.register("glb")
-class Glb(Format):
+class GlbFormat(Format):
     """glTF 2.0 with morph targets, exact or under the names of --shapes: Blender, Unity, three.js, Unreal."""
 
     next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
@@ -41,7 +34,6 @@ class Glb(Format):
     units = "m"
     up_axes = ("y",)
     uses = ("tolerance", "shapes", "key_tolerance")
-    requires = ("pygltflib", "train")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write one animation: all of it, or what the given shapes can show of it.
@@ -50,7 +42,7 @@ class Glb(Format):
             FaceDiffError: if the shapes do not fit the animation.
         """
         (animation,) = animations
-        space = Space.of(animation, options, "m")
+        space = FileSpace.of(animation, options, "m")
         head, animation = animation.head, animation.still()
         rest = space.place(animation.template)
         extras = facts(animation, space)
@@ -63,11 +55,10 @@ class Glb(Format):
             extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
-        binary = Binary()
-        document = make_document(animation, space, rest, morphs, binary, extras)
+        document = make_document(animation, space, rest, morphs, extras)
         if head is not None:
-            add_head(document, animation.frame_rate, head * np.repeat([1.0, space.factor], 3), binary)
-        write_container(path, document, binary)
+            add_head(document, animation.frame_rate, head * np.repeat([1.0, space.factor], 3))
+        document.write(path)
 
 
 @dataclass(frozen=True)
@@ -82,7 +73,7 @@ class Morphs:
 
 
 def named_shapes(
-    animation: Animation, space: Space, shapes: Path, key_tolerance: float
+    animation: Animation, space: FileSpace, shapes: Path, key_tolerance: float
 ) -> tuple[Morphs, dict[str, object]]:
     """The motion as weights of blendshapes under their own names, and facts on how well they fit.
 
@@ -92,12 +83,12 @@ def named_shapes(
     from facediff.editing.blendshapes import SolveOptions, key_frames, solve
     from facediff.editing.shapes import read_shapes
 
-    found = read_shapes(shapes, animation.template, animation.unit)
-    weights = solve(animation, found, SolveOptions())
+    shape_set = read_shapes(shapes, animation.template, animation.unit)
+    weights = solve(animation, shape_set, SolveOptions())
     # All curves of a mesh share their keys in glTF.
     keys = key_frames(weights.values, key_tolerance)
-    offsets = np.asarray(found.deltas * space.factor, np.float32)
-    morphs = Morphs(offsets, weights.values[keys].astype(np.float32), None, found.names, keys)
+    offsets = np.asarray(shape_set.deltas * space.factor, np.float32)
+    morphs = Morphs(offsets, weights.values[keys].astype(np.float32), None, shape_set.names, keys)
     return morphs, {
         "shapes": shapes.name,
         "residual_rms_mm": round(float(np.sqrt(np.square(weights.residual_rms_mm).mean())), 6),
@@ -205,140 +196,82 @@ def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
         yield flat[:, start : start + BLOCK].astype(np.float64)
 
 
-class Binary:
-    """The binary chunk and the accessors into it; every array has its own buffer view, so that all are aligned."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.length = 0
-        self.views: list[Any] = []
-        self.accessors: list[Any] = []
-
-    def add(self, array: npt.NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (N,), (N, 3) or (N, 4) and return its accessor's number."""
-        from pygltflib import Accessor, BufferView
-
-        array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-        data = array.tobytes()
-        columns = array.reshape(len(array), -1)
-        self.views.append(BufferView(buffer=0, byteOffset=self.length, byteLength=len(data), target=target))
-        self.accessors.append(
-            Accessor(
-                bufferView=len(self.views) - 1,
-                componentType=COMPONENT_TYPES[array.dtype],
-                count=len(array),
-                type="SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
-                min=columns.min(0).tolist() if bounds else None,
-                max=columns.max(0).tolist() if bounds else None,
-            )
-        )
-        self.parts += [data, bytes(-len(data) % 4)]
-        self.length += len(data) + len(self.parts[-1])
-        return len(self.accessors) - 1
-
-
 def make_document(
-    animation: Animation, space: Space, rest: Array, morphs: Morphs, binary: Binary, extras: dict[str, object]
-) -> GLTF2:
-    """The glTF document of one animated mesh at rest (V, 3); its arrays are appended to the binary chunk."""
-    import pygltflib as gltf
+    animation: Animation, space: FileSpace, rest: Array, morphs: Morphs, extras: dict[str, object]
+) -> GlbWriter:
+    """The glTF document of one animated mesh at rest (V, 3), with its arrays."""
+    document = GlbWriter({"asset": {"version": "2.0", "generator": "facediff"}})
+    if (licence := animation.metadata.get("licence")) is not None:
+        document.content["asset"]["copyright"] = licence
 
     def add_vertices(positions: Array, normals: Array) -> dict[str, int]:
         return {
-            "POSITION": binary.add(positions, target=ARRAY_BUFFER, bounds=True),
-            "NORMAL": binary.add(normals, target=ARRAY_BUFFER),
+            "POSITION": document.add(positions, target=ARRAY_BUFFER, bounds=True),
+            "NORMAL": document.add(normals, target=ARRAY_BUFFER),
         }
 
     faces = outward(animation)
     rest_normals = normals_of(rest, faces)
     attributes = add_vertices(rest, rest_normals)
-    material = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.7)
+    surface: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
     if animation.colours is None:
-        material.baseColorFactor = [0.6, 0.6, 0.6, 1.0]
+        surface["baseColorFactor"] = [0.6, 0.6, 0.6, 1.0]
     else:
-        attributes["COLOR_0"] = binary.add(linear_colours(animation.colours), target=ARRAY_BUFFER)
+        attributes["COLOR_0"] = document.add(linear_colours(animation.colours), target=ARRAY_BUFFER)
     # The largest number of a type is reserved: it restarts a strip of triangles.
     index_type = np.uint16 if len(rest) < 65_535 else np.uint32
-    indices = binary.add(faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
+    indices = document.add(faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
     if morphs.names:
         # Named shapes are used for other motions too, so that each has the normals of its own pose.
-        turned = np.stack([normals_of(rest + shape, faces) - rest_normals for shape in morphs.shapes])
+        normal_offsets = np.stack([normals_of(rest + shape, faces) - rest_normals for shape in morphs.shapes])
     else:
         true_normals = (normals_of(points, faces) for points in space.frames(animation))
-        turned = normal_shapes(morphs.weights, rest_normals, true_normals)
-    targets = [add_vertices(shape, normals) for shape, normals in zip(morphs.shapes, turned, strict=True)]
+        normal_offsets = normal_shapes(morphs.weights, rest_normals, true_normals)
+    targets = [add_vertices(shape, normals) for shape, normals in zip(morphs.shapes, normal_offsets, strict=True)]
     prefix = "frame" if morphs.components is None else "shape"
     frames = np.arange(len(animation.vertices)) if morphs.keys is None else morphs.keys
-    times = (frames / animation.frame_rate).astype(np.float32)
-    sampler = gltf.AnimationSampler(
-        input=binary.add(times, bounds=True), output=binary.add(morphs.weights.ravel()), interpolation="LINEAR"
-    )
-    channel = gltf.AnimationChannel(sampler=0, target=gltf.AnimationChannelTarget(node=0, path="weights"))
-    face = gltf.Mesh(
-        name="face",
-        primitives=[
-            gltf.Primitive(attributes=gltf.Attributes(**attributes), indices=indices, material=0, targets=targets)
+    times = document.add((frames / animation.frame_rate).astype(np.float32), bounds=True)
+    document.content |= {
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": animation.name, "mesh": 0, "extras": extras}],
+        "meshes": [
+            {
+                "name": "face",
+                "primitives": [{"attributes": attributes, "indices": indices, "material": 0, "targets": targets}],
+                "weights": [0.0] * len(targets),
+                "extras": {
+                    "targetNames": list(morphs.names) or [f"{prefix}_{index:04d}" for index in range(len(targets))]
+                },
+            }
         ],
-        weights=[0.0] * len(targets),
-        extras={"targetNames": list(morphs.names) or [f"{prefix}_{index:04d}" for index in range(len(targets))]},
-    )
-    return gltf.GLTF2(
-        asset=gltf.Asset(generator="facediff", copyright=animation.metadata.get("licence")),
-        scene=0,
-        scenes=[gltf.Scene(nodes=[0])],
-        nodes=[gltf.Node(name=animation.name, mesh=0, extras=extras)],
-        meshes=[face],
-        # alphaCutoff has a default in pygltflib, which validators report for a material that is not masked.
-        materials=[gltf.Material(name="face", doubleSided=True, pbrMetallicRoughness=material, alphaCutoff=None)],
-        animations=[gltf.Animation(name=animation.name, samplers=[sampler], channels=[channel])],
-        accessors=binary.accessors,
-        bufferViews=binary.views,
-        buffers=[gltf.Buffer(byteLength=binary.length)],
-    )
+        "materials": [{"name": "face", "doubleSided": True, "pbrMetallicRoughness": surface}],
+        "animations": [
+            {
+                "name": animation.name,
+                "samplers": [{"input": times, "output": document.add(morphs.weights.ravel()), "interpolation": LINEAR}],
+                "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
+            }
+        ],
+    }
+    return document
 
 
-def add_head(document: GLTF2, frame_rate: float, head: npt.NDArray[np.float64], binary: Binary) -> None:
+def add_head(document: GlbWriter, frame_rate: float, head: npt.NDArray[np.float64]) -> None:
     """Add a node "head" that carries the face, and turns and shifts it.
 
     Args:
         document: of :func:`make_document`, with the face as its only node.
         frame_rate: frames a second.
         head: (T, 6) rotations, axis-angle in radians, and shifts in metres.
-        binary: to which the curves are appended.
     """
-    import pygltflib as gltf
-
     half = 0.5 * np.linalg.norm(head[:, :3], axis=1, keepdims=True)
     quaternions = np.concatenate([0.5 * np.sinc(half / np.pi) * head[:, :3], np.cos(half)], axis=1)
-    times = binary.add((np.arange(len(head)) / frame_rate).astype(np.float32), bounds=True)
-    (motion,) = document.animations
+    times = document.add((np.arange(len(head)) / frame_rate).astype(np.float32), bounds=True)
+    (motion,) = document.content["animations"]
     for path, values in (("rotation", quaternions), ("translation", head[:, 3:])):
-        output = binary.add(values.astype(np.float32))
-        motion.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
-        target = gltf.AnimationChannelTarget(node=1, path=path)
-        motion.channels.append(gltf.AnimationChannel(sampler=len(motion.samplers) - 1, target=target))
-    document.nodes.append(gltf.Node(name="head", children=[0]))
-    document.scenes[0].nodes = [1]
-    document.buffers[0].byteLength = binary.length
-
-
-def write_container(path: Path, document: GLTF2, binary: Binary) -> None:
-    """Write the header, the JSON chunk and the binary chunk, each padded to four bytes.
-
-    Raises:
-        FaceDiffError: if the file would be larger than its header can count.
-    """
-    text = document.gltf_to_json(separators=(",", ":"), indent=None).encode()
-    text += b" " * (-len(text) % 4)
-    length = 12 + 8 + len(text) + 8 + binary.length
-    if length > LIMIT:
-        raise FaceDiffError(
-            f"{path}: would have {length / 2**30:.1f} GiB, and a .glb may have 4; write .usdc, or export a shorter part"
-        )
-    # pygltflib's save_binary copies the binary chunk twice: for 252 MB of targets it took 764 MB of memory and 1.7 s,
-    # where writing the parts one after the other takes 281 MB and 0.2 s.
-    with path.open("wb") as stream:
-        stream.write(struct.pack("<4sII", b"glTF", 2, length))
-        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        stream.write(struct.pack("<I4s", binary.length, b"BIN\0"))
-        stream.writelines(binary.parts)
+        output = document.add(values.astype(np.float32))
+        motion["samplers"].append({"input": times, "output": output, "interpolation": LINEAR})
+        motion["channels"].append({"sampler": len(motion["samplers"]) - 1, "target": {"node": 1, "path": path}})
+    document.content["nodes"].append({"name": "head", "children": [0]})
+    document.content["scenes"][0]["nodes"] = [1]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
-import struct
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -14,12 +12,11 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.errors import FaceDiffError
-from facediff.export.glb import ARRAY_BUFFER, LIMIT, Morphs, compress, normal_shapes
+from facediff.export.glb import Morphs, compress, normal_shapes
+from facediff.export.glb_writer import ARRAY_BUFFER, GlbWriter
 from facediff.mesh.glb import Glb, attributes, open_glb
 from facediff.mesh.glb_scene import Placed, placed_parts
-from facediff.utils.files import atomic
 
-FLOAT = 5126  # glTF's code of float32
 WELD = 1e-6  # Vertices nearer than this share of the mesh's size share a normal's turn: seams of textures stay closed
 
 Array = npt.NDArray[np.float64]
@@ -45,7 +42,9 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
     """
     try:
         glb = open_glb(target)
-        changed = _Changed(glb)
+        for kind in ("buffers", "bufferViews", "accessors"):
+            glb.entries(kind)  # refuses what is no list, to which the writer could not append
+        writer = GlbWriter(glb.content, glb.binary)
         parts = list(placed_parts(glb))
         total = sum(len(part.local) for part in parts)
         if total != len(animation.template):
@@ -53,14 +52,13 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
                 f"{target}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
                 f"animation was carried to"
             )
-        _animate(changed, parts, animation, tolerance_mm / 1000 / metres_per_unit(animation.unit))
+        _animate(glb, writer, parts, animation, tolerance_mm / 1000 / metres_per_unit(animation.unit))
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again") from error
-    changed.write(path)
+    writer.write(path)
 
 
-def _animate(changed: _Changed, parts: list[Placed], animation: Animation, tolerance: float) -> None:
-    glb = changed.glb
+def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animation, tolerance: float) -> None:
     begins = np.cumsum([0, *(len(part.local) for part in parts)])
     rest = np.asarray(animation.template, np.float64)
     furthest = np.zeros(len(rest))
@@ -79,7 +77,7 @@ def _animate(changed: _Changed, parts: list[Placed], animation: Animation, toler
     turns = _Turns(
         rest, np.concatenate([part.faces + k for part, k in zip(parts, begins, strict=False)]), used, offsets
     )
-    times = changed.add((np.arange(len(offsets)) / animation.frame_rate).astype(np.float32), "SCALAR", bounds=True)
+    times = writer.add((np.arange(len(offsets)) / animation.frame_rate).astype(np.float32), bounds=True)
     own: dict[str, Any] = {"name": animation.name, "samplers": [], "channels": []}
     by_node: dict[int, list[tuple[Placed, npt.NDArray[np.int64]]]] = defaultdict(list)
     for part, some in moving:
@@ -100,26 +98,23 @@ def _animate(changed: _Changed, parts: list[Placed], animation: Animation, toler
         else:
             primitives = [part.primitive for part, _ in own_parts]
         targets = {
-            id(primitive): _targets(changed, part, primitive, morphs, np.searchsorted(used, some), turns, offsets)
+            id(primitive): _targets(glb, writer, part, primitive, morphs, np.searchsorted(used, some), turns, offsets)
             for primitive, (part, some) in zip(primitives, own_parts, strict=True)
         }
-        default, before = _append(changed, node, targets, len(morphs.shapes))
-        _pad_others(changed, node, before, len(morphs.shapes))
+        default, before = _append(glb, writer, node, targets, len(morphs.shapes))
+        _pad_others(glb, writer, node, before, len(morphs.shapes))
         rows = np.concatenate(
             [np.tile(np.array(default, np.float32), (len(offsets), 1)), morphs.weights], axis=1, dtype=np.float32
         )
-        own["samplers"].append(
-            {"input": times, "output": changed.add(rows.ravel(), "SCALAR"), "interpolation": "LINEAR"}
-        )
+        own["samplers"].append({"input": times, "output": writer.add(rows.ravel()), "interpolation": "LINEAR"})
         own["channels"].append({"sampler": len(own["samplers"]) - 1, "target": {"node": node, "path": "weights"}})
     glb.content["animations"] = [*glb.entries("animations"), own]
 
 
 def _append(
-    changed: _Changed, node: int, targets: dict[int, list[dict[str, int]]], count: int
+    glb: Glb, writer: GlbWriter, node: int, targets: dict[int, list[dict[str, int]]], count: int
 ) -> tuple[list[float], int]:
     """Add targets to the mesh of a node: the default weights of its own ones, and how many those are."""
-    glb = changed.glb
     entry = glb.entry("nodes", node)
     mesh = glb.entry("meshes", entry["mesh"])
     primitives = glb.primitives(entry["mesh"])
@@ -127,13 +122,13 @@ def _append(
     for primitive in primitives:
         new = targets.get(id(primitive))
         if new is None:  # all primitives of a mesh have as many targets
-            still = changed.add(np.zeros((len(glb.positions(primitive)), 3), np.float32), "VEC3", vertices=True)
-            new = [{"POSITION": still} for _ in range(count)]
+            still = np.zeros((len(glb.positions(primitive)), 3), np.float32)
+            new = [{"POSITION": writer.add(still, target=ARRAY_BUFFER, bounds=True)}] * count
         primitive["targets"] = [*glb.entries("targets", primitive), *new]
-    default = [float(each) for each in mesh.get("weights", [0.0] * before)]
+    default = [float(weight) for weight in mesh.get("weights", [0.0] * before)]
     mesh["weights"] = [*default, *[0.0] * count]
     if "weights" in entry:
-        default = [float(each) for each in entry["weights"]]
+        default = [float(weight) for weight in entry["weights"]]
         entry["weights"] = [*default, *[0.0] * count]
     extras = mesh.setdefault("extras", {})
     names = list(extras.get("targetNames", [f"target_{k}" for k in range(before)]))
@@ -142,7 +137,8 @@ def _append(
 
 
 def _targets(
-    changed: _Changed,
+    glb: Glb,
+    writer: GlbWriter,
     part: Placed,
     primitive: dict[str, Any],
     morphs: Morphs,
@@ -152,22 +148,23 @@ def _targets(
 ) -> list[dict[str, int]]:
     """Accessors of the new targets of a primitive, whose vertices are some rows of those that move."""
     places = part.returned(np.asarray(morphs.shapes[:, rows], np.float64)).astype(np.float32)
-    made = [{"POSITION": changed.add(place, "VEC3", vertices=True)} for place in places]
-    normal = attributes(primitive).get("NORMAL")
-    if normal is not None:
-        local = changed.glb.numbers(normal, "VEC3", ("f4", "i1", "i2"), len(part.local)).astype(np.float64)
+    targets = [{"POSITION": writer.add(place, target=ARRAY_BUFFER, bounds=True)} for place in places]
+    accessor = attributes(primitive).get("NORMAL")
+    if accessor is not None:
+        local = glb.numbers(accessor, "VEC3", ("f4", "i1", "i2"), len(part.local)).astype(np.float64)
         shown = _unit(local @ np.linalg.inv(part.turn))  # normals turn by the inverse transpose
-        turned = (_unit((turns.at(offset, rows, shown)[:, None] @ part.turn)[:, 0]) for offset in offsets)
-        shapes = normal_shapes(morphs.weights, local.astype(np.float32), (each.astype(np.float32) for each in turned))
-        for target, shape in zip(made, shapes, strict=True):
-            target["NORMAL"] = changed.add(shape, "VEC3", vertices=True)
-    return made
+        local_turns = (_unit((turns.at(offset, rows, shown)[:, None] @ part.turn)[:, 0]) for offset in offsets)
+        normals = (normal.astype(np.float32) for normal in local_turns)
+        shapes = normal_shapes(morphs.weights, local.astype(np.float32), normals)
+        for target, shape in zip(targets, shapes, strict=True):
+            target["NORMAL"] = writer.add(shape, target=ARRAY_BUFFER, bounds=True)
+    return targets
 
 
 class _Turns:
-    """How the normals of the moving vertices turn from rest: as those do that follow from the triangles.
+    """How normals turn from rest: as the normals that are computed from the triangles do.
 
-    The file's own normals may be anybody's, sharp at some edges and smooth at others; they keep that.
+    The file's own normals, which may be sharp at some edges and smooth at others, are turned and not replaced.
     """
 
     def __init__(self, rest: Array, faces: npt.NDArray[np.int64], used: npt.NDArray[np.int64], offsets: Array) -> None:
@@ -205,7 +202,7 @@ class _Turns:
         rows_of = self.moved[self.points]
         points = self.rest[self.points] + np.where(rows_of[:, None] >= 0, offset[rows_of], 0.0)
         one, two = self.before[rows], self._normals(points)[rows]
-        # The least rotation of one vector onto another, after Rodrigues.
+        # The least rotation of one vector onto another, after Rodrigues; 1 + cosine is 0 where they are opposite.
         axis, cosine = np.cross(one, two), np.einsum("nd,nd->n", one, two)
         across = np.cross(axis, normals)
         return normals + across + np.cross(axis, across) / np.maximum(1.0 + cosine, 1e-3)[:, None]
@@ -216,9 +213,8 @@ def _unit(vectors: Array) -> Array:
     return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
 
 
-def _pad_others(changed: _Changed, node: int, before: int, more: int) -> None:
+def _pad_others(glb: Glb, writer: GlbWriter, node: int, before: int, more: int) -> None:
     """Give the file's own animations of a node's weights zeros for the new targets."""
-    glb = changed.glb
     for animation in glb.entries("animations"):
         samplers, channels = glb.entries("samplers", animation), glb.entries("channels", animation)
         for channel in channels:
@@ -228,59 +224,9 @@ def _pad_others(changed: _Changed, node: int, before: int, more: int) -> None:
                 sampler = dict(samplers[number])
                 values = glb.numbers(sampler["output"], "SCALAR", ("f4", "i1", "u1", "i2", "u2")).reshape(-1, before)
                 padded = np.pad(values.astype(np.float32), ((0, 0), (0, more)))
-                sampler["output"] = changed.add(padded.ravel(), "SCALAR")
-                if sum(each.get("sampler") == number for each in channels) == 1:
+                sampler["output"] = writer.add(padded.ravel())
+                if sum(other.get("sampler") == number for other in channels) == 1:
                     samplers[number] = sampler
                 else:
                     samplers.append(sampler)
                     channel["sampler"] = len(samplers) - 1
-
-
-class _Changed:
-    """A file's content with arrays added to its binary chunk."""
-
-    def __init__(self, glb: Glb) -> None:
-        self.glb, self.content = glb, glb.content
-        self.parts = [glb.binary, bytes(-len(glb.binary) % 4)]
-        self.length = len(glb.binary) + len(self.parts[1])
-        if not glb.entries("buffers"):
-            self.content["buffers"] = [{"byteLength": 0}]
-        for kind in ("bufferViews", "accessors"):
-            self.content[kind] = glb.entries(kind)
-
-    def add(self, array: npt.NDArray[np.float32], form: str, *, bounds: bool = False, vertices: bool = False) -> int:
-        """Append an array, of times with their bounds or of a target's vertices; return its accessor's number."""
-        data = np.ascontiguousarray(array, "<f4").tobytes()
-        view = {"buffer": 0, "byteOffset": self.length, "byteLength": len(data)}
-        self.content["bufferViews"].append(view | ({"target": ARRAY_BUFFER} if vertices else {}))
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.content["bufferViews"]) - 1,
-            "componentType": FLOAT,
-            "count": len(array),
-            "type": form,
-        }
-        if bounds or vertices:
-            columns = array.reshape(len(array), -1)
-            accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
-        self.content["accessors"].append(accessor)
-        self.parts.append(data)
-        self.length += len(data)
-        return len(self.content["accessors"]) - 1
-
-    def write(self, path: Path) -> None:
-        """Write header, description and binary chunk.
-
-        Raises:
-            FaceDiffError: if the file would be larger than its header can count.
-        """
-        self.content["buffers"][0]["byteLength"] = self.length
-        text = json.dumps(self.content, separators=(",", ":"), allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
-        length = 12 + 8 + len(text) + 8 + self.length
-        if length > LIMIT:
-            raise FaceDiffError(f"{path}: would be larger than a .glb may be; add a shorter animation")
-        with atomic(path) as temporary, temporary.open("wb") as stream:
-            stream.write(struct.pack("<4sII", b"glTF", 2, length))
-            stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
-            stream.write(struct.pack("<I4s", self.length, b"BIN\0"))
-            stream.writelines(self.parts)

@@ -18,7 +18,7 @@ from facediff.render import Camera, Renderer, contact_sheet, heat_colours, save_
 
 
 @dataclass(frozen=True)
-class Panel:
+class DrawnFace:
     """A face to draw."""
 
     label: str
@@ -36,9 +36,9 @@ def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights
     _draw(
         path,
         [
-            Panel(f"{animation.name}, frame {frame}", truth, animation.triangles, animation.colours),
-            Panel("from the weights", built, animation.triangles, animation.colours),
-            Panel(label, built, animation.triangles, colours),
+            DrawnFace(f"{animation.name}, frame {frame}", truth, animation.triangles, animation.colours),
+            DrawnFace("from the weights", built, animation.triangles, animation.colours),
+            DrawnFace(label, built, animation.triangles, colours),
         ],
     )
 
@@ -65,10 +65,10 @@ def draw_correspondence(path: Path, animation: Animation, made: Animation, found
     _draw(
         path,
         [
-            Panel(f"{animation.name}, frame {frame}", source, animation.triangles, animation.colours),
-            Panel("on the target mesh", posed, made.triangles, made.colours),
-            Panel(moved, posed, made.triangles, moves),
-            Panel(apart, back.apply(made.template), made.triangles, distances),
+            DrawnFace(f"{animation.name}, frame {frame}", source, animation.triangles, animation.colours),
+            DrawnFace("on the target mesh", posed, made.triangles, made.colours),
+            DrawnFace(moved, posed, made.triangles, moves),
+            DrawnFace(apart, back.apply(made.template), made.triangles, distances),
         ],
         # A whole figure would show its face in a few pixels.
         focus=[source, animation.template],
@@ -82,7 +82,7 @@ def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDAr
 
 
 def _draw(
-    path: Path, panels: Sequence[Panel], size: int = 272, *, focus: Sequence[npt.NDArray[np.floating]] | None = None
+    path: Path, panels: Sequence[DrawnFace], size: int = 272, *, focus: Sequence[npt.NDArray[np.floating]] | None = None
 ) -> None:
     """Draw faces of one unit next to each other at one scale; the points in ``focus`` are in view, all if None."""
     camera = Camera.framing(focus or [panel.vertices for panel in panels])

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
-from facediff.export.format import Format, Space, facts, folder_of
+from facediff.export.format import FileSpace, Format, facts, folder_of
 from facediff.registry import export_format
 from facediff.utils.plain_files import json_text
 
@@ -28,7 +28,7 @@ class MeshSequence(Format):
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write ``hello_obj/hello_0000.obj`` … and ``hello_obj/sequence.json`` for ``hello.obj``."""
         (animation,) = animations
-        space = Space.of(animation, options)
+        space = FileSpace.of(animation, options)
         folder = folder_of(path)
         folder.mkdir()
         frame_bytes = self.encoder(animation, space)
@@ -41,7 +41,7 @@ class MeshSequence(Format):
             record["speech"] = options.speech_file
         (folder / RECORD).write_bytes(json_text(path, record).encode())
 
-    def encoder(self, animation: Animation, space: Space) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A function that gives a file's bytes from a frame's positions (V, 3)."""
         raise NotImplementedError
 
@@ -50,7 +50,7 @@ class MeshSequence(Format):
 class ObjSequence(MeshSequence):
     """A folder with an .obj mesh for every frame."""
 
-    def encoder(self, animation: Animation, space: Space) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """Vertices with nine digits, which give back every float32; colours follow them as sRGB from 0 to 1."""
         comment = f"# {_comment(animation, space)}\n"
         # Triangles are counted from 1 and keep the animation's order and winding.
@@ -71,7 +71,7 @@ class ObjSequence(MeshSequence):
 class PlySequence(MeshSequence):
     """A folder with a binary .ply mesh for every frame."""
 
-    def encoder(self, animation: Animation, space: Space) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A header, little-endian vertices with sRGB bytes, and triangles."""
         colours = animation.colours
         names = () if colours is None else ("red", "green", "blue")
@@ -94,7 +94,7 @@ class PlySequence(MeshSequence):
         return encode
 
 
-def _comment(animation: Animation, space: Space) -> str:
+def _comment(animation: Animation, space: FileSpace) -> str:
     """One line with the program that wrote the file, the unit and the axes."""
     name, unit = " ".join(animation.name.split()), " ".join(space.unit.split())
     return (
@@ -113,7 +113,7 @@ class PointCache(Format):
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write the header and the positions, and the mesh at rest where there are triangles."""
         (animation,) = animations
-        space = Space.of(animation, options)
+        space = FileSpace.of(animation, options)
         with path.open("wb") as stream:
             stream.write(self.header(animation))
             for points in space.frames(animation):

@@ -11,7 +11,7 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export.format import Format, Space, facts, linear_colours, normals_of, outward
+from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward
 from facediff.registry import export_format
 
 
@@ -34,7 +34,7 @@ class Usd(Format):
         except ImportError as error:
             raise MissingExtraError("pxr", "usd", "writing USD") from error
         (animation,) = animations
-        space = Space.of(animation, options)
+        space = FileSpace.of(animation, options)
         stage = Usd.Stage.CreateInMemory()
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if space.up == "z" else UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, space.metres)
@@ -74,7 +74,7 @@ class TextUsd(Usd):
     """USD, text: a mesh with points for every frame."""
 
 
-def _add_face(stage: Any, path: Any, animation: Animation, space: Space) -> None:  # noqa: ANN401 - usd-core has no type hints
+def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> None:  # noqa: ANN401 - usd-core has no type hints
     """A polygon mesh without subdivision, with points, normals and extent of every frame."""
     from pxr import Sdf, UsdGeom, Vt
 

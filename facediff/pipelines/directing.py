@@ -40,7 +40,7 @@ MOST_RUNS = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class ConditionedRun:
     """One way of generating a recording.
 
     Attributes:
@@ -112,7 +112,7 @@ def plan_runs(
     style: Reference | Style | None,
     condition: str | None,
     style_template: str | Path | None = None,
-) -> list[Run]:
+) -> list[ConditionedRun]:
     """What must be generated, one run where nothing changes.
 
     Args:
@@ -127,7 +127,7 @@ def plan_runs(
         FaceDiffError: naming the channel that the model cannot follow, or if there are too many combinations.
     """
     if direction is None:
-        return [Run(style, condition, model.choices())]
+        return [ConditionedRun(style, condition, model.choices())]
     channels = [name for name in direction.channels if name in ("style", "condition") or name.startswith("guidance.")]
     found: list[list[tuple[str, float | str, Share]]] = []
     for name in channels:
@@ -143,13 +143,13 @@ def plan_runs(
     }
     last = max(key.time for key in direction.keys)
     times = np.arange(int(np.ceil(last * model.frame_rate)) + 2) / model.frame_rate
-    runs: list[Run] = []
+    runs: list[ConditionedRun] = []
     for chosen in product(*found):
         # Shares of an alternative that is alone are 1 at all times; without them the motion stays as it is.
         shares = tuple(
             share for alternatives, (_, _, share) in zip(found, chosen, strict=True) if len(alternatives) > 1
         )
-        run = Run(style, condition, {}, shares)
+        run = ConditionedRun(style, condition, {}, shares)
         if shares and not run.share(times).any():
             continue  # these values never meet
         if len(runs) == MOST_RUNS:
@@ -167,7 +167,7 @@ def plan_runs(
                     _named(direction, name, lambda value=value: model.choose_expressivity(value))
             given = str(now["condition"]) if "condition" in now else condition
             _named(direction, "condition", lambda given=given: model.check_condition(given))
-            runs.append(Run(styles.get(str(now.get("style")), style), given, model.choices(), shares))
+            runs.append(ConditionedRun(styles.get(str(now.get("style")), style), given, model.choices(), shares))
     return runs
 
 
@@ -205,7 +205,7 @@ def _expressivity(
     return [("expressivity", value, ExpressivityShare(known, value, (), curves, weights)) for value in (0.0, 1.0)]
 
 
-def blend(motions: Sequence[Tensor], runs: Sequence[Run], frame_rate: float, start: int = 0) -> Tensor:
+def blend(motions: Sequence[Tensor], runs: Sequence[ConditionedRun], frame_rate: float, start: int = 0) -> Tensor:
     """Motions (seeds, T, V, 3) of the runs, blended by their shares in each frame.
 
     Args:
@@ -242,7 +242,9 @@ class DirectedStream:
         frames: how many have been given out so far.
     """
 
-    def __init__(self, model: AnimationModel, runs: Sequence[Run], *, identity: str, seeds: Sequence[int]) -> None:
+    def __init__(
+        self, model: AnimationModel, runs: Sequence[ConditionedRun], *, identity: str, seeds: Sequence[int]
+    ) -> None:
         self.model, self.runs = model, list(runs)
         self.streams: list[SpeechStream] = []
         self.frames = 0
@@ -269,10 +271,10 @@ class DirectedStream:
         """All vertices for a recording, part by part."""
         return in_parts(self, speech, progress=progress)
 
-    def _pairs(self) -> Iterator[tuple[Run, SpeechStream]]:
+    def _pairs(self) -> Iterator[tuple[ConditionedRun, SpeechStream]]:
         return zip(self.runs, self.streams, strict=True)
 
-    def _of(self, run: Run, step: Any, argument: Any) -> Tensor:  # noqa: ANN401
+    def _of(self, run: ConditionedRun, step: Any, argument: Any) -> Tensor:  # noqa: ANN401
         with self.model.choosing(run.choices):
             made: Tensor = step(argument)
         # Absolute vertices are blended, as they are in one pass: the two agree to the last bit.

@@ -263,7 +263,7 @@ def test_export_names_missing_packages_before_any_work(tmp_path: Path, monkeypat
 
 BOUNDS = """
 from facediff.export import Format
-from facediff.export.format import Space
+from facediff.export.format import FileSpace
 
 class Bounds(Format):
     "The box around the vertices of every frame, as text."
@@ -273,7 +273,7 @@ class Bounds(Format):
 
     def write(self, path, animations, options):
         (animation,) = animations
-        frames = Space.of(animation, options).frames(animation)
+        frames = FileSpace.of(animation, options).frames(animation)
         path.write_text("".join(f"{frame.min()} {frame.max()} {options.speech_file}\\n" for frame in frames))
 """
 

@@ -53,7 +53,7 @@ PREVIEWED = ("expressiveness", "head")
 
 
 @export_format.register("html")
-class Page(Format):
+class PageFormat(Format):
     """A page that plays in any browser, without a server."""
 
     next_step = "open it in a browser; `facediff view` has more options"
