@@ -1,4 +1,4 @@
-"""``facediff adapt``: a trained model is fine-tuned on a new speaker, or learns to hear other voices, or at once."""
+"""``facediff adapt``: fine-tune a model on a new speaker, or adapt its audio encoder to other voices or low latency."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
-    from facediff.models.hearing import HearingOptions
+    from facediff.models.audio_distillation import DistillationOptions
 
 CLIP_SECONDS = 0.05  # What training on a clip takes with the built-in corpus's small model, on two processor cores
 OF_TRAINING = (
@@ -35,7 +35,7 @@ def adapt(
     checkpoint: Checkpoint,
     person: Annotated[str | None, Option(metavar="DIR", reads=True)] = None,
     voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
-    at_once: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_AT_ONCE_STEPS)] = None,
+    low_latency: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_LOW_LATENCY_STEPS)] = None,
     audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     output: Output,
@@ -51,22 +51,22 @@ def adapt(
     quiet: bool = False,
     yes: bool = False,
 ) -> None:
-    """Fine-tune a checkpoint on a new speaker, or let it learn to hear other voices or at once; write a checkpoint.
+    """Fine-tune a checkpoint on a new speaker, or adapt its audio encoder to other voices or to low latency.
 
-    With --person, it learns from a minute of the new speaker's motion, and knows them by name. With --voices, it learns
-    to hear other voices, rooms and noise, and moves as before. With --at-once, its audio encoder learns to hear
-    0.12 s ahead and no further; a small one may take its place. The corpus that the checkpoint was trained on must be
-    on this machine.
+    With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --voices,
+    its audio encoder is distilled to be robust to other voices, rooms and noise; with --low-latency, to need no more
+    than 0.12 s of speech ahead, and a smaller encoder may take its place. The corpus that the checkpoint was trained on
+    must be on this machine.
 
     Args:
         checkpoint: trained model (.ckpt)
         person: folder that `facediff data import-person` wrote, or the name of a speaker of the corpus who was not
             trained on and has clips that belong to no split
-        voices: let the audio encoder learn other voices, rooms and noise, in so many steps (600 if no number); modes,
-            epochs and rates are those of --person
-        at_once: let the audio encoder learn to hear at once, in so many steps (1500 if no number)
-        audio_encoder: with --at-once: what takes its place, such as mel or mel:num_layers=6, and learns to give
-            what it gave
+        voices: distil the audio encoder to be robust to other voices, rooms and noise, in so many steps (600 if no
+            number); --mode, --epochs and --learning-rate are for --person
+        low_latency: distil the audio encoder for low latency, in so many steps (1500 if no number)
+        audio_encoder: with --low-latency: an encoder that replaces the checkpoint's and learns to reproduce its
+            features, such as mel or mel:num_layers=6
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md)
         output: checkpoint to write (.ckpt)
@@ -85,26 +85,26 @@ def adapt(
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
-    if sum(each is not None for each in (person, voices, at_once)) != 1:
+    if sum(choice is not None for choice in (person, voices, low_latency)) != 1:
         raise FaceDiffError(
-            "--person, --voices, --at-once: expected one of them: a new speaker to move like, voices to hear, or "
-            "hearing at once"
+            "--person, --voices, --low-latency: expected one of them: a new speaker, robustness to other voices, or an "
+            "audio encoder of low latency"
         )
     if augmentation and voices is None:
-        raise FaceDiffError("--augmentation: says how --voices changes speech; give --voices as well")
-    if audio_encoder is not None and at_once is None:
-        raise FaceDiffError("--audio-encoder: takes the place of one that hears too slowly; give --at-once as well")
+        raise FaceDiffError("--augmentation: is an option of --voices; give --voices as well")
+    if audio_encoder is not None and low_latency is None:
+        raise FaceDiffError("--audio-encoder: is an option of --low-latency; give --low-latency as well")
     check_model_source(checkpoint, "--checkpoint")
     if person is None:
-        from facediff.models.hearing import AT_ONCE, HearingOptions
+        from facediff.models.audio_distillation import LOW_LATENCY_DISTILLATION, DistillationOptions
 
-        if at_once is not None:
-            chosen = replace(AT_ONCE, steps=at_once, seed=seed)
+        if low_latency is not None:
+            chosen = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
-            chosen = HearingOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed)
+            chosen = DistillationOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed)
             chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
-        adapt_hearing(
+        adapt_audio_encoder(
             *(checkpoint, output, data_root, corpus, device, commercial_only, chosen, audio_encoder), quiet=quiet
         )
         return
@@ -128,8 +128,8 @@ def adapt(
     if not data.root.is_dir():
         raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
     if name not in data.corpus.templates:
-        known = ", ".join(sorted(data.corpus.templates))
-        raise FaceDiffError(f"--person {person}: neither a person's folder nor a speaker of the corpus ({known})")
+        speakers = ", ".join(sorted(data.corpus.templates))
+        raise FaceDiffError(f"--person {person}: neither a person's folder nor a speaker of the corpus ({speakers})")
     clips = data.clips("train")
     if not any(clip.identity == name for clip in clips):
         raise FaceDiffError(f"--person {person}: no clip of {name} lies outside the corpus's test split")
@@ -159,27 +159,27 @@ def adapt(
     trainer.save_checkpoint(output)
     seconds = sum(data.corpus.frames(clip) for clip in clips if clip.identity == name) / data.frame_rate
     # Pictures need a mesh, which a corpus may lack.
-    made = "speech.npz" if model.assets.faces is None else "speech.mp4"
-    words = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", made]
+    target = "speech.npz" if model.assets.faces is None else "speech.mp4"
+    command = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", target]
     tell(
         f"{output}: adapted to {name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
-        f"next: {shlex.join(words)}"
+        f"next: {shlex.join(command)}"
     )
 
 
-def adapt_hearing(
+def adapt_audio_encoder(
     checkpoint: Path,
     output: Path,
     data_root: Path | None,
     corpus: str | None,
     device: str,
     commercial_only: bool,
-    chosen: HearingOptions,
+    chosen: DistillationOptions,
     encoder: str | None,
     *,
     quiet: bool,
 ) -> None:
-    """Write a checkpoint whose audio encoder has learnt other voices, or to hear at once; see :func:`adapt`."""
+    """Write a checkpoint with a distilled audio encoder; see :func:`adapt`."""
     from facediff.models.base import PROVENANCE_KEY
     from facediff.models.checkpoint import build_model, read_checkpoint
     from facediff.pipelines.animate import usable_device
@@ -196,72 +196,71 @@ def adapt_hearing(
     if not data.root.is_dir():
         raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
     content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
-    left = hear(checkpoint, content, data, output, chosen, encoder, device=device, quiet=quiet)
-    what, words = (
-        ("other voices", "they change what it hears by")
-        if chosen.ahead is None
-        else ("to hear at once", "what it hears differs by")
+    error = write_distilled(checkpoint, content, data, output, chosen, encoder, device=device, quiet=quiet)
+    goal = "other voices" if chosen.look_ahead is None else "low latency"
+    tell(
+        f"{output}: audio encoder adapted to {goal} in {time.monotonic() - started:.0f} s; its features err by "
+        f"{error:.2f} of their variance"
     )
-    tell(f"{output}: has learnt {what} in {time.monotonic() - started:.0f} s; {words} {left:.2f} of its variance")
 
 
-def hear(
+def write_distilled(
     checkpoint: Path,
     content: dict[str, Any],
     data: SpeechMotionDataModule,
     output: Path,
-    options: HearingOptions,
+    options: DistillationOptions,
     encoder: str | None = None,
     *,
     device: str = "cpu",
     quiet: bool = False,
 ) -> float:
-    """Write a checkpoint's content with an audio encoder that has learnt more, and everything else as it is.
+    """Write a checkpoint's content with a distilled audio encoder, and everything else as it is.
 
     Args:
         checkpoint: the file.
         content: of it; it is changed.
         data: the corpus.
         output: checkpoint to write.
-        options: what is learnt.
-        encoder: what takes the audio encoder's place, by name with its options; None for itself.
+        options: how the encoder is distilled.
+        encoder: an encoder that replaces the checkpoint's, by name with its options; None for itself.
         device: where.
         quiet: no progress bar.
 
     Returns:
-        as :func:`facediff.models.hearing.learn_voices`.
+        the remaining error, as :func:`facediff.models.audio_distillation.distil_audio_encoder` gives it.
 
     Raises:
         FaceDiffError: if there is no such encoder, or it cannot be replaced.
     """
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.models.adaptation import with_audio_encoder
+    from facediff.models.audio_distillation import distil_audio_encoder, encoder_weights
     from facediff.models.checkpoint import build_model
-    from facediff.models.hearing import encoder_weights, learn_voices
     from facediff.utils.progress import progress_bar
 
     model, teacher = build_model(checkpoint, content).to(device), None
     if encoder is not None:
         from facediff.registry import audio_encoder as registered
 
-        name, given = registered.read(encoder)
-        chosen = {"class_path": f"facediff.registry.audio_encoder.{name}", "init_args": given}
+        name, init_args = registered.read(encoder)
+        chosen = {"class_path": f"facediff.registry.audio_encoder.{name}", "init_args": init_args}
         teacher, replaced = model.speech_encoder, set(encoder_weights(model))
         model = with_audio_encoder(model, chosen).to(device)
         content["hyper_parameters"] = {**content["hyper_parameters"], "audio_encoder": chosen}
-        content["state_dict"] = {key: each for key, each in content["state_dict"].items() if key not in replaced}
-        for key in OF_TRAINING:  # it is of the encoder that was replaced; `fit` begins anew
+        content["state_dict"] = {key: weight for key, weight in content["state_dict"].items() if key not in replaced}
+        for key in OF_TRAINING:  # it belongs to the encoder that was replaced; `fit` starts from the beginning
             content.pop(key, None)
-    what = "other voices" if options.ahead is None else "hearing at once"
-    with progress_bar(what, options.steps, shown=not quiet) as step:
-        left = learn_voices(model, data, options, step, teacher=teacher)
+    goal = "other voices" if options.look_ahead is None else "low latency"
+    with progress_bar(goal, options.steps, shown=not quiet) as step:
+        error = distil_audio_encoder(model, data, options, step, teacher=teacher)
     weights = encoder_weights(model)
     # With averaged weights, those of the last step are kept for a training that goes on.
     for key in ("state_dict", "current_model_state"):
         if key in content:
             content[key] = {**content[key], **weights}
     AtomicCheckpointIO().save_checkpoint(content, output)
-    return left
+    return error
 
 
 def adaptation_data(

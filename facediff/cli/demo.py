@@ -43,15 +43,15 @@ def demo(
         epochs: training epochs (default: the config's)
         data_root: where the corpus is kept (default: the user's cache folder)
     """
-    from facediff.cli.adapt import hear
+    from facediff.cli.adapt import write_distilled
     from facediff.cli.lightning import run_cli
     from facediff.export import ExportOptions, check_export
 
     if fast and epochs is not None:
         raise FaceDiffError("--fast and --epochs both say how long to train; give one of them")
     check_export(output / "truth_and_prediction.mp4", ExportOptions())
+    from facediff.models.audio_distillation import DistillationOptions
     from facediff.models.checkpoint import read_checkpoint
-    from facediff.models.hearing import HearingOptions
 
     started = time.monotonic()
 
@@ -69,7 +69,7 @@ def demo(
     fitted.trainer.save_checkpoint(checkpoint)
     if not fast:
         report("adapting the audio encoder to other voices and rooms")
-        hear(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, HearingOptions())
+        write_distilled(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, DistillationOptions())
     report("scoring sentences that were not in training")
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])

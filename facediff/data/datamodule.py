@@ -277,7 +277,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """A function that returns further speech (S,) at 16 kHz by number, without motion; None if there is no more.
 
         The audio encoder can be distilled on it, which needs more speech than the corpus's sentences
-        (:mod:`facediff.models.hearing`).
+        (:mod:`facediff.models.audio_distillation`).
         """
         return None
 

@@ -289,8 +289,8 @@ USUAL_SWAY = 2.0
 """Degrees where no number is given."""
 Threads = Annotated[int, Range(0, 1024)]
 Tolerance = Annotated[float, Range(1e-15, 1)]
-USUAL_AT_ONCE_STEPS = 1500
-"""Steps in which an audio encoder learns to hear at once."""
+USUAL_LOW_LATENCY_STEPS = 1500
+"""Steps in which an audio encoder is distilled for low latency."""
 
 USUAL_VOICE_STEPS = 600
 """Training steps in which an audio encoder learns other voices where no number is given."""

@@ -17,9 +17,9 @@ from facediff.data import collate
 from facediff.data.prepare.runner import write_templates
 from facediff.models import load_model
 from facediff.models.adaptation import grow
+from facediff.models.audio_distillation import encoder_weights
 from facediff.models.base import PROVENANCE_KEY
 from facediff.models.checkpoint import read_checkpoint
-from facediff.models.hearing import encoder_weights
 from facediff.utils.pickles import load_pickle
 from tests.fakes.tiny import Tiny
 
@@ -240,13 +240,13 @@ def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         assert "--voices" in capsys.readouterr().err
 
 
-def test_hearing_at_once_with_another_audio_encoder(
+def test_low_latency_with_another_audio_encoder(
     checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The new encoder stands where the old one stood, and nothing else has changed."""
     out = tmp_path / "quick.ckpt"
     words = ["adapt", "--checkpoint", str(checkpoint), "-o", str(out), "--accelerator", "cpu", "--quiet"]
-    assert main([*words, "--at-once", "2", "--audio-encoder", "mel:hidden_dim=8,num_layers=2"]) == 0
+    assert main([*words, "--low-latency", "2", "--audio-encoder", "mel:hidden_dim=8,num_layers=2"]) == 0
     before, after = load_model(checkpoint), load_model(out)
     assert after.speech_encoder.stem.out_channels == 8
     assert before.speech_encoder.stem.out_channels != 8
@@ -255,8 +255,8 @@ def test_hearing_at_once_with_another_audio_encoder(
     for name, value in after.state_dict().items():
         assert name in encoder or torch.equal(value, before.state_dict()[name])
     assert "optimizer_states" not in read_checkpoint(out)
-    for wrong in (["--audio-encoder", "mel", "--voices"], ["--at-once", "--voices"]):
+    for wrong in (["--audio-encoder", "mel", "--voices"], ["--low-latency", "--voices"]):
         assert main([*words, *wrong]) == 2
-        assert "--at-once" in capsys.readouterr().err
-    assert main([*words, "--at-once", "2", "--audio-encoder", "mle"]) == 2
+        assert "--low-latency" in capsys.readouterr().err
+    assert main([*words, "--low-latency", "2", "--audio-encoder", "mle"]) == 2
     assert "mle" in capsys.readouterr().err

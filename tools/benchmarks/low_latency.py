@@ -4,7 +4,7 @@
 
 animates the test recordings of the model's corpus as a whole, by windows, and at low latency with other steps and
 looking further or less far ahead; each animation is compared with the truth. Further checkpoints are rows of their own,
-such as one of ``facediff adapt --at-once``.
+such as one of ``facediff adapt --low-latency``.
 
     python tools/benchmarks/low_latency.py --size
 

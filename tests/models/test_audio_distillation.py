@@ -1,4 +1,4 @@
-"""An audio encoder learns to hear changed speech as it hears the recording, and the rest of the model stays."""
+"""A distilled audio encoder gives the teacher's features of augmented or truncated speech; the rest stays."""
 
 from __future__ import annotations
 
@@ -15,11 +15,16 @@ import torch
 from facediff.data.augmentation import filtered
 from facediff.errors import FaceDiffError
 from facediff.models.adaptation import with_audio_encoder
+from facediff.models.audio_distillation import (
+    LOW_LATENCY_DISTILLATION,
+    DistillationOptions,
+    distil_audio_encoder,
+    encoder_weights,
+)
 from facediff.models.base import AnimationModel
-from facediff.models.hearing import AT_ONCE, HearingOptions, encoder_weights, learn_voices
 from tests.fakes.tiny import Tiny
 
-FEW = HearingOptions(steps=3, batch_size=2, workers=0)
+FEW = DistillationOptions(steps=3, batch_size=2, workers=0)
 
 
 @pytest.fixture
@@ -49,14 +54,16 @@ def test_speech_that_was_never_trained_on_is_heard_better(model: AnimationModel,
         return float(torch.cat([(one - two).square() for one, two in zip(made, wanted, strict=True)]).mean())
 
     before = error(change=True)
-    learn_voices(model, tiny, HearingOptions(steps=60, batch_size=6, workers=0, moved=1.0, learning_rate=3e-3))
+    distil_audio_encoder(
+        model, tiny, DistillationOptions(steps=60, batch_size=6, workers=0, interpolation=1.0, learning_rate=3e-3)
+    )
     assert error(change=True) < 0.5 * before
     assert error(change=False) < 0.2 * before
 
 
 def test_only_the_audio_encoder_changes(model: AnimationModel, tiny: Tiny) -> None:
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    learn_voices(model, tiny, FEW)
+    distil_audio_encoder(model, tiny, FEW)
     changed = {name for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
     assert changed
     assert changed <= set(encoder_weights(model))
@@ -67,10 +74,10 @@ def test_only_the_audio_encoder_changes(model: AnimationModel, tiny: Tiny) -> No
 def test_weights_go_a_share_of_the_way(make_model: Callable[..., AnimationModel], tiny: Tiny) -> None:
     """0 is the model as it was, and a half lies in the middle between that and all of the way."""
     ends = {}
-    for moved in (0.0, 0.5, 1.0):
+    for interpolation in (0.0, 0.5, 1.0):
         model = make_model()
-        learn_voices(model, tiny, replace(FEW, moved=moved))
-        ends[moved] = encoder_weights(model)
+        distil_audio_encoder(model, tiny, replace(FEW, interpolation=interpolation))
+        ends[interpolation] = encoder_weights(model)
     for name, before in encoder_weights(make_model()).items():
         assert torch.equal(ends[0.0][name], before)
         torch.testing.assert_close(ends[0.5][name], (before + ends[1.0][name]) / 2)
@@ -84,7 +91,7 @@ def test_the_seed_decides_whatever_process_changes_speech(
     for seed, workers in ((0, 0), (0, 1), (1, 0)):
         model = make_model()
         torch.manual_seed(len(made))
-        learn_voices(model, tiny, replace(FEW, seed=seed, workers=workers))
+        distil_audio_encoder(model, tiny, replace(FEW, seed=seed, workers=workers))
         after = torch.rand(1)
         torch.manual_seed(len(made))
         assert torch.equal(after, torch.rand(1))
@@ -96,12 +103,12 @@ def test_the_seed_decides_whatever_process_changes_speech(
 def test_what_cannot_be_learnt_is_refused(model: AnimationModel, tiny: Tiny) -> None:
     for name in ("speed", "pauses"):
         with pytest.raises(FaceDiffError, match=name):
-            learn_voices(model, tiny, replace(FEW, augmentations=["noise", name]))
+            distil_audio_encoder(model, tiny, replace(FEW, augmentations=["noise", name]))
     with pytest.raises(FaceDiffError, match=r"data\.augmentations"):
-        learn_voices(model, tiny, replace(FEW, augmentations=["voices"]))
+        distil_audio_encoder(model, tiny, replace(FEW, augmentations=["voices"]))
     model.speech_encoder.requires_grad_(False)
     with pytest.raises(FaceDiffError, match="audio_encoder"):
-        learn_voices(model, tiny, FEW)
+        distil_audio_encoder(model, tiny, FEW)
 
 
 class Talks(Tiny):
@@ -119,11 +126,11 @@ class Talks(Tiny):
 
 def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., AnimationModel], tiny_root: Path) -> None:
     data = Talks(root=str(tiny_root))
-    learn_voices(make_model(), data, replace(FEW, steps=12, further=500))
+    distil_audio_encoder(make_model(), data, replace(FEW, steps=12, further=500))
     assert 0 <= min(data.asked) < max(data.asked) < 500
     assert 6 <= len(data.asked) <= 18  # of 24, without what is asked for a second time
     data.asked.clear()
-    learn_voices(make_model(), data, replace(FEW, further=0))
+    distil_audio_encoder(make_model(), data, replace(FEW, further=0))
     assert not data.asked
 
 
@@ -146,7 +153,9 @@ def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tin
         return float(torch.cat(found).mean())
 
     before = error()
-    learn_voices(model, tiny, replace(AT_ONCE, steps=60, batch_size=6, workers=0, learning_rate=3e-3))
+    distil_audio_encoder(
+        model, tiny, replace(LOW_LATENCY_DISTILLATION, steps=60, batch_size=6, workers=0, learning_rate=3e-3)
+    )
     assert error() < 0.85 * before
 
 
@@ -155,7 +164,7 @@ def test_a_student_of_another_size_learns_from_its_teacher(model: AnimationModel
     model.adopt(tiny.assets())
     torch.manual_seed(1)
     student = with_audio_encoder(model, small)
-    options = replace(AT_ONCE, steps=40, batch_size=6, workers=0, learning_rate=3e-3)
-    first = learn_voices(copy.deepcopy(student), tiny, replace(options, steps=2), teacher=model.speech_encoder)
-    last = learn_voices(student, tiny, options, teacher=model.speech_encoder)
+    options = replace(LOW_LATENCY_DISTILLATION, steps=40, batch_size=6, workers=0, learning_rate=3e-3)
+    first = distil_audio_encoder(copy.deepcopy(student), tiny, replace(options, steps=2), teacher=model.speech_encoder)
+    last = distil_audio_encoder(student, tiny, options, teacher=model.speech_encoder)
     assert last < 0.5 * first

@@ -1,0 +1,321 @@
+"""Distil a trained model's audio encoder: for robustness to other voices, rooms and microphones, or for low latency.
+
+**Robustness.** Training the whole model with augmented speech would teach it the same motion again for every voice,
+which takes long and costs accuracy on clean speech. Here only the audio encoder is trained: from augmented speech, the
+student must reproduce the features that the teacher, the encoder as it was, computes from the clean recording (Li,
+Seltzer, Wang, Zhao and Gong 2017, "Large-scale domain adaptation via teacher-student learning"). A step costs a small
+part of a training step, and no motion is needed. In the end the weights are interpolated between teacher and student,
+which gives back most of the accuracy on clean speech and keeps most of the robustness (Wortsman et al. 2022, "Robust
+fine-tuning of zero-shot models").
+
+**Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
+features of the whole recording. The student may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean
+2015, "Distilling the knowledge in a neural network"): HuBERT takes a fifth of a second for each frame of a stream.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from facediff.data import SpeechMotionDataModule
+from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, read_augmentations
+from facediff.errors import FaceDiffError
+from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.base import AnimationModel
+from facediff.models.layers import frame_mask
+from facediff.speech.windows import LOW_LATENCY, QUIETEST
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import USUAL_VOICE_STEPS
+from facediff.utils.workers import processors
+
+ROBUST_AUGMENTATIONS = (
+    "voice:share=0.8,semitones=6,formants=0.22",
+    "loudness:share=0.3",
+    "room:share=0.6,seconds=0.8,direct=-4",
+    "tilt:share=0.6",
+    "band:share=0.25",
+    "codec:share=0.1",
+    "noise:share=0.7",
+    "hum:share=0.1",
+)
+"""Default augmentations of speech; see docs/voices.md."""
+
+WINDOW = 4.0
+"""Seconds of a clip in a batch, at most."""
+
+LOW_LATENCY_WINDOW = (0.6, 1.7)
+"""Seconds of speech that a low-latency student gets, at least and at most."""
+
+STEP_RATE = 50
+"""Features a second at which student and teacher are compared."""
+
+
+@dataclass(frozen=True)
+class DistillationOptions:
+    """How an audio encoder is distilled.
+
+    Attributes:
+        augmentations: by name with their options, in the order in which they are applied.
+        steps: training steps.
+        batch_size: clips in a step.
+        share: of the clips that are augmented; the others keep the student accurate on clean speech.
+        further: how many pieces of further speech are used in addition to the clips, where the corpus has such
+            (:meth:`facediff.data.SpeechMotionDataModule.further_speech`); they are drawn as often as the clips.
+        interpolation: of the weights, from the teacher's (0) to the trained student's (1).
+        learning_rate: the highest; it rises over the first twentieth of the steps and falls as a cosine.
+        seed: of all random numbers.
+        workers: processes that augment speech; 0 for this one.
+        look_ahead: seconds of speech after a feature that the student gets; None for the whole recording, which the
+            teacher always gets.
+    """
+
+    augmentations: Sequence[str] = ROBUST_AUGMENTATIONS
+    steps: int = USUAL_VOICE_STEPS
+    batch_size: int = 12
+    share: float = 0.5
+    further: int = 1200
+    interpolation: float = 0.85
+    learning_rate: float = 1e-3
+    seed: int = 0
+    workers: int = 1
+    look_ahead: float | None = None
+
+
+LOW_LATENCY_DISTILLATION = DistillationOptions(
+    augmentations=(), share=0.0, interpolation=1.0, look_ahead=LOW_LATENCY.after
+)
+"""How an audio encoder is distilled for low latency."""
+
+
+class DistillationBatch(NamedTuple):
+    """Speech of the teacher and of the student.
+
+    Attributes:
+        clean: the teacher's input (batch, samples).
+        lengths: valid samples of each clip.
+        student_input: the same speech, augmented, or cut to the steps from ``start`` to ``end`` (batch, fewer samples).
+        start: first step of the student's input.
+        end: the step after its last one.
+        mean: of each clip's speech up to ``end``; None where the student gets all of it.
+        deviation: standard deviation of the same speech.
+    """
+
+    clean: Tensor
+    lengths: Tensor
+    student_input: Tensor
+    start: Tensor
+    end: Tensor
+    mean: Tensor | None = None
+    deviation: Tensor | None = None
+
+    def to(self, device: torch.device) -> DistillationBatch:
+        """On a device."""
+        return DistillationBatch(*(None if part is None else part.to(device) for part in self))  # type: ignore[arg-type]
+
+
+def distil_audio_encoder(
+    model: AnimationModel,
+    data: SpeechMotionDataModule,
+    options: DistillationOptions = DistillationOptions(),  # noqa: B008 - it cannot be changed
+    step_done: Callable[[], object] = lambda: None,
+    *,
+    teacher: AudioEncoder | None = None,
+) -> float:
+    """Distil a trained model's audio encoder in place.
+
+    Args:
+        model: a trained model, whose audio encoder is the student.
+        data: the corpus; of its training clips, only the speech is used.
+        options: how.
+        step_done: called after each step.
+        teacher: gives the features to reproduce; a copy of the student if None.
+
+    Returns:
+        the remaining error of the student's features, as a share of the teacher features' variance: the mean of the
+        last tenth of the steps.
+
+    Raises:
+        FaceDiffError: if nothing of the encoder can be trained, or an augmentation is unknown.
+    """
+    augmentations = read_augmentations(options.augmentations)
+    # The teacher's features of the clean recording are the target: its frames must stay where they are.
+    if moving := [change for change in augmentations if not isinstance(change, SpeechAugmentation)]:
+        raise FaceDiffError(
+            f"augmentations: {type(moving[0]).__name__.lower()} changes the timing of the speech, so the teacher has "
+            f"no features to compare with; omit it"
+        )
+    student = model.speech_encoder
+    weights = [weight for weight in student.parameters() if weight.requires_grad]
+    if not weights:
+        raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
+    teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
+    before = [weight.detach().clone() for weight in weights]
+    pairs = SpeechPairs(data, Augmenter(augmentations), options)
+    workers = min(options.workers, processors() - 1)
+    loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
+    optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options.steps))
+    errors: list[float] = []
+    devices = [] if model.device.type == "cpu" else [model.device]
+    with torch.random.fork_rng(devices):
+        torch.manual_seed(options.seed)
+        student.train()
+        for batch in loader:
+            speech: DistillationBatch = batch.to(model.device)
+            with torch.no_grad():
+                target = teacher(speech.clean, speech.lengths, _steps(speech.lengths))
+            error = _difference(_features(student, speech), *_compared(target, speech, options.look_ahead))
+            optimiser.zero_grad()
+            error.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(weights, 1.0)
+            optimiser.step()
+            schedule.step()
+            errors.append(float(error.detach()))
+            step_done()
+    student.eval()
+    with torch.no_grad():
+        for weight, old in zip(weights, before, strict=True):
+            weight.copy_(torch.lerp(old, weight, options.interpolation))
+    return float(np.mean(errors[-max(1, options.steps // 10) :]))
+
+
+def encoder_weights(model: AnimationModel) -> dict[str, Tensor]:
+    """The weights of a model's audio encoder, by their names in its checkpoint."""
+    name = next(name for name, module in model.named_modules() if module is model.speech_encoder)
+    return {f"{name}.{key}": value.detach().cpu() for key, value in model.speech_encoder.state_dict().items()}
+
+
+def _steps(samples: Tensor) -> Tensor:
+    """Features of so many samples."""
+    return (samples * STEP_RATE // SAMPLE_RATE).clamp_min(1)
+
+
+def _features(student: AudioEncoder, speech: DistillationBatch) -> Tensor:
+    """The student's features, standardised by the level of all speech so far as in a stream."""
+    steps = speech.end - speech.start
+    if speech.mean is None or speech.deviation is None:
+        features: Tensor = student(speech.student_input, speech.lengths, steps)
+        return features
+    with student.at_level(speech.mean[:, None], speech.deviation[:, None]):
+        features = student(speech.student_input, steps * SAMPLE_RATE // STEP_RATE, steps)
+    return features
+
+
+def _compared(target: Tensor, speech: DistillationBatch, look_ahead: float | None) -> tuple[Tensor, Tensor]:
+    """The teacher's features of the student's steps, and True on the steps that are compared."""
+    count = speech.end - speech.start
+    if look_ahead is None:
+        return target, frame_mask(count, target.shape[1])[..., None]
+    place = torch.arange(int(count.max()), device=target.device)[None]
+    steps = (speech.start[:, None] + place).clamp_max(target.shape[1] - 1)
+    # Steps within the look-ahead are context only. Steps more than half a second before it have enough context
+    # already, and would drown the error of the hard ones.
+    last = (count - round(look_ahead * STEP_RATE))[:, None]
+    mask = (place < last) & (place >= last - STEP_RATE // 2)
+    return target.gather(1, steps[..., None].expand(-1, -1, target.shape[2])), mask[..., None]
+
+
+def _difference(features: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """Squared difference of features (batch, steps, channels) as a share of their variance, over valid steps."""
+    # Dividing by a tiny variance would let channels that carry hardly any information dominate the loss: the variance
+    # counts as a twentieth of the mean one at least.
+    count = mask.sum()
+    mean = (target * mask).sum((0, 1)) / count
+    variance = ((target - mean).square() * mask).sum((0, 1)) / count
+    least = (variance.mean() / 20).clamp_min(1e-12)
+    return (((features - target).square() * mask).sum((0, 1)) / count / variance.clamp_min(least)).mean()
+
+
+def _rate(step: int, steps: int) -> float:
+    """The share of the learning rate at a step."""
+    rise = max(1, steps // 20)
+    return (step + 1) / rise if step < rise else 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
+
+
+class SpeechPairs(Dataset[DistillationBatch]):
+    """Batches of clean speech with the student's version of it.
+
+    A batch follows from its number and the seed, independently of the process that makes it.
+    """
+
+    def __init__(self, data: SpeechMotionDataModule, augmenter: Augmenter, options: DistillationOptions) -> None:
+        # Not the data module itself, which may hold what cannot be pickled for a worker.
+        self.corpus, self.clips, self.further = data.corpus, data.clips("train"), data.further_speech()
+        self.augmenter, self.options = augmenter, options
+        self._further_speech: dict[int, npt.NDArray[np.float32]] = {}
+
+    def __len__(self) -> int:
+        """Number of batches."""
+        return self.options.steps
+
+    def __getitem__(self, index: int) -> DistillationBatch:
+        """A batch by number."""
+        if index >= len(self):
+            raise IndexError(index)
+        random = np.random.default_rng([self.options.seed, index])
+        clean, augmented = [], []
+        for _ in range(self.options.batch_size):
+            speech = self._speech(random)
+            clean.append(speech)
+            augmented.append(self._augmented(speech, random) if random.random() < self.options.share else speech)
+        lengths = torch.tensor([len(speech) for speech in clean])
+        end = _steps(lengths)
+        if self.options.look_ahead is None:
+            return DistillationBatch(_padded(clean), lengths, _padded(augmented), torch.zeros_like(end), end)
+        spans = [self._span(steps, random) for steps in end.tolist()]
+        size = SAMPLE_RATE // STEP_RATE
+        so_far = [clip[: stop * size].astype(np.float64) for clip, (_, stop) in zip(augmented, spans, strict=True)]
+        windows = [clip[start * size : stop * size] for clip, (start, stop) in zip(augmented, spans, strict=True)]
+        means, deviations = zip(*map(_level, so_far), strict=True)
+        mean, deviation = torch.tensor(means, dtype=torch.float32), torch.tensor(deviations, dtype=torch.float32)
+        start, stop = torch.tensor(spans).unbind(1)
+        return DistillationBatch(_padded(clean), lengths, _padded(windows), start, stop, mean, deviation)
+
+    def _span(self, steps: int, random: np.random.Generator) -> tuple[int, int]:
+        """Where a window of low latency begins and ends in a clip, in steps."""
+        least = min(steps, round((self.options.look_ahead or 0) * STEP_RATE) + 2)
+        end = int(random.integers(least, steps + 1))
+        shortest, longest = (round(seconds * STEP_RATE) for seconds in LOW_LATENCY_WINDOW)
+        return max(0, end - int(random.integers(shortest, longest + 1))), end
+
+    def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
+        """A clip or a piece of further speech, or a random window of it."""
+        most = max(1, round(WINDOW * self.corpus.frame_rate))
+        if self.further is not None and self.options.further and random.random() < 0.5:
+            number = int(random.integers(self.options.further))
+            if number not in self._further_speech:
+                self._further_speech[number] = self.further(number)
+            speech = self._further_speech[number]
+            start = int(random.integers(max(1, len(speech) - round(WINDOW * SAMPLE_RATE) + 1)))
+            return speech[start : start + round(WINDOW * SAMPLE_RATE)]
+        clip = self.clips[int(random.integers(len(self.clips)))]
+        frames = self.corpus.frames(clip)
+        start = int(random.integers(frames - most + 1)) if frames > most else 0
+        return self.corpus.read_audio(clip, start, min(frames, start + most)).numpy()
+
+    def _augmented(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
+        """Speech of the same length in another voice, another room or with noise."""
+        nothing = np.zeros((1, 1, 3), np.float32)
+        example = Example(
+            speech, nothing, len(nothing) * SAMPLE_RATE / max(1, len(speech)), nothing[0], nothing[0, :, 0]
+        )
+        return self.augmenter(example, int(random.integers(2**31))).speech
+
+
+def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Mean and deviation as a stream takes them."""
+    return float(speech.mean()), max(float(speech.std()), QUIETEST)
+
+
+def _padded(speech: list[Any]) -> Tensor:
+    return nn.utils.rnn.pad_sequence([torch.from_numpy(clip) for clip in speech], batch_first=True)
