@@ -44,9 +44,10 @@ ALLOWED: dict[str, set[str]] = {
     "export": {"animation", "editing", "render", "mesh", *BASE},
     "runtime": {"version", "animation", "speech", "export", *BASE},
     "live": {"version", "runtime", "animation", "speech", "editing", "export", "mesh", *BASE},
-    "evaluation": {"speech", "data", "metrics", "mesh", "render", *BASE},
-    "benchmark": {"version", "evaluation", "metrics", *BASE},
-    "study": {"version", "animation", "speech", "data", "evaluation", "mesh", "render", *BASE},
+    "reporting": BASE,
+    "evaluation": {"reporting", "speech", "data", "metrics", "mesh", "render", *BASE},
+    "benchmark": {"version", "evaluation", "reporting", "metrics", *BASE},
+    "study": {"version", "reporting", "animation", "speech", "data", "evaluation", "mesh", "render", *BASE},
     "pipelines": {"version", "runtime", "models", "speech", "data", "editing", "export", "animation", "mesh", *BASE},
 }
 ALLOWED["cli"] = set(ALLOWED) - {"__main__"}

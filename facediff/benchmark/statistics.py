@@ -8,22 +8,12 @@ which is a valid test that neither is the reason (an intersection–union test, 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from facediff.evaluation.report import Bootstrap, Interval
-from facediff.utils.statistics import holm
-
-Array = npt.NDArray[np.float64]
-
-EXACT = 14
-"""Up to so many sentences, all signs are tried; of more, some at random."""
-FLIPS = 20_000
-BLOCK = 2_000  # Random signs that are held at a time
+from facediff.reporting.statistics import Array, Bootstrap, Interval, holm, sign_flip
 
 
 @dataclass(frozen=True)
@@ -124,62 +114,28 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
     return Difference(float((ours - theirs).sum()), interval, p_sentences, runs, p_runs, p, len(common))
 
 
-def sign_flip(differences: Array, *, seed: int = 0) -> float:
-    """Two-sided p-value of a paired permutation test: each sentence's difference might as well have the other sign.
-
-    Exact for few sentences; with more, the observed signs count as one of the random ones, so that p is never 0.
-
-    Args:
-        differences: what each sentence adds to the difference (sentences,).
-        seed: of the random signs.
-
-    Example:
-        >>> sign_flip(np.array([1.0, 2.0, 3.0]))  # the two most extreme of eight
-        0.25
-    """
-    count = len(differences)
-    observed = abs(differences.sum())
-    # Sums of the same numbers in another order differ in the last digits, and must count as equal.
-    limit = observed - 1e-12 * np.abs(differences).sum()
-    if not count:
-        return 1.0
-    if count <= EXACT:
-        signs = 1 - 2 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
-        return float(np.mean(np.abs(signs @ differences) >= limit))
-    random = np.random.default_rng(seed)
-    extreme = 0
-    for _ in range(FLIPS // BLOCK):
-        signs = random.integers(0, 2, (BLOCK, count)) * 2 - 1
-        extreme += int(np.count_nonzero(np.abs(signs @ differences) >= limit))
-    return (extreme + 1) / (FLIPS + 1)
-
-
 def welch(one: RowScores, other: RowScores, level: float = 0.95) -> tuple[float | None, Interval | None]:
     """Welch's t-test between the training runs of two rows, and its interval of the difference.
 
-    A row that was not trained has one value without chance. Where both are such, nothing is by chance of training.
+    A row that was not trained has one value without chance, against which the other's runs are tested. Where both are
+    such, nothing is by chance of training.
 
     Returns:
         p-value and interval; None where a row that was trained has a single run.
     """
-    from scipy.special import stdtr, stdtrit
+    from scipy.stats import ttest_1samp, ttest_ind
 
-    terms = []  # (variance of the mean, degrees of freedom)
-    for scores in (one, other):
-        if scores.fixed:
-            continue
-        if len(scores.runs) < 2:
-            return None, None
-        terms.append((float(scores.runs.var(ddof=1)) / len(scores.runs), len(scores.runs) - 1))
+    trained = [scores.runs for scores in (one, other) if not scores.fixed]
+    if any(len(runs) < 2 for runs in trained):
+        return None, None
     gap = one.mean - other.mean
-    variance = sum(term for term, _ in terms)
-    if variance == 0:
+    if all(np.ptp(runs) == 0 for runs in trained):
         return (0.0 if gap else 1.0), Interval(gap, gap)
-    freedom = variance**2 / sum(term**2 / count for term, count in terms)
-    deviation = math.sqrt(variance)
-    p = 2 * float(stdtr(freedom, -abs(gap) / deviation))
-    half = float(stdtrit(freedom, (1 + level) / 2)) * deviation
-    return min(p, 1.0), Interval(gap - half, gap + half)
+    if len(trained) == 2:
+        test = ttest_ind(one.runs, other.runs, equal_var=False)
+    else:
+        test = ttest_1samp(one.runs - other.mean if other.fixed else one.mean - other.runs, 0)
+    return float(test.pvalue), Interval(*map(float, test.confidence_interval(level)))
 
 
 def compared(

@@ -11,7 +11,7 @@ import numpy as np
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
 from facediff.benchmark.statistics import Difference, RowScores, compared, marked
-from facediff.evaluation.report import Bootstrap, Interval
+from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils import ranges
 
 REFERENCE_LABELS = {

@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from facediff.benchmark.plots import Panel, curves_plot, scatter_plot, speed_plot
+from facediff.benchmark.plots import plots_of
 from facediff.benchmark.statistics import Difference
 from facediff.benchmark.tables import BenchmarkReport, Table, TableRow
-from facediff.errors import FaceDiffError, printable
-from facediff.evaluation.report import Interval
+from facediff.errors import FaceDiffError
+from facediff.reporting.documents import (
+    NONE,
+    Block,
+    Bullets,
+    Drawing,
+    Paragraph,
+    ReportTable,
+    Title,
+    between,
+    html_page,
+    latex,
+    markdown,
+    p_value,
+    terminal_text,
+    write_texts,
+)
+from facediff.reporting.drawing import has_matplotlib
+from facediff.reporting.statistics import Interval
 from facediff.utils.files import atomic
 from facediff.utils.plain_files import write_rows
-from facediff.utils.tables import format_table, html_table, html_text
-from facediff.utils.tables import latex_text as tex
 
-NONE = "–"
 TITLES = {"mve": "MVE", "lve": "LVE", "fdd": "FDD", "fdd_absolute": "FDD, absolute", "fdd_signed": "FDD, signed"}
 BEGIN, END = (
     "<!-- benchmark {name}: begin, written by `facediff benchmark report` -->",
@@ -36,21 +49,15 @@ def write_report(report: BenchmarkReport, folder: Path) -> list[Path]:
     if not report.tables:
         reason = f"; the first problem: {report.failed[0]}" if report.failed else ""
         raise FaceDiffError(f"{report.outline.name}: no cell has a result yet{reason}; run `facediff benchmark` first")
-    name = report.outline.name
-    files: list[Path] = []
-    for suffix, content in ((".md", markdown(report)), (".tex", latex(report)), (".html", page(report))):
-        path = folder / f"{name}{suffix}"
-        with atomic(path) as temporary:
-            temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
-        files.append(path)
+    name, drawings = report.outline.name, plots(report)
+    texts = {
+        f"{name}.md": markdown(document(report)),
+        f"{name}.tex": latex_tables(report),
+        f"{name}.html": html_page(report.outline.title, document(report, drawings)),
+    }
+    files = write_texts(folder, texts | {f"{name}_{plot}.svg": drawing.svg for plot, drawing in drawings.items()})
     write_rows(folder / f"{name}.csv", csv_rows(report))
-    files.append(folder / f"{name}.csv")
-    for place, panel in panels(report).items():
-        path = folder / f"{name}_{place}.svg"
-        with atomic(path) as temporary:
-            temporary.write_text(panel.svg, encoding="utf-8", errors="backslashreplace")
-        files.append(path)
-    return files
+    return [*files, folder / f"{name}.csv"]
 
 
 # Numbers.
@@ -78,7 +85,7 @@ class Scale:
         """An interval in brackets."""
         if interval is None:
             return NONE
-        return f"[{self.number(interval.low, digits, sign)}, {self.number(interval.high, digits, sign)}]"
+        return between(interval.low, interval.high, lambda end: self.number(end, digits, sign))
 
 
 def scales(table: Table) -> dict[str, Scale]:
@@ -128,93 +135,84 @@ def mean_and_deviation(row: TableRow, column: str, scale: Scale) -> str:
     return f"{scale.number(scores.mean)}{deviation}"
 
 
-def runs_of(row: TableRow) -> str:
-    """How many training runs."""
-    return NONE if not row.seeds else str(len(row.seeds))
+# The blocks of a report.
 
 
-def p_value(value: float | None) -> str:
-    """A p-value."""
-    return NONE if value is None else "<0.001" if value < 0.001 else f"{value:.3f}"
-
-
-# Markdown.
-
-
-def markdown(report: BenchmarkReport) -> str:
-    """The whole report."""
+def document(report: BenchmarkReport, drawings: Mapping[str, Drawing] | None = None) -> list[Block]:
+    """The whole report, with plots of :func:`plots` below the table that they belong to."""
     outline = report.outline
-    lines = [f"# {cell(outline.title)}", "", *([cell(outline.description), ""] if outline.description else [])]
-    return "\n".join([*lines, *markdown_body(report), ""])
+    return [
+        Title(outline.title),
+        *([Paragraph(outline.description)] if outline.description else []),
+        *body(report, drawings or {}),
+    ]
 
 
-def markdown_body(report: BenchmarkReport) -> list[str]:
+def body(report: BenchmarkReport, drawings: Mapping[str, Drawing]) -> list[Block]:
     """The report without its title."""
-    lines: list[str] = []
+    blocks: list[Block] = []
     if any(table.synthetic for table in report.tables):
-        lines += ["**Synthetic data**: what follows says nothing about real people.", ""]
-    for table in report.tables:
-        lines += [f"## {cell(table.title)}", "", *markdown_table(table, report), ""]
-    lines += ["## What the numbers are", "", *[f"- {cell(line)}" for line in about(report)], ""]
-    definitions = [line.strip() for line in report.definition.splitlines() if line.strip()]
-    lines += [f"- {cell(line)}" for line in definitions]
-    return lines
-
-
-def cell(text: object) -> str:
-    """Text that Markdown shows as it is; what stands between backticks is code, in which only bars are special."""
-    parts = printable(text).split("`")
-    if len(parts) % 2 == 0:
-        parts = ["`".join(parts)]
-    for place in range(0, len(parts), 2):
-        parts[place] = re.sub(r"([|<>*_`\[\]])", r"\\\1", parts[place])
-    for place in range(1, len(parts), 2):
-        parts[place] = parts[place].replace("|", "\\|")
-    return "`".join(parts)
-
-
-def markdown_grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table of finished cells."""
-    lines = [f"| {' | '.join(head)} |", f"|{'|'.join(['---'] + ['---:'] * (len(head) - 1))}|"]
-    return [*lines, *(f"| {' | '.join(row)} |" for row in rows)]
-
-
-def markdown_table(table: Table, report: BenchmarkReport) -> list[str]:
-    """Scores, intervals, and comparisons of one table."""
-    scale = scales(table)
-    emphasis = {"best": "**{}**", "second": "<u>{}</u>", "": "{}"}
-    paper = [column for column in table.columns if any(column in each for each in table.published.scores.values())]
-    head = ["", *(head_of(column, scale[column]) + arrow(better) for column, better in table.columns.items())]
-    head += [f"{title_of(column)}, printed" for column in paper] + ["runs", *COSTS]
-    rows = []
-    for row in table.rows:
-        cells = [
-            emphasis[row.marks.get(column, "")].format(mean_and_deviation(row, column, scale[column]))
-            for column in table.columns
+        blocks.append(Paragraph("Synthetic data: what follows says nothing about real people.", warning=True))
+    for place, table in enumerate(report.tables):
+        facts = f"{table.frames} frames, {table.sequences} sentences"
+        regions = [
+            f"{part} {facts_of_part['count']} vertices (hash {facts_of_part['hash']})"
+            for part, facts_of_part in table.regions.items()
+            if isinstance(facts_of_part, dict) and "count" in facts_of_part
         ]
-        cells += [scale[column].number(table.published.scores.get(row.name, {}).get(column)) for column in paper]
-        name = f"*{cell(row.label)}*" if row.reference else cell(row.label)
-        rows.append([name, *cells, runs_of(row), *cost_cells(row)])
-    lines = markdown_grid(head, rows)
-    lines += ["", f"{100 * report.bootstrap.level:.0f} % intervals over sentences (bootstrap):", ""]
+        notes = [f"{facts}; {', '.join(regions)}" if regions else facts, *table.notes]
+        notes += [f"printed figures: {source}" for source in table.published.sources] + list(table.published.reasons)
+        blocks += [Title(table.title, 2), main_table(table, printed=True), *details(table, report), Bullets(notes)]
+        blocks += [drawing for name, drawing in drawings.items() if name.startswith(f"{place}_")]
+    definitions = [line.strip() for line in report.definition.splitlines() if line.strip()]
+    return [*blocks, Title("What the numbers are", 2), Bullets(about(report)), Bullets(definitions)]
+
+
+def main_table(table: Table, *, printed: bool = False, level: float | None = None, caption: str = "") -> ReportTable:
+    """Scores and costs of every row.
+
+    Args:
+        table: of one corpus and split.
+        printed: whether the figures of papers stand next to ours.
+        level: puts a star behind what differs from the baseline at this level; no stars if None.
+        caption: in LaTeX.
+    """
+    scale = scales(table)
+    figures = table.published.scores
+    paper = [column for column in table.columns if any(column in row for row in figures.values())] if printed else []
+    rows: list[list[str]] = []
+    marks: dict[tuple[int, int], str] = {}
+    for place, row in enumerate(table.rows):
+        cells = [mean_and_deviation(row, column, scale[column]) for column in table.columns]
+        if level is not None:
+            starred = [row.significant(column, level) for column in table.columns]
+            cells = [cell + "*" * star for cell, star in zip(cells, starred, strict=True)]
+        cells += [scale[column].number(figures.get(row.name, {}).get(column)) for column in paper]
+        rows.append([row.label, *cells, NONE if not row.seeds else str(len(row.seeds)), *cost_cells(row)])
+        marks |= {(place, number): row.marks.get(column, "") for number, column in enumerate(table.columns, 1)}
+    head = ["", *(head_of(column, scale[column]) + arrow(better) for column, better in table.columns.items())]
+    head += [*(f"{title_of(column)}, printed" for column in paper), "runs", *COSTS]
+    references = frozenset(place for place, row in enumerate(table.rows) if row.reference)
+    return ReportTable(head, rows, marks, references, caption)
+
+
+def details(table: Table, report: BenchmarkReport) -> list[Block]:
+    """Intervals, and comparisons with the baseline."""
+    scale = scales(table)
     intervals = [
-        [cell(row.label), *(scale[column].interval(row.intervals.get(column)) for column in table.columns)]
+        [row.label, *(scale[column].interval(row.intervals.get(column)) for column in table.columns)]
         for row in table.rows
     ]
-    lines += markdown_grid(["", *(head_of(column, scale[column]) for column in table.columns)], intervals)
-    comparisons = comparison_rows(table, report)
-    if comparisons:
-        lines += ["", f"Against {cell(table.row(table.baseline).label)}:", ""]
-        lines += markdown_grid(COMPARISON, [[cell(text) for text in row] for row in comparisons])
-    facts = f"{table.frames} frames, {table.sequences} sentences"
-    regions = [
-        f"{part} {each['count']} vertices (hash {each['hash']})"
-        for part, each in table.regions.items()
-        if isinstance(each, dict) and "count" in each
+    blocks: list[Block] = [
+        Paragraph(f"{100 * report.bootstrap.level:.0f} % intervals over sentences (bootstrap):"),
+        ReportTable(["", *(head_of(column, scale[column]) for column in table.columns)], intervals),
     ]
-    notes = [f"{facts}; {', '.join(regions)}" if regions else facts, *table.notes]
-    notes += [f"printed figures: {source}" for source in table.published.sources] + list(table.published.reasons)
-    return [*lines, "", *(f"- {cell(note)}" for note in notes)]
+    if comparisons := comparison_rows(table, report):
+        blocks += [
+            Paragraph(f"Against {table.row(table.baseline).label}:"),
+            ReportTable(COMPARISON, comparisons),
+        ]
+    return blocks
 
 
 COMPARISON = ("row", "score", "difference", "over sentences", "p", "over runs", "p", "corrected p", "")
@@ -225,17 +223,13 @@ def comparison_rows(table: Table, report: BenchmarkReport) -> list[list[str]]:
     scale = scales(table)
     rows = []
     for row in table.rows:
-        for column, (found, adjusted) in row.differences.items():
+        for column, (difference, adjusted) in row.differences.items():
             own = scale[column]
             star = "*" if row.significant(column, report.bootstrap.level) else ""
-            rows.append(
-                [
-                    *(row.label, title_of(column), own.number(found.value, sign="+")),
-                    *(own.interval(found.sentences, sign="+"), p_value(found.p_sentences)),
-                    *(own.interval(found.runs, sign="+"), p_value(found.p_runs)),
-                    *(p_value(adjusted), star),
-                ]
-            )
+            cells = [row.label, title_of(column), own.number(difference.value, sign="+")]
+            cells += [own.interval(difference.sentences, sign="+"), p_value(difference.p_sentences)]
+            cells += [own.interval(difference.runs, sign="+"), p_value(difference.p_runs), p_value(adjusted), star]
+            rows.append(cells)
     return rows
 
 
@@ -257,9 +251,9 @@ def about(report: BenchmarkReport) -> list[str]:
     ]
     factors = [row.cost.factor for table in report.tables for row in table.rows if row.cost.factor is not None]
     machines = {
-        f"{each.machine.get('gpu') or each.machine.get('processor')}, {each.machine.get('threads')} thread(s)"
-        for each in report.results
-        if each.machine.get("processor") and not each.problem
+        f"{result.machine.get('gpu') or result.machine.get('processor')}, {result.machine.get('threads')} thread(s)"
+        for result in report.results
+        if result.machine.get("processor") and not result.problem
     }
     if factors:
         lines.append(
@@ -267,13 +261,28 @@ def about(report: BenchmarkReport) -> list[str]:
             f"training and test; on {'; '.join(sorted(machines))}"
         )
     lines += report.remarks
+    if not has_matplotlib():
+        lines.append("plots are left out: matplotlib is not installed; `pip install 'facediff[figures]'`, write again")
     lines += [f"no result yet: {name}" for name in report.missing]
     lines += [f"failed: {problem}" for problem in report.failed]
-    codes = sorted({" ".join(each.code.values()) for each in report.results if each.code})
+    codes = sorted({" ".join(result.code.values()) for result in report.results if result.code})
     lines.append(
         f"facediff {', '.join(codes)}" + (f"; made by `{report.outline.command}`" if report.outline.command else "")
     )
     return lines
+
+
+def latex_tables(report: BenchmarkReport) -> str:
+    """Tables for a paper."""
+    outline = report.outline
+    return latex(
+        main_table(
+            table,
+            caption=f"{outline.title}: {table.title}. Protocol {outline.protocol}; mean ± standard deviation over "
+            f"training runs; {table.sequences} sentences, {table.frames} frames.",
+        )
+        for table in report.tables
+    )
 
 
 def replace_block(path: Path, report: BenchmarkReport) -> None:
@@ -290,51 +299,11 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
             f"{path}: has no place for {name}; write the two lines  {begin}  and  {end}  where it shall be"
         )
     # Headings of the page stand above those of the tables.
-    body = "\n".join(f"#{line}" if line.startswith("#") else line for line in markdown_body(report))
-    text = f"{text[: text.index(begin)]}{begin}\n\n{body}\n\n{text[text.index(end) :]}"
+    blocks = body(report, {})
+    lowered = [replace(block, level=block.level + 1) if isinstance(block, Title) else block for block in blocks]
+    text = f"{text[: text.index(begin)]}{begin}\n\n{markdown(lowered)}\n{text[text.index(end) :]}"
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-# LaTeX.
-
-
-def latex(report: BenchmarkReport) -> str:
-    """Tables for a paper, with the package booktabs."""
-    lines = ["% \\usepackage{booktabs}"]
-    for table in report.tables:
-        lines += latex_table(table, report)
-    return "\n".join([*lines, ""])
-
-
-def latex_table(table: Table, report: BenchmarkReport) -> list[str]:
-    """One table."""
-    scale = scales(table)
-    emphasis = {"best": r"\textbf{%s}", "second": r"\underline{%s}", "": "%s"}
-    head = []
-    for column, better in table.columns.items():
-        power = f" $/10^{{{scale[column].exponent}}}$" if scale[column].exponent else ""
-        head.append(f"{tex(title_of(column))}{power}{tex(arrow(better))}")
-    lines = [
-        *(r"\begin{table}", r"\centering"),
-        rf"\caption{{{tex(report.outline.title)}: {tex(table.title)}. Protocol {tex(report.outline.protocol)}; "
-        rf"mean $\pm$ standard deviation over training runs; {table.sequences} sentences, {table.frames} frames.}}",
-        rf"\begin{{tabular}}{{l{'r' * (len(head) + 1 + len(COSTS))}}}",
-        r"\toprule",
-        " & ".join(["", *head, "runs", *COSTS]) + r" \\",
-        r"\midrule",
-    ]
-    references = False
-    for row in table.rows:
-        if row.reference and not references:
-            lines.append(r"\midrule")
-            references = True
-        cells = [
-            emphasis[row.marks.get(column, "")] % tex(mean_and_deviation(row, column, scale[column]))
-            for column in table.columns
-        ]
-        lines.append(" & ".join([tex(row.label), *cells, *map(tex, [runs_of(row), *cost_cells(row)])]) + r" \\")
-    return [*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""]
 
 
 # CSV.
@@ -349,33 +318,25 @@ def csv_rows(report: BenchmarkReport) -> list[dict[str, Any]]:
 
 
 def _csv_rows(table: Table, report: BenchmarkReport) -> Iterator[dict[str, Any]]:
+    def ends(name: str, interval: Interval | None) -> dict[str, float | None]:
+        low, high = (None, None) if interval is None else (interval.low, interval.high)
+        return {f"{name}_low": low, f"{name}_high": high}
+
     for row in table.rows:
         for column, scores in row.scores.items():
-            interval = row.intervals.get(column)
-            found, adjusted = row.differences.get(column, (NOTHING, None))
-
-            def ends(name: str, value: Interval | None) -> dict[str, float | None]:
-                return (
-                    {f"{name}_low": None, f"{name}_high": None}
-                    if value is None
-                    else {
-                        f"{name}_low": value.low,
-                        f"{name}_high": value.high,
-                    }
-                )
-
+            difference, adjusted = row.differences.get(column, (NOTHING, None))
             yield {
                 **{"corpus": table.corpus, "split": table.split, "row": row.name, "label": row.label},
                 **{"score": column, "protocol": report.outline.protocol, "mean": scores.mean},
                 **{"deviation_over_runs": scores.deviation, "runs": len(row.seeds)},
                 "seeds": " ".join(str(seed) for seed in row.seeds if seed is not None),
-                **ends("sentences", interval),
+                **ends("sentences", row.intervals.get(column)),
                 "mark": row.marks.get(column, ""),
-                "difference": None if found is NOTHING else found.value,
-                **ends("difference_sentences", found.sentences),
-                "p_sentences": found.p_sentences,
-                **ends("difference_runs", found.runs),
-                "p_runs": found.p_runs,
+                "difference": None if difference is NOTHING else difference.value,
+                **ends("difference_sentences", difference.sentences),
+                "p_sentences": difference.p_sentences,
+                **ends("difference_runs", difference.runs),
+                "p_runs": difference.p_runs,
                 "p_corrected": adjusted,
                 "printed": table.published.scores.get(row.name, {}).get(column),
                 **{"frames": table.frames, "sentences": row.clips, "parameters": row.cost.parameters},
@@ -384,117 +345,24 @@ def _csv_rows(table: Table, report: BenchmarkReport) -> Iterator[dict[str, Any]]
             }
 
 
-# HTML.
-
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #1a1a1a; }
-table { border-collapse: collapse; margin: 0.6rem 0 1.2rem; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.2rem 0.7rem; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; white-space: normal; }
-thead th { border-top: 2px solid; border-bottom: 1px solid; } tbody tr:last-child td { border-bottom: 2px solid; }
-.best { font-weight: bold; } .second { text-decoration: underline; } .reference { font-style: italic; color: #444; }
-.scroll { overflow-x: auto; } figure { display: inline-block; margin: 0 1rem 1rem 0; } figcaption { font-size: 13px; }
-.warning { border: 1px solid #b55; padding: 0.4rem 0.8rem; display: inline-block; }
-@media (prefers-color-scheme: dark) { body { background: #16181c; color: #e6e6e6; } .reference { color: #bbb; }
-  svg { background: #fff; } }
-"""
-
-
-def page(report: BenchmarkReport) -> str:
-    """The report as one file that needs no network."""
-    outline, e = report.outline, html_text
-    parts = [f"<h1>{e(outline.title)}</h1>"]
-    parts += [f"<p>{e(outline.description)}</p>"] if outline.description else []
-    if any(table.synthetic for table in report.tables):
-        parts.append('<p class="warning">Synthetic data: what follows says nothing about real people.</p>')
-    drawn = panels(report)
-    for place, table in enumerate(report.tables):
-        parts += [f"<h2>{e(table.title)}</h2>", *_html_table(table, report)]
-        own = [panel for name, panel in drawn.items() if name.startswith(f"{place}_")]
-        parts += [f"<figure>{panel.svg}<figcaption>{e(panel.caption)}</figcaption></figure>" for panel in own]
-    parts += ["<h2>What the numbers are</h2><ul>", *(f"<li>{e(line)}</li>" for line in about(report)), "</ul>"]
-    parts.append(f"<pre>{e(report.definition)}</pre>")
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{e(outline.title)}</title>'
-    body = "\n".join(parts)
-    return (
-        f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n'
-    )
-
-
-def _html_table(table: Table, report: BenchmarkReport) -> Iterator[str]:
-    scale = scales(table)
-    paper = [column for column in table.columns if any(column in each for each in table.published.scores.values())]
-    head = ["", *(head_of(column, scale[column]) + arrow(better) for column, better in table.columns.items())]
-    head += [f"{title_of(column)}, printed" for column in paper] + ["runs", *COSTS]
-    rows: list[list[str]] = []
-    marks: dict[tuple[int, int], str] = {}
-    for place, row in enumerate(table.rows):
-        printed = table.published.scores.get(row.name, {})
-        cells = [mean_and_deviation(row, column, scale[column]) for column in table.columns]
-        cells += [scale[column].number(printed.get(column)) for column in paper]
-        rows.append([row.label, *cells, runs_of(row), *cost_cells(row)])
-        marks |= {(place, number): row.marks.get(column, "") for number, column in enumerate(table.columns, 1)}
-    yield html_table(head, rows, kinds=["reference" if row.reference else "" for row in table.rows], marks=marks)
-    yield f"<p>{100 * report.bootstrap.level:.0f} % intervals over sentences (bootstrap)</p>"
-    intervals = [
-        [row.label, *(scale[column].interval(row.intervals.get(column)) for column in table.columns)]
-        for row in table.rows
-    ]
-    yield html_table(["", *(head_of(column, scale[column]) for column in table.columns)], intervals)
-    comparisons = comparison_rows(table, report)
-    if comparisons:
-        yield f"<p>Against {html_text(table.row(table.baseline).label)}</p>"
-        yield html_table(COMPARISON, comparisons)
-    notes = [f"{table.frames} frames, {table.sequences} sentences", *table.notes]
-    notes += [f"printed figures: {source}" for source in table.published.sources] + list(table.published.reasons)
-    yield f"<ul>{''.join(f'<li>{html_text(note)}</li>' for note in notes)}</ul>"
-
-
-def panels(report: BenchmarkReport) -> dict[str, Panel]:
-    """The plots of all tables: error over steps and over time, sentence by sentence, and error over speed."""
-    found: dict[str, Panel | None] = {}
-    makers: tuple[tuple[str, Callable[[Table, BenchmarkReport], Panel | None]], ...] = (
-        ("steps", lambda table, report: curves_plot(table, report, "step")),
-        ("time", lambda table, report: curves_plot(table, report, "seconds")),
-        ("sentences", scatter_plot),
-        ("speed", speed_plot),
-    )
-    for place, table in enumerate(report.tables):
-        for name, make in makers:
-            found[f"{place}_{table.corpus}_{table.split}_{name}"] = make(table, report)
-    return {name: panel for name, panel in found.items() if panel is not None}
-
-
-# The terminal.
+def plots(report: BenchmarkReport) -> dict[str, Drawing]:
+    """The plots of all tables by number of the table, corpus, split and name; none without matplotlib."""
+    if not has_matplotlib():
+        return {}
+    return {
+        f"{place}_{table.corpus}_{table.split}_{name}": drawing
+        for place, table in enumerate(report.tables)
+        for name, drawing in plots_of(table, report).items()
+    }
 
 
 def text(report: BenchmarkReport) -> str:
     """The main tables for the terminal."""
-    lines: list[str] = []
-    signs = {"best": " (best)", "second": " (second)", "": ""}
+    blocks: list[Block] = []
     for table in report.tables:
-        scale = scales(table)
         kind = "SYNTHETIC corpus " if table.synthetic else ""
-        head = ["", *(head_of(column, scale[column]) for column in table.columns), "runs", *COSTS]
-        rows = [
-            [
-                row.label,
-                *(
-                    mean_and_deviation(row, column, scale[column])
-                    + signs[row.marks.get(column, "")]
-                    + ("*" if row.significant(column, report.bootstrap.level) else "")
-                    for column in table.columns
-                ),
-                runs_of(row),
-                *cost_cells(row),
-            ]
-            for row in table.rows
-        ]
-        lines += [
-            "",
-            f"{kind}{table.title}: {table.sequences} sentences, {table.frames} frames",
-            format_table(head, rows),
-        ]
-        lines += [f"note: {note}" for note in (*table.notes, *table.published.reasons)]
-    lines += ["", *about(report)]
-    return "\n".join(printable(line) if "\n" not in line else line for line in lines)
+        blocks.append(Title(f"{kind}{table.title}: {table.sequences} sentences, {table.frames} frames"))
+        blocks.append(main_table(table, level=report.bootstrap.level))
+        notes = [f"note: {note}" for note in (*table.notes, *table.published.reasons)]
+        blocks += [Bullets(notes)] if notes else []
+    return "\n" + terminal_text([*blocks, Bullets(about(report))])

@@ -117,7 +117,8 @@ class PageOptions:
     def paper(self) -> Paper:
         """The page, after a check that the figure can be written."""
         from facediff.evaluation.figures import Paper
-        from facediff.evaluation.figures.page import check_output, matplotlib
+        from facediff.evaluation.figures.page import check_output
+        from facediff.reporting.drawing import matplotlib
 
         matplotlib()
         check_output(self.output)

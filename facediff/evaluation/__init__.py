@@ -2,7 +2,8 @@
 
 from facediff.evaluation.evaluator import evaluate
 from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region
-from facediff.evaluation.report import Comparison, EvaluationReport, Interval, MethodResult, Score, SequenceScores, text
+from facediff.evaluation.report import Comparison, EvaluationReport, MethodResult, Score, SequenceScores, text
+from facediff.reporting.statistics import Interval
 
 __all__ = [
     "DEFAULT_PATTERNS",

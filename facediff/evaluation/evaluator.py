@@ -25,10 +25,11 @@ from facediff.evaluation.files import (
     read_pairs,
 )
 from facediff.evaluation.groups import attributes_of
-from facediff.evaluation.report import Bootstrap, EvaluationReport, MethodTable, runs_of
+from facediff.evaluation.report import EvaluationReport, MethodTable, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
+from facediff.reporting.statistics import Bootstrap
 from facediff.speech.audio import SAMPLE_RATE, read_speech
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges

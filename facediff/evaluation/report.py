@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, printable
 from facediff.evaluation.files import Missing, Pair
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
-from facediff.utils import ranges
+from facediff.reporting.statistics import Array, Bootstrap, Interval, pooled
 from facediff.utils.provenance import Provenance, read_provenance
 from facediff.utils.tables import format_table
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A bootstrap confidence interval over sequences."""
-
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -179,77 +170,6 @@ class EvaluationReport:
     def rows(self) -> list[dict[str, Any]]:
         """One flat row for each sequence and method."""
         return [sequence.row() for method in self.methods for sequence in method.sequences]
-
-
-# From the values of sequences to a score, and how sure it is.
-
-Array = npt.NDArray[np.float64]
-
-BLOCK = 2**20  # Counts that are held at a time while resampling: memory does not grow with the number of resamples
-
-
-def pooled(values: Array, weights: Array) -> Array:
-    """Scores (columns,) of values (sequences, columns): Σ w v / Σ w, NaN where no sequence has a value.
-
-    The weights are frames where all frames count alike, 1 where all sequences do, and 0 where there is no value.
-    """
-    with np.errstate(invalid="ignore"):
-        return np.asarray((values * weights).sum(0) / weights.sum(0))
-
-
-def draws(sequences: int, resamples: int, seed: int) -> Iterator[Array]:
-    """How often each sequence is in each resample, drawn with replacement: (resamples of a block, sequences)."""
-    random = np.random.default_rng(seed)
-    step = max(1, BLOCK // sequences)
-    shares = np.full(sequences, 1 / sequences)
-    for start in range(0, resamples, step):
-        yield random.multinomial(sequences, shares, min(step, resamples - start)).astype(np.float64)
-
-
-@dataclass(frozen=True)
-class Bootstrap:
-    """Confidence intervals by resampling sequences (Efron's percentile interval).
-
-    Args:
-        resamples: how many; 0 for no intervals.
-        level: share of the resamples inside an interval.
-        seed: of the random numbers; equal seeds and numbers of sequences give the same resamples.
-
-    Raises:
-        FaceDiffError: if a number is out of range.
-    """
-
-    resamples: ranges.Resamples = 1000
-    level: ranges.Level = 0.95
-    seed: ranges.Seed = 0
-
-    def __post_init__(self) -> None:
-        ranges.check_fields(self)
-
-    def scores(self, values: Array, weights: Array) -> Array | None:
-        """The score of every resample: a ratio of sums, so that a sequence keeps the weight of its frames.
-
-        From values and weights (sequences, columns) to (resamples, columns); None without resamples, or with a single
-        sequence, of which they would tell nothing.
-        """
-        if not self.resamples or len(values) < 2:
-            return None
-        weighted = values * weights
-        # einsum and not a matrix product: its digits do not depend on threads or on the processor's library.
-        with np.errstate(invalid="ignore"):  # resamples without any sequence that has a value are not used
-            blocks = [
-                np.einsum("rs,sc->rc", counts, weighted) / np.einsum("rs,sc->rc", counts, weights)
-                for counts in draws(len(values), self.resamples, self.seed)
-            ]
-        return np.concatenate(blocks)
-
-    def intervals(self, scores: Array | None, columns: int) -> list[Interval | None]:
-        """The middle of the scores of the resamples (resamples, columns), for each column."""
-        if scores is None:
-            return [None] * columns
-        places = [(1 - self.level) / 2, (1 + self.level) / 2]
-        valued = [column[~np.isnan(column)] for column in scores.T]
-        return [Interval(*np.quantile(column, places).tolist()) if len(column) else None for column in valued]
 
 
 # The values of all clips of a method, and what becomes of them.

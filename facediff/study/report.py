@@ -12,21 +12,13 @@ from typing import Any, Literal
 import numpy as np
 
 from facediff.errors import FaceDiffError
+from facediff.reporting.statistics import binomial_interval, binomial_p, holm, share_between_raters, wilson_interval
 from facediff.study.answers import Rater, merge, read_answers
 from facediff.study.definition import DATABASE, LEFT, RIGHT, SAME, Study, Trial, read_study
 from facediff.study.design import TRUTH
-from facediff.study.statistics import (
-    alpha_interval,
-    binomial_interval,
-    binomial_p,
-    bradley_terry,
-    krippendorff_alpha,
-    share_between_raters,
-    wilson_interval,
-)
+from facediff.study.statistics import alpha_interval, bradley_terry, krippendorff_alpha
 from facediff.study.store import AnswerStore
 from facediff.utils import ranges
-from facediff.utils.statistics import holm
 
 Interval = Literal["wilson", "binomial"]
 

@@ -1,4 +1,4 @@
-"""The numbers of a report: intervals of shares, Bradley-Terry scores, agreement, and how many raters a study needs.
+"""Bradley-Terry scores, agreement between raters, and how many raters a study needs.
 
 Each follows one formula of the literature, named in its docstring; none knows anything of studies.
 """
@@ -13,98 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.reporting.statistics import Array
 from facediff.utils import ranges
-
-Array = npt.NDArray[np.float64]
 
 STEPS, PRECISE = 200, 1e-10
 FEW_RATERS = 10
 """With fewer raters, the variance between them is too uncertain to be used in place of the model's."""
-
-
-def wilson_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's (1927) score interval of a share.
-
-    Args:
-        wins: how often it happened; half for no difference.
-        count: out of how many.
-        level: of the interval.
-
-    Returns:
-        lower and upper end; 0 and 1 if nothing was counted.
-
-    Example:
-        >>> [round(end, 4) for end in wilson_interval(89, 120)]
-        [0.6567, 0.8116]
-    """
-    if not count:
-        return 0.0, 1.0
-    from scipy.stats import norm
-
-    z = float(norm.ppf((1 + level) / 2))
-    share = wins / count
-    middle = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    # Without a win, the lower end is 0, which rounding may miss.
-    return (0.0 if wins <= 0 else middle - half), (1.0 if wins >= count else middle + half)
-
-
-def binomial_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
-    """The exact binomial interval of Clopper and Pearson (1934), which never covers less than its level.
-
-    The arguments are those of :func:`wilson_interval`; half wins, of no difference, are taken as they are.
-
-    Example:
-        >>> [round(end, 4) for end in binomial_interval(89, 120)]
-        [0.6538, 0.8172]
-    """
-    if not count:
-        return 0.0, 1.0
-    from scipy.stats import beta
-
-    tail = (1 - level) / 2
-    lower = 0.0 if wins <= 0 else float(beta.ppf(tail, wins, count - wins + 1))
-    upper = 1.0 if wins >= count else float(beta.ppf(1 - tail, wins + 1, count - wins))
-    return lower, upper
-
-
-def binomial_p(wins: int, count: int) -> float:
-    """Two-sided p value of the exact binomial test of a share against one half; 1 if nothing was counted.
-
-    Example:
-        >>> round(binomial_p(15, 20), 6)
-        0.041389
-    """
-    if not count:
-        return 1.0
-    from scipy.stats import binomtest
-
-    return float(binomtest(wins, count, 0.5).pvalue)
-
-
-def share_between_raters(
-    wins: Array, counts: Array, level: float = 0.95, *, resamples: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile interval of a share over raters that are drawn again with replacement.
-
-    Answers of one rater are alike, which intervals of single answers do not know; this one takes raters as they come.
-
-    Args:
-        wins: of each rater (R,).
-        counts: answers of each rater (R,).
-        level: of the interval.
-        resamples: how often raters are drawn.
-        seed: of the draws.
-    """
-    if not counts.sum():
-        return 0.0, 1.0
-    if len(counts) < 2 or not resamples:
-        return math.nan, math.nan
-    drawn = np.random.default_rng(seed).multinomial(len(counts), np.full(len(counts), 1 / len(counts)), resamples)
-    totals = drawn @ counts
-    shares = (drawn @ wins)[totals > 0] / totals[totals > 0]
-    lower, upper = np.quantile(shares, [(1 - level) / 2, (1 + level) / 2])
-    return float(lower), float(upper)
 
 
 @dataclass(frozen=True)
@@ -233,11 +147,6 @@ def alpha_interval(
         return math.nan, math.nan
     lower, upper = np.quantile(alphas, [(1 - level) / 2, (1 + level) / 2])
     return float(lower), float(upper)
-
-
-def power_of(count: int, share: float, level: float = 0.95) -> float:
-    """The chance that an exact two-sided binomial test against one half notices a share, in ``count`` answers."""
-    return float(_powers(np.array([count]), share, level)[0])
 
 
 def _powers(counts: npt.NDArray[np.int64], share: float, level: float) -> Array:

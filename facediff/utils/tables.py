@@ -1,10 +1,9 @@
-"""Tables for the terminal, for pipes, and for documents."""
+"""Tables for the terminal and for pipes; :mod:`facediff.reporting` has those of documents."""
 
 from __future__ import annotations
 
-import html
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TextIO
 
 from facediff.errors import printable
@@ -55,115 +54,3 @@ def print_table(
     for row in cells:
         table.add_row(*row)
     console.print(table)
-
-
-# The same as text for documents. Cells are text; None becomes –.
-
-_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_LATEX |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
-_LATEX |= {letter: f"${letter}$" for letter in "<>|"}  # which the usual fonts of text do not have
-_LATEX |= {
-    "±": r"$\pm$",
-    "−": "$-$",
-    "–": "--",
-    "α": r"$\alpha$",
-    "↑": r"$\uparrow$",
-    "↓": r"$\downarrow$",
-    "→": r"$\to$",
-}
-
-
-def latex_text(text: object) -> str:
-    r"""Text that LaTeX shows as it is.
-
-    Example:
-        >>> latex_text("50 % of a_b < 1")
-        '50 \\% of a\\_b $<$ 1'
-    """
-    return "".join(_LATEX.get(letter, letter) for letter in printable(text))
-
-
-def latex_table(head: Sequence[str], rows: Iterable[Sequence[object]], *, caption: str = "") -> str:
-    """A table for a paper, with the package booktabs; the first column is aligned to the left.
-
-    Args:
-        head: titles of the columns.
-        rows: cells.
-        caption: below the table; none if empty.
-    """
-    lines = [r"\begin{table}", r"\centering", rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}", r"\toprule"]
-    lines += [" & ".join(map(latex_text, head)) + r" \\", r"\midrule"]
-    lines += [" & ".join(latex_text(_cell(cell)) for cell in row) + r" \\" for row in rows]
-    lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += [rf"\caption{{{latex_text(caption)}}}"] if caption else []
-    return "\n".join([*lines, r"\end{table}"])
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    r"""A table in Markdown.
-
-    Example:
-        >>> print(markdown_table(["", "share"], [["a|b", 0.5]]))
-        |  | share |
-        |---|---:|
-        | a\|b | 0.5 |
-    """
-    lines = [list(head), *([_cell(cell) for cell in row] for row in rows)]
-    shown = ["| " + " | ".join(_markdown(cell) for cell in line) + " |" for line in lines]
-    return "\n".join([shown[0], f"|---|{'---:|' * (len(head) - 1)}", *shown[1:]])
-
-
-def html_text(text: object) -> str:
-    """Text that a page shows as it is; its lines stay lines.
-
-    Example:
-        >>> html_text("a < b")
-        'a &lt; b'
-    """
-    return "\n".join(html.escape(printable(line)) for line in str(text).split("\n"))
-
-
-def html_table(
-    head: Sequence[str],
-    rows: Iterable[Sequence[object]],
-    *,
-    kinds: Sequence[str] = (),
-    marks: Mapping[tuple[int, int], str] | None = None,
-) -> str:
-    """A table for a page.
-
-    Args:
-        head: titles of the columns.
-        rows: cells.
-        kinds: CSS class of each row; none where it is empty.
-        marks: CSS class of single cells, by row and column.
-
-    Example:
-        >>> print(html_table(["", "LVE"], [["ours", 1.5]], marks={(0, 1): "best"}))
-        <div class="scroll"><table><thead><tr><th scope="col"></th><th scope="col">LVE</th></tr></thead><tbody>
-        <tr><td>ours</td><td class="best">1.5</td></tr>
-        </tbody></table></div>
-    """
-
-    def opened(name: str, kind: str) -> str:
-        return f'<{name} class="{html.escape(kind)}">' if kind else f"<{name}>"
-
-    titles = "".join(f'<th scope="col">{html_text(text)}</th>' for text in head)
-    lines = []
-    for place, row in enumerate(rows):
-        cells = (
-            f"{opened('td', (marks or {}).get((place, column), ''))}{html_text(_cell(cell))}</td>"
-            for column, cell in enumerate(row)
-        )
-        lines.append(f"{opened('tr', kinds[place] if place < len(kinds) else '')}{''.join(cells)}</tr>")
-    body = "\n".join(lines)
-    return f'<div class="scroll"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
-
-
-def _cell(cell: object) -> str:
-    return "–" if cell is None else str(cell)
-
-
-def _markdown(text: str) -> str:
-    special = "\\`*_{}[]<>|#"
-    return "".join(f"\\{letter}" if letter in special else letter for letter in printable(text))

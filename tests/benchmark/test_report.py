@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import re
 from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,9 +17,10 @@ from facediff.benchmark import report_of
 from facediff.benchmark.outline import read_outline, read_results, write_outline
 from facediff.benchmark.published import published, shown_tables
 from facediff.benchmark.tables import BenchmarkReport
-from facediff.benchmark.writing import BEGIN, END, cell, latex, markdown, page, replace_block, text, write_report
+from facediff.benchmark.writing import BEGIN, END, document, latex_tables, plots, replace_block, text, write_report
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
+from facediff.reporting.documents import html_page, markdown
 from tests.fakes.benchmark import outline, results
 
 BIWI: dict[str, Any] = {
@@ -55,7 +57,7 @@ def test_means_and_deviations_are_over_seeds_and_intervals_over_sentences() -> N
 
 def test_the_order_of_cells_changes_nothing() -> None:
     found = results(effects=(0.0, 0.6, 1.2))
-    assert markdown(report_of(outline(), found, resamples=50)) == markdown(
+    assert document(report_of(outline(), found, resamples=50)) == document(
         report_of(outline(), sorted(found, key=lambda each: (each.seed, each.row)), resamples=50)
     )
 
@@ -83,9 +85,9 @@ def test_all_forms_are_written_and_hold_the_same_numbers(tmp_path: Path) -> None
     (row,) = [each for each in rows if (each["row"], each["score"]) == ("method_0", "lve")]
     assert float(row["mean"]) == mean
     assert row["mark"] == "best"
-    for form in (markdown(report), latex(report), page(report), text(report)):
+    for form in (markdown(document(report)), latex_tables(report), html_page("", document(report)), text(report)):
         assert f"{mean:.4f}" in form
-    tex = latex(report)
+    tex = latex_tables(report)
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
     assert all(f"\\{rule}rule" in tex for rule in ("top", "mid", "bottom"))
     assert rf"\textbf{{{mean:.4f}" in tex
@@ -101,12 +103,12 @@ def test_the_page_needs_no_network_and_shows_hostile_names_as_they_are() -> None
             assert tag != "script"
             assert not any(name in ("src", "href") or name.startswith("on") for name, _ in attrs)
 
-    whole = page(report)
+    whole = html_page(evil, document(report, plots(report)))
     Tags().feed(whole)
-    assert "http" not in whole.replace("http://www.w3.org/2000/svg", "")
-    assert r"\textbackslash{}input\{x\}" in latex(report)
-    assert "\\<script\\>" in markdown(report)
-    assert "\\|" in markdown(report)
+    assert not re.search("https?:", re.sub(r"http://www\.w3\.org/(2000/svg|1999/xlink)", "", whole))
+    assert r"\textbackslash{}input\{x\}" in latex_tables(report)
+    assert "\\<script\\>" in markdown(document(report))
+    assert "\\|" in markdown(document(report))
 
 
 def test_the_block_of_a_page_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
@@ -169,6 +171,8 @@ def test_the_command_writes_a_report_from_results_alone(tmp_path: Path, capsys: 
     assert str(tmp_path / "none") in capsys.readouterr().err
 
 
-def test_code_in_notes_stays_code() -> None:
-    assert cell("made by `a_b|c` and x_y") == "made by `a_b\\|c` and x\\_y"
-    assert cell("an odd ` and_") == "an odd \\` and\\_"
+def test_without_matplotlib_the_report_says_so_and_has_no_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facediff.benchmark.writing.has_matplotlib", lambda: False)
+    report = made()
+    assert {path.suffix for path in write_report(report, tmp_path)} == {".md", ".tex", ".html", ".csv"}
+    assert "matplotlib" in (tmp_path / "made.md").read_text()

@@ -18,7 +18,7 @@ from facediff.benchmark import Cell, cells_of, read_plan, read_result, report_of
 from facediff.benchmark.outline import outline_of, read_results
 from facediff.benchmark.results import cell_file
 from facediff.benchmark.running import Setting, estimate, fit_options, pending, remember, run_cells
-from facediff.benchmark.writing import markdown
+from facediff.benchmark.writing import document
 from facediff.cli.benchmark import corpus_folders
 from facediff.errors import FaceDiffError
 
@@ -66,7 +66,7 @@ def report(folder: Path) -> str:
     plan = read_plan(folder / "plan.yaml")
     outline = outline_of(plan, cells_of(plan), "")
     results, missing = read_results(folder / "out", outline)
-    text = markdown(report_of(outline, results, missing, resamples=50))
+    text = document(report_of(outline, results, missing, resamples=50))
     measured = ("training", "memory", "RTF", "facediff ")  # columns and lines that a clock decides
     lines = [line for line in text.splitlines() if not any(word in line for word in measured)]
     return "\n".join(line.rpartition("| 2 |")[0] or line for line in lines)

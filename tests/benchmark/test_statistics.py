@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from facediff.benchmark.statistics import RowScores, compared, difference, marked, sign_flip, welch
-from facediff.evaluation.report import Bootstrap
-from facediff.utils.statistics import holm
+from facediff.benchmark.statistics import RowScores, compared, difference, marked, welch
+from facediff.reporting.statistics import Bootstrap, holm, sign_flip
 
 BOOTSTRAP = Bootstrap(2000, 0.95, 0)
 

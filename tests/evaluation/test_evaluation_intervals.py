@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.evaluation.report import BLOCK, Bootstrap, draws, pooled
 from facediff.metrics import PROTOCOLS
+from facediff.reporting.statistics import BLOCK, Bootstrap, draws, pooled
 from tests.evaluation.conftest import LENGTHS, Files, scores_of
 
 

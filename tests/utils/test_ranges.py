@@ -12,8 +12,8 @@ from facediff.animation.options import AnimationControls, AnimationOptions
 from facediff.editing.blendshapes import SolveOptions
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import Paper
-from facediff.evaluation.report import Bootstrap
 from facediff.export import ExportOptions
+from facediff.reporting.statistics import Bootstrap
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, check_fields, checked, mismatch
 

@@ -34,9 +34,9 @@ from facediff.live.frames import Performance, open_receivers
 from facediff.live.loop import Loop
 from facediff.live.model import LiveModel
 from facediff.live.sources import Pcm
+from facediff.reporting.documents import markdown_table
 from facediff.speech.audio import read_speech
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.tables import markdown_table
 
 RATE = 30.0
 PIECE = SAMPLE_RATE // 100

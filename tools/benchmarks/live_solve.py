@@ -22,8 +22,8 @@ from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, solve
 from facediff.editing.live_weights import FrameSolver
 from facediff.editing.shapes import ARKIT, ShapeSet
+from facediff.reporting.documents import markdown_table
 from facediff.synthetic.arkit import puppet_shapes
-from facediff.utils.tables import markdown_table
 
 VERTICES, FRAME_RATE = 5_023, 30.0
 NOISE_MM = 0.1

@@ -41,10 +41,10 @@ from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.checkpoint import corpus_class
 from facediff.models.inference import Style
 from facediff.pipelines.export_model import export_model
+from facediff.reporting.documents import markdown_table
 from facediff.runtime import RuntimeModel
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.speech.windows import LOW_LATENCY, WindowPlan
-from facediff.utils.tables import markdown_table
 
 Array = npt.NDArray[np.float32]
 PIECE = SAMPLE_RATE // 100

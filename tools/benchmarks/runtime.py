@@ -28,9 +28,9 @@ from sampling_tables import processor
 from facediff.models import AnimationModel, load_model
 from facediff.models.checkpoint import corpus_class
 from facediff.pipelines.export_model import export_model
+from facediff.reporting.documents import markdown_table
 from facediff.runtime import RuntimeModel
 from facediff.speech.audio import SAMPLE_RATE
-from facediff.utils.tables import markdown_table
 
 ROOT = Path(__file__).parents[2]
 PRECISIONS = ("float32", "float16", "int8")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from facediff.utils.tables import markdown_table
+from facediff.reporting.documents import markdown_table
 from tools.browser.chromium import Chromium, Page, find_chromium
 
 ROUNDS = 3

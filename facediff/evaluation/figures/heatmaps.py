@@ -13,18 +13,8 @@ import numpy as np
 from torch import Tensor
 
 from facediff.evaluation.figures.material import FLAT, TRUTH, Array, FigureData, Painter, chunks, shortest
-from facediff.evaluation.figures.page import (
-    GAP,
-    SMALLEST_TEXT,
-    Grid,
-    Heading,
-    Paper,
-    check_output,
-    plain,
-    save,
-    style,
-    wrapped,
-)
+from facediff.evaluation.figures.page import GAP, Grid, Heading, Paper, check_output, save, style, wrapped
+from facediff.reporting.drawing import SMALLEST_TEXT, plain
 from facediff.utils import ranges
 from facediff.utils.jobs import in_order, run_tasks
 

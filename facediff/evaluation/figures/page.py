@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.errors import FaceDiffError, choices
+from facediff.reporting.drawing import FONT, GREY, SMALLEST_TEXT, TEXT, drawing_settings, matplotlib, plain
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -28,24 +27,9 @@ if TYPE_CHECKING:
 SUFFIXES = (".png", ".pdf", ".svg")
 WIDEST = 16_384  # Pixels across: as high, a figure fills a gibibyte
 COLUMN, PAGE = 85.0, 175.0  # Widths in mm of a column and of a page of the usual journals
-SMALLEST_TEXT, TEXT = 7.0, 8.0  # Sizes of letters in points
 POINTS_PER_MM = 72 / 25.4
-FONT = "DejaVu Sans"
-"""The font that comes with matplotlib: it has the letters of the IPA, and is the same on every machine."""
 
-BLACK, GREY, FAINT = "#000000", "#595959", "#BFBFBF"
-
-# Okabe and Ito's colours (2008), without black, which is the truth's, and yellow, which is too faint for lines.
-LINES: tuple[tuple[str, Any], ...] = (
-    ("#0072B2", "-"),
-    ("#D55E00", (0, (5, 1.5))),
-    ("#009E73", (0, (1.2, 1.2))),
-    ("#CC79A7", (0, (5, 1.5, 1.2, 1.5))),
-    ("#E69F00", (0, (3, 1))),
-    ("#56B4E9", (0, (8, 1.5, 1.2, 1.5, 1.2, 1.5))),
-)
-"""Colour and dashes of each line, so that lines differ without colours too."""
-
+BLACK, FAINT = "#000000", "#BFBFBF"
 PANEL_HEIGHT = 42.0  # Height in mm of axes with curves
 GAP = 1.0  # Millimetres between pictures, and between pictures and labels
 NAME_LINES = 2  # The most lines of a row's name
@@ -72,21 +56,6 @@ class Paper:
         return round(mm * self.dpi / 25.4)
 
 
-def matplotlib() -> ModuleType:
-    """The package matplotlib.
-
-    Raises:
-        MissingExtraError: if it is not installed.
-    """
-    try:
-        import matplotlib as package
-        import matplotlib.backends.backend_agg
-        import matplotlib.figure  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("matplotlib", "figures", "drawing figures") from error
-    return package
-
-
 def check_output(path: Path) -> None:
     """Check, before any work is done, that a figure can be written to a file.
 
@@ -105,35 +74,13 @@ def style(paper: Paper) -> Iterator[None]:
     Raises:
         FaceDiffError: if the font is not installed, or lacks a letter.
     """
-    package = matplotlib()
+    matplotlib()
     from matplotlib import font_manager
 
     fonts = sorted(set(font_manager.get_font_names()))
     if paper.font not in fonts:
         raise FaceDiffError(f'--font: there is no "{paper.font}": {choices(paper.font, fonts)}')
-    settings = {
-        "font.family": [paper.font],
-        "font.size": TEXT,
-        "axes.labelsize": TEXT,
-        "axes.titlesize": TEXT,
-        "xtick.labelsize": SMALLEST_TEXT,
-        "ytick.labelsize": SMALLEST_TEXT,
-        "legend.fontsize": TEXT,
-        "legend.frameon": False,
-        "legend.handlelength": 2.6,
-        "axes.linewidth": 0.6,
-        "xtick.major.width": 0.6,
-        "ytick.major.width": 0.6,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.formatter.use_mathtext": False,
-        "pdf.fonttype": 42,
-        "svg.fonttype": "none",
-        "svg.hashsalt": "facediff",
-    }
-    with package.rc_context(), warnings.catch_warnings():
-        package.rcdefaults()  # a matplotlibrc of the user's must not change the figure
-        package.rcParams.update(settings)
+    with drawing_settings(paper.font):
         warnings.filterwarnings("error", r"Glyph \d+ .*missing", UserWarning)
         try:
             yield
@@ -178,12 +125,6 @@ def save(figure: Figure, path: Path) -> None:
         temporary.write_bytes(content.getbuffer())
 
 
-def line_style(number: int) -> dict[str, object]:
-    """Colour, dashes and width of a method's or run's line, as matplotlib's options."""
-    colour, dashes = LINES[number % len(LINES)]
-    return {"color": colour, "linestyle": dashes, "linewidth": 1.1 if number < len(LINES) else 0.7}
-
-
 def legend_columns(axes: Axes, paper: Paper) -> int:
     """The number of legend entries that surely fit on one line."""
     labels = axes.get_legend_handles_labels()[1]
@@ -191,11 +132,6 @@ def legend_columns(axes: Axes, paper: Paper) -> int:
     widest = max(text_width(label, font_size, paper.font) for label in labels)
     entry = widest + (2.6 + 0.8 + 2.0) * font_size / POINTS_PER_MM
     return max(1, min(len(labels), int((paper.width - 2) / entry)))
-
-
-def plain(text: str) -> str:
-    """Text in which matplotlib sees no formula."""
-    return text.replace("$", r"\$")
 
 
 def text_width(text: str, size: float, font: str = FONT) -> float:

@@ -12,18 +12,8 @@ import numpy as np
 
 from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array
-from facediff.evaluation.figures.page import (
-    PANEL_HEIGHT,
-    SMALLEST_TEXT,
-    Paper,
-    check_output,
-    legend_columns,
-    line_style,
-    new_figure,
-    plain,
-    save,
-    style,
-)
+from facediff.evaluation.figures.page import PANEL_HEIGHT, Paper, check_output, legend_columns, new_figure, save, style
+from facediff.reporting.drawing import SMALLEST_TEXT, line_style, plain
 from facediff.utils import ranges
 from facediff.utils.plain_files import read_rows
 

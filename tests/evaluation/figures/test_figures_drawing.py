@@ -30,11 +30,12 @@ from facediff.evaluation.figures import (
     draw_training,
 )
 from facediff.evaluation.figures import lips as lips_module
-from facediff.evaluation.figures import page as page_module
 from facediff.evaluation.figures.heatmaps import scale_end
 from facediff.evaluation.figures.material import FLAT, Painter
-from facediff.evaluation.figures.page import LINES, SMALLEST_TEXT, Grid, Heading, check_output, text_width, wrapped
+from facediff.evaluation.figures.page import Grid, Heading, check_output, text_width, wrapped
 from facediff.render.panels import heat_ramp
+from facediff.reporting import drawing
+from facediff.reporting.drawing import LINES, SMALLEST_TEXT
 
 SMALL = Paper(width=85, dpi=100)
 TIMES = (np.arange(50) + 0.5) / 25
@@ -285,7 +286,7 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match=r'pip install "facediff\[figures\]"'):
-        page_module.matplotlib()
+        drawing.matplotlib()
 
 
 def test_nothing_is_left_of_a_figure_that_failed(
