@@ -5,12 +5,15 @@ A config is the user's own and may name classes and environment variables; it ma
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from facediff.errors import FaceDiffError
+from facediff.utils.files import config_dir
 from facediff.utils.yaml_files import check_yaml, yaml_text
 
 SHORT = 32  # characters of a value that can neither expand nor recurse
@@ -34,6 +37,43 @@ def keys_of(path: Path | str) -> set[str]:
     return {str(key.value) for key, _ in root.value} if isinstance(root, yaml.MappingNode) else set()
 
 
+PARTS = ("model", "data", "trainer")
+"""Folders of the bundled configs that hold one part of an experiment, and the options that take such a part."""
+
+
+def bundled_config(name: str) -> Path | None:
+    """The file of a bundled config: of ``configs/trainer/cpu.yaml`` or, shorter, ``trainer/cpu``; None for others."""
+    if not re.fullmatch(r"[\w./-]{1,200}", name):
+        return None
+    place = config_dir() / name.removeprefix("configs/")
+    return next((path for path in (place, place.with_name(f"{place.name}.yaml")) if path.is_file()), None)
+
+
+def as_parts(words: Sequence[str]) -> list[str]:
+    """The words with ``--trainer FILE`` in place of ``--config FILE`` where a bundled config holds that part alone."""
+    parts = list(words)
+    for number, word in enumerate(parts):
+        flag, joined, value = word.partition("=")
+        if flag in ("-c", "--config"):
+            path = Path(value if joined else next(iter(parts[number + 1 :]), ""))
+            if path.parent.name in PARTS and path.parent.parent == config_dir():
+                parts[number] = f"--{path.parent.name}{joined}{value}"
+    return parts
+
+
+def with_bundled(content: Any) -> Any:  # noqa: ANN401
+    """A config's content with the bundled files that it names, unless the user has files at these places."""
+    from jsonargparse._paths import _current_path_dir
+
+    if isinstance(content, dict):
+        return {key: with_bundled(value) for key, value in content.items()}
+    if isinstance(content, str) and content.startswith("configs/"):
+        own = Path(_current_path_dir.get() or ".") / content
+        bundled = None if own.is_file() else bundled_config(content)
+        return content if bundled is None else str(bundled)
+    return content
+
+
 def guard_configs(mode: str) -> None:
     """Let jsonargparse check every YAML text of a parser mode before it reads it: also files that a config names."""
     from jsonargparse import set_loader
@@ -49,6 +89,6 @@ def guard_configs(mode: str) -> None:
                 if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries what else it may be
                     raise error.__cause__ from error
                 raise
-        return read(text)
+        return with_bundled(read(text))
 
     set_loader(mode, load, exceptions=(yaml.YAMLError,))

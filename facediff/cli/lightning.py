@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
+from facediff.cli.configs import as_parts, bundled_config, check_config, keys_of
 from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices
 from facediff.registry import defaults, plain
@@ -59,8 +60,7 @@ def lightning(name: str, arguments: Sequence[str]) -> int:
 def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     """Run one of Lightning's subcommands; the object that holds what it made: trainer, model, data module."""
     check_options(name, arguments)
-    words = change_values(arguments, find_config)
-    words = change_values(words, fresh_component)
+    words = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
     checkpoint = value_of(words, "--ckpt_path")
     if checkpoint is not None and checkpoint != "last":  # that depends on the config
         check_model_source(checkpoint, "--ckpt_path")
@@ -94,7 +94,7 @@ def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
         FaceDiffError: as ``facediff fit`` itself.
     """
     check_options("fit", arguments)
-    words = change_values(change_values(arguments, find_config), fresh_component)
+    words = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
     from facediff.cli.lightning_cli import parse_lightning_cli
 
     for kind in registry.KINDS.values():
@@ -253,23 +253,22 @@ def value_of(words: Sequence[str], flag: str) -> str | None:
 
 
 def find_config(flag: str, value: str) -> str:
-    """The file of a --config; those that begin with ``configs/`` are installed with the package.
+    """The file of a --config; bundled ones are named ``configs/experiment/biwi.yaml`` or ``experiment/biwi``.
 
     Raises:
         FaceDiffError: if there is no such file.
     """
-    if os.path.isfile(value) and (flag in ("-c", "--config") or value.endswith((".yaml", ".yml"))):  # noqa: PTH113
-        from facediff.cli.configs import check_config
-
+    is_config = flag in ("-c", "--config")
+    if os.path.isfile(value) and (is_config or value.endswith((".yaml", ".yml"))):  # noqa: PTH113
         check_config(value)
         return value
-    if flag not in ("-c", "--config") or re.search(r"[\n{]|: ", value):
-        return value
-    bundled = config_dir() / value.removeprefix("configs/")
-    if value.startswith("configs/") and bundled.is_file():
+    bundled = bundled_config(value) if is_config or value.startswith("configs/") else None
+    if bundled is not None:
         return str(bundled)
-    known = [f"configs/{path.relative_to(config_dir()).as_posix()}" for path in config_dir().rglob("*.yaml")]
-    near = difflib.get_close_matches(value, known, n=1)
+    if not is_config or re.search(r"[\n{]|: ", value):
+        return value
+    names = [f"configs/{path.relative_to(config_dir()).as_posix()}" for path in config_dir().rglob("*.yaml")]
+    near = difflib.get_close_matches(value, names, n=1)
     hint = f'did you mean "{near[0]}"?' if near else "the bundled ones are configs/experiment/puppet.yaml and others"
     raise FaceDiffError(f"--config {value}: no such file; {hint}")
 
@@ -279,8 +278,6 @@ def experiment_name(words: Sequence[str]) -> str | None:
 
     Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it.
     """
-    from facediff.cli.configs import keys_of
-
     files: list[str] = []
 
     def note(flag: str, value: str) -> str:

@@ -6,10 +6,13 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from facediff.cli.app import main
 from facediff.cli.configs import check_config
+from facediff.cli.lightning import find_config
 from facediff.errors import FaceDiffError
+from facediff.utils.files import config_dir
 from facediff.utils.yaml_files import check_yaml, load_yaml
 
 LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -100,3 +103,38 @@ def test_plain_yaml_holds_numbers_and_texts_and_no_objects(tmp_path: Path) -> No
         path.write_text(text)
         with pytest.raises(FaceDiffError, match=re.escape(str(path))):
             load_yaml(path, "expected a plan")
+
+
+def test_bundled_parts_are_named_inside_ones_own_config(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From any folder; a file of the user's own at the same place comes first."""
+    (tmp_path / "mine.yaml").write_text(
+        "model: configs/model/voca_small.yaml\ndata: configs/data/puppet.yaml\n"
+        "trainer: configs/trainer/published_cpu.yaml\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", "--config", "mine.yaml", "--print_config"]) == 0
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["trainer"]["max_epochs"] == 30
+    assert config["model"]["class_path"].endswith("Voca")
+    (tmp_path / "configs" / "trainer").mkdir(parents=True)
+    (tmp_path / "configs" / "trainer" / "published_cpu.yaml").write_text("max_epochs: 7\n")
+    assert main(["fit", "--config", "mine.yaml", "--print_config"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["trainer"]["max_epochs"] == 7
+
+
+@pytest.mark.parametrize("name", ["configs/trainer/cpu.yaml", "trainer/cpu"])
+def test_a_bundled_part_is_given_as_a_config(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", "--config", name, "--model=Voca", "--data=Puppet", "--print_config"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["trainer"]["logger"]["init_args"]["save_dir"] == "runs"
+
+
+def test_a_bundled_experiment_is_known_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_config("--config", "experiment/biwi") == str(config_dir() / "experiment" / "biwi.yaml")
+    with pytest.raises(FaceDiffError, match=r"configs/experiment/biwi\.yaml"):
+        find_config("--config", "experiment/bivi")
