@@ -14,7 +14,7 @@ from facediff.data.mead3d import VALIDATION
 from facediff.data.vocaset import TRAIN
 from facediff.data.vocaset import VALIDATION as HELD_OUT
 from facediff.models import DualPathDiffusion
-from tests.data.test_corpora import write
+from tests.fakes.mini import write
 
 CORPORA: dict[str, tuple[str, list[str], set[str]]] = {
     "biwi": ("MiniBiwi", ["F2_e01", "F2_e02", "F2_e33"], {"F2"}),
@@ -38,7 +38,7 @@ def test_paper_configs_train_and_validate(
     kind, clips, speakers = CORPORA[corpus]
     root = write(tmp_path / corpus, clips, speakers, frames=8)
     small = ["--model.dim=16", "--model.diffusion_steps=20", "--model.sampler.steps=20", "--data.num_workers=0"]
-    words = ["--config", f"configs/experiment/{corpus}_paper.yaml", f"--data=tests.data.test_corpora.{kind}"]
+    words = ["--config", f"configs/experiment/{corpus}_paper.yaml", f"--data=tests.fakes.mini.{kind}"]
     words += [f"--data.root={root}", f"--model.audio_encoder.source={hubert_source}", "--trainer.accelerator=cpu"]
     words += ["--trainer.fast_dev_run=1", "--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
     monkeypatch.chdir(Path(__file__).parents[2])

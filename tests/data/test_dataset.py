@@ -9,7 +9,6 @@ import pytest
 import soundfile
 import torch
 
-from facediff.data import collate
 from facediff.data.dataset import MotionDataset, Pick
 from facediff.errors import FaceDiffError
 from tests.fakes.tiny import Tiny, write_tiny
@@ -100,17 +99,6 @@ def test_unknown_people_have_identity_minus_one(tiny: Tiny) -> None:
     assert {sample.identity for sample in tiny.dataset("test_b")} == {-1}
 
 
-def test_a_batch_pads_with_zeros_and_says_what_is_valid(tiny: Tiny) -> None:
-    samples = [tiny.dataset("train")[i] for i in (0, 5)]
-    batch = collate(samples)
-    assert batch.mask.sum(1).tolist() == [len(s.motion) for s in samples]
-    assert batch.reference_mask.sum(1).tolist() == [len(s.reference) for s in samples]
-    for i, sample in enumerate(samples):
-        assert torch.equal(batch.motion[i, : len(sample.motion)], sample.motion)
-        assert not batch.motion[i, len(sample.motion) :].any()
-        assert not batch.audio[i, len(sample.audio) :].any()
-
-
 def test_the_motion_scale_gives_unit_variance(tiny: Tiny) -> None:
     # The miniature's clips are shorter than the number of frames that the scale is measured on, or little longer.
     motion = np.concatenate(
@@ -122,21 +110,6 @@ def test_the_motion_scale_gives_unit_variance(tiny: Tiny) -> None:
         ]
     )
     assert tiny.motion_scale() * np.sqrt((motion**2).mean()) == pytest.approx(1.0, rel=0.05)
-
-
-def test_assets_survive_a_round_trip_through_a_safe_file(tiny: Tiny, tmp_path: Path) -> None:
-    from facediff.data import Assets
-
-    assets = tiny.assets().with_motion_scale(3.0)
-    torch.save(assets.state(), tmp_path / "assets.pt")
-    loaded = Assets.from_state(torch.load(tmp_path / "assets.pt", weights_only=True))
-    assert loaded.identities == ["A", "B"]
-    assert loaded.motion_scale == 3.0
-    assert loaded.references["C"].clip == assets.references["C"].clip
-    assert torch.equal(loaded.templates["B"], assets.templates["B"])
-    assert loaded.regions["lips"].tolist() == list(range(12))
-    assert loaded.faces is not None
-    assert loaded.faces.shape == (15, 3)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import json
 import pickle
 import subprocess
 import sys
-from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,9 @@ import pytest
 import soundfile
 
 from facediff import synthetic as puppet
-from facediff.data import Puppet
 from facediff.errors import FaceDiffError
 from facediff.synthetic import corpus as corpus_module
 from facediff.synthetic.corpus import clips, generate, is_complete
-from facediff.synthetic.motion import SpeakingStyle
-from facediff.synthetic.speakers import SPEAKERS, drawn_speaker
 
 pytest.importorskip("espeakng_loader")
 
@@ -72,20 +68,6 @@ def test_drawn_speakers_leave_the_eight_as_they_are(corpus: Path, tmp_path: Path
     assert 0.001 < np.abs(motion - templates["X02"]).max() < 0.04
 
 
-def test_drawn_speakers_know_nothing_of_those_who_are_only_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = [drawn_speaker.__wrapped__(number) for number in range(1, 40)]
-    for field in fields(SpeakingStyle):
-        values = [getattr(SPEAKERS[name].style, field.name) for name in puppet.SEEN_IDENTITIES]
-        wider = 0.1 * (max(values) - min(values)) + 1e-9
-        assert all(min(values) - wider <= getattr(s.style, field.name) <= max(values) + wider for s in drawn)
-        spread = np.ptp([getattr(speaker.style, field.name) for speaker in drawn])
-        assert spread > 0.7 * (max(values) - min(values))
-    for name in puppet.UNSEEN_IDENTITIES:
-        monkeypatch.setitem(SPEAKERS, name, replace(SPEAKERS[name], style=SpeakingStyle(jaw=9.0, blinks=9.0)))
-    assert drawn_speaker.__wrapped__(1) == drawn[0]
-    assert len({speaker.voice for speaker in drawn}) > 30
-
-
 def test_corpus_with_drawn_speakers_is_another_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(corpus_module, "clips", lambda drawn=0: clips(drawn)[:1] + clips(drawn)[-drawn:][:drawn])
     root = tmp_path / "corpus"
@@ -93,17 +75,6 @@ def test_corpus_with_drawn_speakers_is_another_corpus(tmp_path: Path, monkeypatc
     assert is_complete(root, drawn=1)
     assert not is_complete(root)
     assert not is_complete(root, drawn=2)
-
-
-def test_data_module_trains_on_drawn_speakers_and_compares_the_eight(tmp_path: Path) -> None:
-    root = tmp_path / "corpus"
-    generate(root, only=["F1_e01", "F1_e04", "F4_e01", "X01_e01", "X01_e04"], progress=False, drawn=2)
-    data = Puppet(root=str(root), drawn_speakers=2)
-    data.setup("fit")
-    assert data.identities == [*puppet.SEEN_IDENTITIES, "X01", "X02"]
-    assert len(data.train_dataloader().dataset) == 4  # all but the unseen speaker's clip
-    assert data.compared_speakers == (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
-    assert Puppet(drawn_speakers=2).root != Puppet().root
 
 
 def test_layout(corpus: Path) -> None:

@@ -1,0 +1,101 @@
+"""Packed corpora from elsewhere: damage is named, sizes are bounded, and nothing is run that a file asks for."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from facediff.data.check import check
+from facediff.data.packed.reader import PackedCorpus
+from facediff.data.packed.unpacking import unpack
+from facediff.errors import FaceDiffError
+from tests.data.packed.damage import RECORD, TINY, change, read_all
+
+
+@pytest.fixture
+def packed(sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    return Path(shutil.copytree(sound, tmp_path / "corpus.zarr"))
+
+
+@pytest.mark.parametrize(
+    ("key", "field", "value"),
+    [
+        (RECORD, "format", "facediff packed corpus 2"),
+        (RECORD, "format", "something else"),
+        (RECORD, "n_vertices", 0),
+        (RECORD, "n_vertices", 25),
+        (RECORD, "step", "0.1"),
+        (RECORD, "step", float("nan")),
+        (RECORD, "clips", {}),
+        (RECORD, "arrays", []),
+        (RECORD, "identities", [3]),
+        (f"{RECORD}.clips.0", "first", 1),
+        (f"{RECORD}.clips.0", "first", 10**9),
+        (f"{RECORD}.clips.0", "frames", 10**5),
+        (f"{RECORD}.clips.0", "frames", -1),
+        (f"{RECORD}.clips.0", "coding", "object"),
+        (f"{RECORD}.clips.0", "name", "../../evil"),
+        (f"{RECORD}.clips.0", "name", "a\nb"),
+        (f"{RECORD}.clips.0", "sound", None),
+        (f"{RECORD}.clips.0.sound", "pieces", [10**12]),
+        (f"{RECORD}.clips.0.sound", "samples", 10**15),
+        (f"{RECORD}.clips.0.sound", "form", "/../../x"),
+        (f"{RECORD}.clips.0.sound", "bits", 3),
+        (f"{RECORD}.files.0", "path", "../evil"),
+        (f"{RECORD}.files.0", "path", "/etc/evil"),
+        (f"{RECORD}.files.0", "path", ".ssh/evil"),
+        (f"{RECORD}.files.0", "path", "a/../../evil"),
+        (f"{RECORD}.files.0", "path", "c:\\evil"),
+        (f"{RECORD}.files.0", "bytes", 10**12),
+        (f"{RECORD}.files.0", "sha256", "0" * 64),
+        (f"{RECORD}.arrays.motion_int16", "rows", 10**14),
+        (f"{RECORD}.arrays.motion_int16", "chunk", 10**9),
+        (f"{RECORD}.arrays.motion_int16", "chunk", 0),
+        (f"{RECORD}.arrays.motion_int16", "chunks", 10**9),
+        (f"{RECORD}.arrays.motion_int16", "shards", [2]),
+        (f"{RECORD}.arrays.motion_int16", "dtype", "object"),
+        (f"{RECORD}.arrays.motion_int16", "width", 10**9),
+    ],
+)
+def test_a_record_is_not_believed(packed: Path, tmp_path: Path, key: str, field: str, value: object) -> None:
+    change(packed, key, lambda place: place.__setitem__(field, value))
+    with pytest.raises(FaceDiffError, match=r"corpus\.zarr") as caught:
+        read_all(packed)
+    assert str(caught.value).count(". ") <= 1
+    assert not list(tmp_path.rglob("*evil*"))
+    with pytest.raises(FaceDiffError):
+        unpack(packed, tmp_path / "back", workers=1)
+    assert not (tmp_path / "back").exists()
+
+
+@pytest.mark.parametrize("text", [b"", b"[]", b"{", b'{"attributes": 3}', b"\xff", b"[" * 10**5])
+def test_metadata_of_anything_else(packed: Path, text: bytes) -> None:
+    (packed / "zarr.json").write_bytes(text)
+    with pytest.raises(FaceDiffError, match=r"zarr\.json"):
+        read_all(packed)
+
+
+CODECS = "codecs.0.configuration.codecs"
+
+
+@pytest.mark.parametrize("codec", ["numcodecs.pickle", "gzip", "numcodecs.json2"])
+def test_only_our_own_codecs_are_run(packed: Path, codec: str) -> None:
+    place = "motion_int16/zarr.json"
+    change(packed, CODECS, lambda codecs: codecs.__setitem__(1, {"name": codec, "configuration": {}}), place)
+    with pytest.raises(FaceDiffError, match=r"motion_int16/zarr\.json: codecs"):
+        read_all(packed)
+
+
+def test_speech_that_is_not_what_the_record_says(packed: Path) -> None:
+    change(packed, f"{RECORD}.clips.0.sound", lambda place: place.__setitem__("samples", place["samples"] - 1))
+    with pytest.raises(FaceDiffError, match=r"speech of clip A_e01"):
+        read_all(packed)
+    assert "sound_unreadable" in {finding.kind for finding in check(packed, TINY).findings}
+
+
+def test_a_folder_of_anything_else_is_no_packed_corpus(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="no packed corpus"):
+        PackedCorpus(tmp_path)

@@ -1,0 +1,52 @@
+"""Motion files that are damaged, absurd or hostile are refused by name."""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.data.corpus import Corpus
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import quoted
+from tests.speech.test_audio import wave
+
+FACE = np.random.default_rng(0).normal(size=(9, 3))
+
+
+def corpus(root: Path, clip: str = "A_01") -> Corpus:
+    for folder in ("wav", "vertices_npy"):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    (root / "wav" / f"{clip}.wav").write_bytes(wave(body=bytes(32_000)))
+    np.save(root / "vertices_npy" / f"{clip}.npy", np.tile(FACE.ravel(), (25, 1)).astype(np.float32))
+    (root / "templates.pkl").write_bytes(pickle.dumps({"A": FACE}))
+    return Corpus(root, 9, 25.0)
+
+
+@pytest.mark.parametrize("name", ["A\n_01", "A\x1b[31m_01", os.fsdecode(b"A\xff_01")], ids=quoted)
+def test_clip_whose_name_cannot_be_printed_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="wav") as refused:
+        _ = corpus(tmp_path, name).clips
+    assert str(refused.value).removeprefix(str(tmp_path)).isprintable()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300, 3e37, -3e37])
+def test_motion_that_is_not_finite_is_refused_by_frame(value: float, tmp_path: Path) -> None:
+    opened = corpus(tmp_path)
+    motion = np.tile(FACE.ravel(), (25, 1))
+    motion[7, 3] = value
+    np.save(tmp_path / "vertices_npy" / "A_01.npy", motion)
+    with pytest.raises(FaceDiffError, match=r"A_01\.npy: frame 7"):
+        opened.read_motion(opened.clips["A_01"])
+
+
+@pytest.mark.parametrize("kind", ["c8", "?", "i4", "S4"])
+def test_motion_of_another_kind_is_refused(kind: str, tmp_path: Path) -> None:
+    opened = corpus(tmp_path)
+    np.save(tmp_path / "vertices_npy" / "A_01.npy", np.zeros((25, 27)).astype(kind))
+    with pytest.raises(FaceDiffError, match=r"A_01\.npy"):
+        opened.read_motion(opened.clips["A_01"])
