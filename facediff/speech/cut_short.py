@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
@@ -36,69 +35,43 @@ def refuse_cut_short(path: Path) -> None:
 
 
 def cut_short(path: Path) -> str | None:
-    """What a recording or video lacks at its end; None if it is whole, or of a format whose decoder reports it.
+    """What a recording lacks at its end; None if it is whole, or of a format whose decoder reports it.
 
-    Only headers are read.
+    Wav, AIFF, MP4, Ogg and mp3 are checked, by their headers only; others, such as flac, are left to the decoder.
 
     Args:
         path: the file, which must not be empty.
     """
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         head = data[:12]
-        form = head[8:12]
-        if head[:4] in (b"RIFF", b"RF64", b"BW64") and form == b"WAVE":
-            return _bytes(_chunks(data, 12, "<4sI", 2, b"data"))
-        if head[:4] == b"RIFX":
-            return _bytes(_chunks(data, 12, ">4sI", 2, b"data"))
-        if head[:4] == b"RIFF" and form == b"AVI ":
-            return _bytes(_chunks(data, 12, "<4sI", 2, b""))
-        if head[:4] == b"FORM":
-            return _bytes(_chunks(data, 12, ">4sI", 2, b"SSND"))
-        if head[:4] == b"caff":
-            return _bytes(_chunks(data, 8, ">4sQ", 1, b"data"))
-        if head[:4] == b".snd" and len(data) >= 12:
-            offset, size = struct.unpack_from(">II", data, 4)
-            return _bytes(None if _is_open(size) else offset + size - len(data))
-        for begins, walk in WALKS.items():
-            if head[begins[0] : begins[0] + len(begins[1])] == begins[1]:
-                return walk(data)
-        return _mpeg(data)
+        if head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:] == b"WAVE":
+            return _chunks(data, "<4sI", b"data")
+        if head[:4] in (b"RIFX", b"FORM"):
+            return _chunks(data, ">4sI", b"data" if head[:4] == b"RIFX" else b"SSND")
+        if head[:4] == b"OggS":
+            return _ogg(data)
+        if head[4:8] in (b"ftyp", b"wide", b"mdat", b"moov"):
+            return _boxes(data)
+        return None if head[:4] == b"fLaC" else _mpeg(data)
 
 
-def _bytes(count: int | None) -> str | None:
-    return f"{count} bytes are missing at its end" if count is not None and count > 0 else None
+def _bytes(count: int) -> str | None:
+    return f"{count} bytes are missing at its end" if count > 0 else None
 
 
-def _is_open(size: int) -> bool:
-    return size >> 32 == 0xFFFF_FFFF or any(size in sizes for sizes in OPEN_ENDS)
-
-
-def _chunks(data: Bytes, at: int, form: str, align: int, wanted: bytes) -> int | None:
-    """Bytes that a cut chunk of some name (any if empty) lacks; a container has chunks with a name and a size each."""
-    header, large = struct.calcsize(form), None
-    while at + header <= len(data):
+def _chunks(data: Bytes, form: str, samples: bytes) -> str | None:
+    """Wav and AIFF: chunks with a name of 4 bytes and a size each, one of which holds the samples."""
+    at, large = 12, None
+    while at + 8 <= len(data):
         name, size = struct.unpack_from(form, data, at)
-        at += header
+        at += 8
         if name == b"ds64" and at + 16 <= len(data):  # the size of the samples in 64 bits, for files above 4 GiB
             large = struct.unpack_from("<Q", data, at + 8)[0]
-        if not wanted or name == wanted:
+        if name == samples:
             size = large if large is not None and size == 0xFFFF_FFFF else size
-            if at + size > len(data):
-                return None if _is_open(size) else at + size - len(data)
-        at += size + -size % align
-    return None
-
-
-def _wave64(data: Bytes) -> str | None:
-    """Sony Wave64: as wav, with names of 16 bytes and sizes of 8 that count the chunk's header."""
-    at = 40
-    while at + 24 <= len(data):
-        name, size = struct.unpack_from("<4s12xQ", data, at)
-        if name == b"data":
-            return _bytes(None if size >> 62 else at + size - len(data))
-        if size < 24:
-            return None
-        at += size + -size % 8
+            is_open = any(size in sizes for sizes in OPEN_ENDS)
+            return None if is_open else _bytes(at + size - len(data))
+        at += size + size % 2
     return None
 
 
@@ -107,10 +80,9 @@ def _ogg(data: Bytes) -> str | None:
     at, last = 0, False
     while at + 27 <= len(data):
         if data[at : at + 4] != b"OggS":
-            found = data.find(b"OggS", at)
-            if found < 0:  # other things follow the last page
+            at = data.find(b"OggS", at)
+            if at < 0:  # other things follow the last page
                 break
-            at = found
             continue
         segments = data[at + 27 : at + 27 + data[at + 26]]
         end = at + 27 + data[at + 26] + sum(segments)
@@ -131,48 +103,6 @@ def _boxes(data: Bytes) -> str | None:
             return None
         at += size
     return _bytes(at - len(data))
-
-
-def _matroska(data: Bytes) -> str | None:
-    """Matroska and WebM: the header, then one segment of a known size, or an unknown one of a live recording."""
-    at = 0
-    for _ in range(2):
-        for keep_marker in (True, False):
-            first = data[at] if at < len(data) else 0
-            width = 9 - first.bit_length()
-            number = data[at : at + width]
-            if not first or len(number) < width:
-                return None
-            value = int.from_bytes(number, "big")
-            if not keep_marker:
-                value &= (1 << 7 * width) - 1
-                if value == (1 << 7 * width) - 1:
-                    return None
-            at += width
-        at += value
-    return _bytes(at - len(data))
-
-
-def _flash(data: Bytes) -> str | None:
-    """Flash video: tags of 11 bytes and their content, each followed by 4 bytes."""
-    at = int.from_bytes(data[5:9], "big") + 4
-    while at < len(data):
-        size = int.from_bytes(data[at + 1 : at + 4], "big") if at + 11 <= len(data) else 0
-        at += 11 + size + 4
-    return _bytes(at - len(data) - 4)  # the last 4 bytes hold nothing
-
-
-WALKS: dict[tuple[int, bytes], Callable[[Bytes], str | None]] = {
-    (0, b"riff\x2e\x91\xcf\x11"): _wave64,
-    (0, b"OggS"): _ogg,
-    (4, b"ftyp"): _boxes,
-    (4, b"wide"): _boxes,
-    (4, b"mdat"): _boxes,
-    (4, b"moov"): _boxes,
-    (0, b"\x1a\x45\xdf\xa3"): _matroska,
-    (0, b"FLV"): _flash,
-}
-"""The walk through a container, by where in the file what marks it."""
 
 
 # MPEG audio (mp3): frames without a container. Only a first frame that encoders add says how many there are.
@@ -225,10 +155,9 @@ def _mpeg(data: Bytes) -> str | None:
         elif data[at : at + 16].startswith(TAGS) or len(data) - at < 4:
             break
         else:  # garbage or padding: go on with the next frame
-            found = data.find(b"\xff", at + 1)
-            if found < 0:
+            at, skipped = data.find(b"\xff", at + 1), skipped + 1
+            if at < 0:
                 break
-            at, skipped = found, skipped + 1
     # The frame that declares does not count itself; some encoders count it nevertheless.
     if declared is not None and skipped < GARBAGE and walked - 1 < declared - 1:
         return f"{walked - 1} of {declared} frames are there"
