@@ -26,19 +26,19 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
 
     if kind is not None and kind not in KINDS:
         raise FaceDiffError(f'there is no kind "{kind}": {choices(kind, KINDS)}')
-    chosen = [each for each in KINDS.values() if kind in (None, each.kind)]
+    chosen = [entry_kind for entry_kind in KINDS.values() if kind in (None, entry_kind.kind)]
     if json:
         rows = [
-            {"kind": each.kind, "name": entry.name, "summary": entry.summary, "class": entry.owner}
-            for each in chosen
-            for entry in each
+            {"kind": entry_kind.kind, "name": entry.name, "summary": entry.summary, "class": entry.owner}
+            for entry_kind in chosen
+            for entry in entry_kind
         ]
         tell(*json_format.dumps(rows, indent=2, allow_nan=False).split("\n"))
         return
-    width = max((len(entry.name) for each in chosen for entry in each), default=0) + 2
-    for each in chosen:
-        tell(f"{each.kind}: {each.title}")
-        for entry in each:
+    width = max((len(entry.name) for entry_kind in chosen for entry in entry_kind), default=0) + 2
+    for entry_kind in chosen:
+        tell(f"{entry_kind.kind}: {entry_kind.title}")
+        for entry in entry_kind:
             tell(f"  {entry.name:<{width}}{plain_text(entry.summary)}")
             if kind is not None:
                 for line in options_of(entry):
@@ -54,7 +54,7 @@ def options_of(entry: Entry) -> list[str]:
     meanings: dict[str, str] = {}
     for base in reversed(inspect.getmro(entry.implementation)):  # a class describes only options of its own
         parsed = docstring_parser.parse(base.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE)
-        meanings |= {each.arg_name: plain_text(each.description or "") for each in parsed.params}
+        meanings |= {option.arg_name: plain_text(option.description or "") for option in parsed.params}
     lines = []
     for name, parameter in inspect.signature(entry.implementation).parameters.items():
         if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):

@@ -62,9 +62,10 @@ def export_model(
             raise FaceDiffError(f"--quick-steps: {type(loaded).__name__} keeps its steps at low latency; omit it")
         loaded.low_latency_steps = quick_steps
     tell(f"recording the graphs of {type(loaded).__name__}, which takes a minute …")
-    made = export(loaded, output, precision=weights, speech=samples)
-    megabytes = sum(made.sizes.values()) / 1e6
+    description = export(loaded, output, precision=weights, speech=samples)
+    megabytes = sum(description.sizes.values()) / 1e6
+    check = description.check
     tell(
-        f"wrote {output}: {megabytes:.1f} MB, {made.precision}; largest difference from PyTorch "
-        f"{made.check['largest_difference']:.1e} {made.unit}, {made.check['share_of_range']:.1e} of the motion's range"
+        f"wrote {output}: {megabytes:.1f} MB, {description.precision}; largest difference from PyTorch "
+        f"{check['largest_difference']:.1e} {description.unit}, {check['share_of_range']:.1e} of the motion's range"
     )

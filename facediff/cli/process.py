@@ -125,7 +125,7 @@ def report(error: BaseException) -> int:
     Raises:
         BaseException: the error itself where it is unexpected and ``FACEDIFF_TRACEBACK`` is set.
     """
-    if any(isinstance(each, KeyboardInterrupt) for each in _chain(error)):
+    if any(isinstance(cause, KeyboardInterrupt) for cause in _chain(error)):
         return fail("interrupted", INTERRUPTED)
     if isinstance(error, StoppedBySignal):
         return fail(error.sentence, int(str(error.code)))

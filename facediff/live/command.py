@@ -141,7 +141,7 @@ def perform(options: LiveOptions, open_model: Callable[[LiveOptions], LiveModel]
         from facediff.editing.shapes import check_shapes
 
         check_shapes(options.shapes)
-    wanting = [each.name for each in receivers if each.needs_weights]
+    wanting = [receiver.name for receiver in receivers if receiver.needs_weights]
     if wanting and options.shapes is None:
         raise FaceDiffError(
             f"{OPTION} {wanting[0]}: sends weights of blendshapes; give --shapes: a folder of meshes, a .glb, or "
@@ -195,11 +195,11 @@ def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:
     from facediff.editing.live_weights import FrameSolver
     from facediff.editing.shapes import read_shapes
 
-    found = read_shapes(shapes, model.neutral, model.unit)
-    made = FrameSolver(
-        found, model.frame_rate, faces=model.faces if len(model.faces) else None, regions={}, unit=model.unit
+    shape_set = read_shapes(shapes, model.neutral, model.unit)
+    frame_solver = FrameSolver(
+        shape_set, model.frame_rate, faces=model.faces if len(model.faces) else None, regions={}, unit=model.unit
     )
-    return found.names, lambda offsets: made.solve(offsets).astype("float32")
+    return shape_set.names, lambda offsets: frame_solver.solve(offsets).astype("float32")
 
 
 @contextmanager
@@ -207,13 +207,13 @@ def opened(receivers: Sequence[Receiver], performance: Performance) -> Iterator[
     """Receivers that are open for as long as the context lasts, and all closed after it."""
     begun: list[Receiver] = []
     try:
-        for each in receivers:
-            begun.append(each)
-            each.open(performance)
+        for opening in receivers:
+            begun.append(opening)
+            opening.open(performance)
         yield
     finally:
-        for each in reversed(begun):
-            each.close()
+        for closing in reversed(begun):
+            closing.close()
 
 
 def reporter(program: str) -> Report:

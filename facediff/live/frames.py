@@ -219,11 +219,11 @@ def open_receiver(text: str) -> Receiver:
     """
     address = read_address(text)
     try:
-        made = receiver.get(address.scheme)
+        implementation = receiver.get(address.scheme)
     except UnknownComponentError as error:
         raise FaceDiffError(f"{OPTION} {text}: {error}") from error
     options = receiver.options(address.scheme, list(address.options.items()), f"{OPTION} {text}")
-    return cast(Receiver, made(address, **options))
+    return cast(Receiver, implementation(address, **options))
 
 
 def open_receivers(texts: Sequence[str]) -> list[Receiver]:

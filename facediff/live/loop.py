@@ -215,7 +215,7 @@ class Loop:
             self._stopped.set()
             self._backlog.end()
             animating.join(timeout=5.0)  # a source may wait for its next sample for ever
-            self.summary.receivers = {each.name: each.status() for each in self.receivers}
+            self.summary.receivers = {receiver.name: receiver.status() for receiver in self.receivers}
         if self._error is not None:
             raise self._error
         return self.summary
@@ -267,7 +267,7 @@ class Loop:
     def _animate(self) -> None:
         """Turn speech into frames."""
         stream = self.model.start()
-        fed, made = 0, 0  # samples, and frames of the stream, which does not know of what was dropped
+        fed, ready = 0, 0  # samples, and frames of the stream, which does not know of what was dropped
         gaps: deque[tuple[int, int]] = deque([(0, 0)])  # from which frame of the stream on how many were dropped before
         recent: deque[tuple[float, float]] = deque()  # seconds of computing, seconds of speech
         while (taken := self._backlog.take(max(self.model.hop, 0.02))) is not None and not self._abandoned:
@@ -283,7 +283,7 @@ class Loop:
                 self.summary.computing.add(now - began)
             recent.append((now - began, len(samples) / SAMPLE_RATE))
             self._measure(recent)
-            made = self._ready(vertices, made, gaps, now)
+            ready = self._ready(vertices, ready, gaps, now)
         if fed and not self._abandoned:
             before, began = stream.made, time.monotonic()
             vertices = stream.finish()
@@ -291,7 +291,7 @@ class Loop:
             self.summary.busy += now - began
             if stream.made > before:
                 self.summary.computing.add(now - began)
-            self._ready(vertices, made, gaps, now)
+            self._ready(vertices, ready, gaps, now)
 
     def _measure(self, recent: deque[tuple[float, float]]) -> None:
         """Find out whether the model is fast enough, and how much speech may therefore wait for it."""
@@ -301,7 +301,7 @@ class Loop:
         enough = max(RECENT, 2 * hop)
         while heard - recent[0][1] > enough:
             heard -= recent.popleft()[1]
-        factor = sum(each for each, _ in recent) / max(heard, 1e-9)
+        factor = sum(seconds for seconds, _ in recent) / max(heard, 1e-9)
         slow = heard > 0.9 * enough and factor > 1
         self._backlog.limit = hop + (HURRIED if slow else self._patience)
         if slow and not self._slow_told:
@@ -312,22 +312,22 @@ class Loop:
                 f"end other programs"
             )
 
-    def _ready(self, vertices: Array, made: int, gaps: deque[tuple[int, int]], now: float) -> int:
+    def _ready(self, vertices: Array, first: int, gaps: deque[tuple[int, int]], now: float) -> int:
         """Queue frames (m, V, 3) of the stream, the first of which has the number ``made``; the number of the next."""
         if not len(vertices):
-            return made
+            return first
         offsets = vertices - self.model.neutral
         with self._changed:
-            for place, each in enumerate(offsets):
-                while len(gaps) > 1 and gaps[1][0] <= made + place:
+            for place, frame_offsets in enumerate(offsets):
+                while len(gaps) > 1 and gaps[1][0] <= first + place:
                     gaps.popleft()
-                index = made + place + gaps[0][1]
+                index = first + place + gaps[0][1]
                 spoken = self.clock.spoken((index + 1) / self.model.frame_rate)
                 if place == 0:
                     self.pacer.ready(spoken, now)
-                self._frames.append(_Ready(index, spoken, now, each))
+                self._frames.append(_Ready(index, spoken, now, frame_offsets))
             self._changed.notify()
-        return made + len(vertices)
+        return first + len(vertices)
 
     # The caller's thread.
 
@@ -415,6 +415,6 @@ class Loop:
         """Report on the last seconds."""
         parts = [f"{self.summary.speech:.0f} s: lag {self._interval}"]
         parts.append(f"{self.summary.dropped + self._backlog.dropped} frames dropped")
-        parts += [f"{each.name}: {status}" for each in self.receivers if (status := each.status())]
+        parts += [f"{receiver.name}: {status}" for receiver in self.receivers if (status := receiver.status())]
         self._interval = Lags()
         self._report("; ".join(parts))

@@ -79,11 +79,11 @@ class SoundOut(Receiver):
 
     def hear(self, speech: Array, start: float) -> None:
         """Keep speech until it is due."""
-        made = self._convert(speech)
+        converted = self._convert(speech)
         with self._lock:
-            at = (self._end + np.arange(len(made))) % len(self._kept)
-            self._kept[at] = made
-            self._end += len(made)
+            at = (self._end + np.arange(len(converted))) % len(self._kept)
+            self._kept[at] = converted
+            self._end += len(converted)
 
     def send(self, frame: LiveFrame) -> None:
         """Nothing: sound has no frames."""
@@ -106,10 +106,10 @@ class SoundOut(Receiver):
             return
         waits = clock.outputBufferDacTime - clock.currentTime
         heard_at = time.monotonic() + (waits if 0 < waits < 1 else 0.0)
-        wanted = round((heard_at - self._pacer.delay - self._clock.offset) * self.rate)
-        if self._place is None or abs(self._place - wanted) > APART * self.rate:
+        due = round((heard_at - self._pacer.delay - self._clock.offset) * self.rate)
+        if self._place is None or abs(self._place - due) > APART * self.rate:
             self.jumps += self._place is not None
-            self._place = wanted
+            self._place = due
         at = self._place + np.arange(count)
         with self._lock:
             there = (at >= max(0, self._end - len(self._kept))) & (at < self._end)

@@ -202,12 +202,12 @@ def sound_library(feature: str) -> Any:  # noqa: ANN401 - a module without types
     return sounddevice
 
 
-def find_device(library: Any, wanted: str, kind: str) -> tuple[int, dict[str, Any]]:  # noqa: ANN401
+def find_device(library: Any, device: str, kind: str) -> tuple[int, dict[str, Any]]:  # noqa: ANN401
     """The number and the facts of a sound device.
 
     Args:
         library: of :func:`sound_library`.
-        wanted: its number or a part of its name; ``default`` for the system's choice.
+        device: its number or a part of its name; ``default`` for the system's choice.
         kind: ``input`` or ``output``.
 
     Raises:
@@ -218,23 +218,23 @@ def find_device(library: Any, wanted: str, kind: str) -> tuple[int, dict[str, An
         devices = list(library.query_devices())
     except (library.PortAudioError, OSError) as error:
         raise FaceDiffError(f"{word}: no sound device can be asked for ({error}); give a recording") from error
-    fit = {place: each for place, each in enumerate(devices) if each[f"max_{kind}_channels"] > 0}
+    fit = {place: facts for place, facts in enumerate(devices) if facts[f"max_{kind}_channels"] > 0}
     if not fit:
         raise FaceDiffError(
             f"{word}: there is no {kind} device; connect one"
             + (", or give a recording, or samples on standard input" if kind == "input" else ", or leave it out")
         )
-    if wanted == USUAL:
+    if device == USUAL:
         usual = library.default.device[0 if kind == "input" else 1]
         place = usual if usual in fit else next(iter(fit))
         return place, fit[place]
-    named = [place for place, each in fit.items() if wanted == str(place) or wanted.lower() in each["name"].lower()]
-    exact = [place for place in named if wanted in (str(place), fit[place]["name"])]
+    named = [place for place, facts in fit.items() if device == str(place) or device.lower() in facts["name"].lower()]
+    exact = [place for place in named if device in (str(place), fit[place]["name"])]
     if len(named) == 1 or exact:
         return (exact or named)[0], fit[(exact or named)[0]]
-    known = [f"{place}: {each['name']}" for place, each in fit.items()]
+    names = [f"{place}: {facts['name']}" for place, facts in fit.items()]
     problem = "several devices are called so" if named else f"there is no {kind} device of this name or number"
-    raise FaceDiffError(f"{word} {wanted}: {problem}; {choices(wanted, known)}")
+    raise FaceDiffError(f"{word} {device}: {problem}; {choices(device, names)}")
 
 
 def _refused(name: str, error: Exception) -> FaceDiffError:

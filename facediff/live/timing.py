@@ -97,7 +97,7 @@ class Pacer:
         self._needed.append((now, needed))
         while self._needed[0][0] < now - MEMORY:
             self._needed.popleft()
-        all_needed = [each for _, each in self._needed]
+        all_needed = [need for _, need in self._needed]
         if self.delay is None:
             self.delay = needed + 2 * MARGIN
         elif needed + MARGIN > self.delay:

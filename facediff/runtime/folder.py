@@ -164,87 +164,87 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
             f"export the model again"
         )
     values: dict[str, Any] = {}
-    for each in fields(Description):
-        kind = KINDS[str(each.type).split("[")[0]]
-        if each.name not in content and (each.default_factory is not MISSING or each.default is not MISSING):
+    for entry in fields(Description):
+        kind = KINDS[str(entry.type).split("[")[0]]
+        if entry.name not in content and (entry.default_factory is not MISSING or entry.default is not MISSING):
             continue  # of a folder written before there were models of this kind
-        value = content.get(each.name)
+        value = content.get(entry.name)
         if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
             raise FaceDiffError(
-                f"{path}: {each.name} is {str(value)[:40]}, expected {each.type}; export the model again"
+                f"{path}: {entry.name} is {str(value)[:40]}, expected {entry.type}; export the model again"
             )
-        values[each.name] = value
+        values[entry.name] = value
     description = Description(**values)
     _check(path, description)
     for name in (*(f"{graph}.onnx" for graph in description.graphs), ARRAYS):
         size = (folder / name).stat().st_size if (folder / name).is_file() else None
         if size != description.sizes.get(name):
-            found = "is missing" if size is None else f"has {size} bytes"
+            problem = "is missing" if size is None else f"has {size} bytes"
             raise FaceDiffError(
-                f"{folder / name}: {found}, expected {description.sizes.get(name)}; copy or export the model again"
+                f"{folder / name}: {problem}, expected {description.sizes.get(name)}; copy or export the model again"
             )
     arrays = read_arrays(folder / ARRAYS)
     _check_arrays(folder / ARRAYS, description, arrays)
     return description, arrays
 
 
-def _check(path: Path, found: Description) -> None:
+def _check(path: Path, description: Description) -> None:
     """Refuse numbers that cannot be."""
 
     def refuse(name: str, expected: str) -> None:
-        raise FaceDiffError(f"{path}: {name} is {str(getattr(found, name))[:40]}, expected {expected}")
+        raise FaceDiffError(f"{path}: {name} is {str(getattr(description, name))[:40]}, expected {expected}")
 
-    if found.sample_rate != 16_000:
+    if description.sample_rate != 16_000:
         refuse("sample_rate", "16000")
-    if not 1 <= found.frame_rate <= 1000:
+    if not 1 <= description.frame_rate <= 1000:
         refuse("frame_rate", "1 to 1000")
-    if not 0 < found.epsilon < 1:
+    if not 0 < description.epsilon < 1:
         refuse("epsilon", "more than 0, less than 1")
-    for name, words in (
+    for name, kinds in (
         ("generation", tuple(NEEDED)),
         ("blending", ("steps", "motion")),
         ("style_source", ("reference", "identity", "none")),
         ("noise_of", ("clip", "seed")),
     ):
-        if getattr(found, name) not in words:
-            refuse(name, " or ".join(words))
-    needed, optional = NEEDED[found.generation], OPTIONAL[found.generation]
-    if not {*needed} <= {*found.graphs} <= {*needed, *optional}:
+        if getattr(description, name) not in kinds:
+            refuse(name, " or ".join(kinds))
+    needed, optional = NEEDED[description.generation], OPTIONAL[description.generation]
+    if not {*needed} <= {*description.graphs} <= {*needed, *optional}:
         refuse("graphs", ", ".join(needed))
-    sampled = found.generation == "sampled"
+    sampled = description.generation == "sampled"
     for name, least in (("state", 1), ("kept", 1), ("drawn", 0), ("longest", 0)):
-        if not (least if sampled else 0) <= getattr(found, name) <= 10_000_000:
+        if not (least if sampled else 0) <= getattr(description, name) <= 10_000_000:
             refuse(name, f"{least} to 10000000")
     for steps, table, least in (("steps", "table", int(sampled)), ("quick_steps", "quick_table", 0)):
-        visited, rows = getattr(found, steps), getattr(found, table)
-        if not least <= len(visited) <= 100_000 or not all(isinstance(each, int) and each >= 0 for each in visited):
+        visited, rows = getattr(description, steps), getattr(description, table)
+        if not least <= len(visited) <= 100_000 or not all(isinstance(step, int) and step >= 0 for step in visited):
             refuse(steps, "steps of the noise process")
         if len(rows) != len(visited) or not all(
             isinstance(row, list) and len(row) == 5 and all(isinstance(number, int | float) for number in row)
             for row in rows
         ):
             refuse(table, "five numbers for each step")
-    if found.decoded not in ("sample", "kept"):
+    if description.decoded not in ("sample", "kept"):
         refuse("decoded", "sample or kept")
     for name in ("identities", "faces", "styles"):
-        if not all(isinstance(each, str) for each in getattr(found, name)):
+        if not all(isinstance(text, str) for text in getattr(description, name)):
             refuse(name, "names")
-    if not found.faces:
+    if not description.faces:
         refuse("faces", "one name at least")
-    _check_clock(refuse, found)
+    _check_clock(refuse, description)
     try:
-        found.plan.in_frames(found.frame_rate)
+        description.plan.in_frames(description.frame_rate)
     except (FaceDiffError, TypeError) as error:
         raise FaceDiffError(f"{path}: windows: {error}") from error
 
 
-def _check_clock(refuse: Callable[[str, str], None], found: Description) -> None:
+def _check_clock(refuse: Callable[[str, str], None], description: Description) -> None:
     """Refuse a clock that cannot be."""
 
     def whole(value: object, most: int) -> bool:
         return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most
 
-    clock = found.clock
+    clock = description.clock
     layers = clock.get("convolutions", [])
     fits = (
         {*clock} <= {"rule", "rows", "convolutions"}
@@ -252,13 +252,16 @@ def _check_clock(refuse: Callable[[str, str], None], found: Description) -> None
         and whole(clock.get("rows", 1), 1000)
         and isinstance(layers, list)
         and len(layers) <= 64
-        and all(isinstance(each, list) and len(each) == 2 and all(whole(n, 10_000) for n in each) for each in layers)
+        and all(
+            isinstance(layer, list) and len(layer) == 2 and all(whole(size, 10_000) for size in layer)
+            for layer in layers
+        )
     )
     if not fits:
         refuse("clock", f"a rule ({', '.join(get_args(Rule))}) with rows and convolutions")
 
 
-def _check_arrays(path: Path, found: Description, arrays: Arrays) -> None:
+def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
     """Refuse arrays that do not fit the description."""
 
     def need(name: str, shape: tuple[int | None, ...], kinds: str) -> None:
@@ -273,13 +276,13 @@ def _check_arrays(path: Path, found: Description, arrays: Arrays) -> None:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise FaceDiffError(f"{path}: {name} holds numbers that are not finite; export the model again")
 
-    need("templates", (len(found.faces), None, 3), "f")
+    need("templates", (len(description.faces), None, 3), "f")
     vertices = arrays["templates"].shape[1]
-    if found.style_source == "reference":
-        need("styles", (len(found.styles), None), "f")
-    need("rest_weights", (len(found.faces), vertices), "f")
+    if description.style_source == "reference":
+        need("styles", (len(description.styles), None), "f")
+    need("rest_weights", (len(description.faces), vertices), "f")
     if "noise" in arrays:
-        need("noise", (found.state, found.state), "f")
+        need("noise", (description.state, description.state), "f")
     if "faces" in arrays:
         need("faces", (None, 3), "iu")
     if "colours" in arrays:

@@ -43,14 +43,14 @@ class NormalStream:
         count = int(np.prod(shape))
         if count < BLOCK:
             raise ValueError(f"{count} numbers: PyTorch draws fewer than {BLOCK} by another rule")
-        made = np.empty(count, np.float32)
+        normal = np.empty(count, np.float32)
         whole = count - count % BLOCK
         uniform = self._uniform(count)
-        made[:whole] = box_muller(uniform[:whole])
+        normal[:whole] = box_muller(uniform[:whole])
         if whole < count:
             # What is left over is not drawn by itself: the last 16 numbers are drawn again.
-            made[-BLOCK:] = box_muller(self._uniform(BLOCK))
-        return made.reshape(shape)
+            normal[-BLOCK:] = box_muller(self._uniform(BLOCK))
+        return normal.reshape(shape)
 
     def _uniform(self, count: int) -> Noise:
         raw = self._bits.random_raw(count)
@@ -119,9 +119,9 @@ class NumpyWindowNoise:
 
     def __call__(self, frames: int, width: int) -> Noise:
         """The next noise (seeds, frames, width); ``frames`` are those of the window."""
-        made = np.concatenate([self._draw(name, index, width)[:, new] for name, index, new in self.names], 1)
+        unit = np.concatenate([self._draw(name, index, width)[:, new] for name, index, new in self.names], 1)
         self._drawn += 1
-        return made
+        return unit
 
     def _draw(self, name: str, index: int, width: int) -> Noise:
         plan = self.window.plan

@@ -78,8 +78,8 @@ class Package:
         Raises:
             FaceDiffError: naming what it is called, if it is anything else.
         """
-        found = f"sha512-{base64.b64encode(hashlib.sha512(content).digest()).decode('ascii')}"
-        if len(content) != self.size or found != self.integrity:
+        integrity = f"sha512-{base64.b64encode(hashlib.sha512(content).digest()).decode('ascii')}"
+        if len(content) != self.size or integrity != self.integrity:
             raise FaceDiffError(f"{name}: is not {NAME} (its size or hash differs); {REMEDY}")
         return content
 
@@ -107,57 +107,57 @@ def web_runtime(source: Path | None = None, *, say: Callable[[str], object] = la
     if source is not None and not source.exists():
         raise FaceDiffError(f"--runtime {source}: no such file or folder; {REMEDY}")
     if source is not None and source.is_dir():
-        found = _in_folder(source)
-        if found is None:
+        files = _in_folder(source)
+        if files is None:
             raise FaceDiffError(f"--runtime {source}: holds no {NAME}, or files that were changed; {REMEDY}")
-        return found
+        return files
     content = b""
     if source is not None:
         with source.open("rb") as stream:
             content = package().check(f"--runtime {source}", stream.read(SIZE + 1))
     kept = cache_dir() / f"onnxruntime-web-{VERSION}"
-    found = _in_folder(kept)
-    if found is not None:
-        return found
+    files = _in_folder(kept)
+    if files is not None:
+        return files
     content = content or _fetch(package(), say)
     with atomic_folder(kept, replace=True) as staged:
         for name, data in _unpacked(content).items():
             (staged / name).write_bytes(data)
-    found = _in_folder(kept)
-    if found is None:
+    files = _in_folder(kept)
+    if files is None:
         raise FaceDiffError(f"{kept}: cannot be read back as it was written; set FACEDIFF_CACHE to another folder")
-    return found
+    return files
 
 
 def _in_folder(folder: Path) -> dict[str, Path] | None:
     """The files in a folder; None if one is missing or another one."""
     for place in PLACES:
-        found = {name: folder / place / name for name in FILES}
-        if all(path.is_file() for path in found.values()):
-            return found if all(sha256(path) == FILES[name] for name, path in found.items()) else None
+        files = {name: folder / place / name for name in FILES}
+        if all(path.is_file() for path in files.values()):
+            return files if all(sha256(path) == FILES[name] for name, path in files.items()) else None
     return None
 
 
-def _fetch(wanted: Package, say: Callable[[str], object]) -> bytes:
-    say(f"fetching {NAME} ({wanted.size / 1e6:.0f} MB, once) from {wanted.address}")
+def _fetch(pinned: Package, say: Callable[[str], object]) -> bytes:
+    say(f"fetching {NAME} ({pinned.size / 1e6:.0f} MB, once) from {pinned.address}")
     try:
-        with urllib.request.urlopen(wanted.address, timeout=30) as answer:  # noqa: S310 - http or https, see package()
-            content: bytes = answer.read(wanted.size + 1)
+        with urllib.request.urlopen(pinned.address, timeout=30) as answer:  # noqa: S310 - http or https, see package()
+            content: bytes = answer.read(pinned.size + 1)
     except (OSError, ValueError, urllib.error.URLError) as error:
         raise FaceDiffError(
-            f"{wanted.address}: cannot be fetched ({brief(error)}); go online once, or run `npm pack "
+            f"{pinned.address}: cannot be fetched ({brief(error)}); go online once, or run `npm pack "
             f"onnxruntime-web@{VERSION}` elsewhere and give the file with --runtime"
         ) from error
-    return wanted.check(wanted.address, content)
+    return pinned.check(pinned.address, content)
 
 
 def _unpacked(content: bytes) -> dict[str, bytes]:
     """The files of the package, whose hash has been checked."""
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     with tarfile.open(fileobj=io.BytesIO(content), mode="r:gz") as archive:
         for member in archive:
             name = member.name.removeprefix("package/dist/")
             stream = archive.extractfile(member) if name in FILES and member.isreg() else None
             if stream is not None:
-                found[name] = stream.read()
-    return found
+                files[name] = stream.read()
+    return files

@@ -58,17 +58,17 @@ def clip_motion(model: RuntimeModel, heard: WindowSpeech, conditions: RuntimeCon
     about = model.description
     features = model.features(heard, model.own_frames(heard))
     if about.generation == "direct":
-        made = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
+        motion = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
     elif about.noise_of == "seed":
         noise = SeedNoise(conditions.seed)  # such a model predicts no mean, so there is no other noise
-        made = SamplerRun(model, conditions, None, 0).run(features, noise, noise)
+        motion = SamplerRun(model, conditions, None, 0).run(features, noise, noise)
     else:
         noises = NumpyClipNoise(NAME, [conditions.seed]), NumpyClipNoise(f"{NAME}/mean", [0])
-        made = SamplerRun(model, conditions, None, 0).run(features, *noises)
-    if made.shape[1] == heard.frames:
-        return made
+        motion = SamplerRun(model, conditions, None, 0).run(features, *noises)
+    if motion.shape[1] == heard.frames:
+        return motion
     # A model that counts its frames by itself may give fewer than the speech lasts: its last one is held.
-    return made[:, np.minimum(np.arange(heard.frames), made.shape[1] - 1)]
+    return motion[:, np.minimum(np.arange(heard.frames), motion.shape[1] - 1)]
 
 
 def window_motion(
@@ -90,15 +90,15 @@ def window_motion(
     Returns:
         the motion, and what to hand over to the next window.
     """
-    wanted = slice(window.context, window.context + window.frames)
+    own_frames = slice(window.context, window.context + window.frames)
     if model.description.blending == "motion":
-        motion = clip_motion(model, heard, conditions)[:, wanted][:, window.fixed :]
+        motion = clip_motion(model, heard, conditions)[:, own_frames][:, window.fixed :]
         if before is not None:
             shared = before[0].shape[1]
             blended = before[0] + crossfade(shared, 0)[:, None, None] * (motion[:, :shared] - before[0])
             motion = np.concatenate([blended, motion[:, shared:]], 1)
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
-    features = np.ascontiguousarray(model.features(heard, heard.frames)[:, wanted])
+    features = np.ascontiguousarray(model.features(heard, heard.frames)[:, own_frames])
     sampling = SamplerRun(model, conditions, before, window.shared, window.fixed)
     noise = NumpyWindowNoise(NAME, window, [conditions.seed])
     motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
@@ -160,8 +160,8 @@ class SamplerRun:
             # As the model's own mean: the prediction at the last step, averaged over a noise and its negative.
             unit = of_mean(frames, width)
             ends = [
-                self._decoded(self._evaluate(features, self._start(each), about.last_step), each)
-                for each in (unit, -unit)
+                self._decoded(self._evaluate(features, self._start(signed_noise), about.last_step), signed_noise)
+                for signed_noise in (unit, -unit)
             ]
             mean = (ends[0] + ends[1]) * np.float32(0.5)
             if share == 0:
@@ -178,13 +178,13 @@ class SamplerRun:
         for step, (of_noisy, first, second, third, of_noise) in self.model.loop:
             prediction, kept = self._evaluate(features, noisy, step)
             predictions = [prediction, *predictions][:3]
-            made = np.float32(of_noisy) * noisy
-            for factor, each in zip((first, second, third), predictions, strict=False):
+            updated = np.float32(of_noisy) * noisy
+            for factor, earlier in zip((first, second, third), predictions, strict=False):
                 if factor:
-                    made = made + np.float32(factor) * each
+                    updated = updated + np.float32(factor) * earlier
             if of_noise:
-                made = made + np.float32(of_noise) * self._coloured(noise(features.shape[1], about.state))
-            noisy = made
+                updated = updated + np.float32(of_noise) * self._coloured(noise(features.shape[1], about.state))
+            noisy = updated
         return noisy, kept
 
     def _evaluate(self, features: Array, noisy: Array, step: int) -> tuple[Array, Array]:

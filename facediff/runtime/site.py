@@ -96,8 +96,8 @@ def make_site(folder: Path, runtime: Mapping[str, Path]) -> Site:
     }
     files |= {f"onnxruntime/{name}": path for name, path in runtime.items()}
     # A page takes styles by their names: what encodes them from motion is left out.
-    graphs = [each for each in description.graphs if each != "style"]
-    files |= {f"model/{name}": folder / name for name in (DESCRIPTION, ARRAYS, *(f"{each}.onnx" for each in graphs))}
+    graphs = [graph for graph in description.graphs if graph != "style"]
+    files |= {f"model/{name}": folder / name for name in (DESCRIPTION, ARRAYS, *(f"{graph}.onnx" for graph in graphs))}
     return files
 
 

@@ -71,7 +71,7 @@ def single_style(name: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
             )
         return RuntimeStyle(path.stem, vector)
     templates, rate, scale = model.arrays["templates"], opened.frame_rate or about.frame_rate, 1.0
-    whose = next((each for each in (path.stem.rpartition("_")[0], identity) if each in about.faces), about.faces[0])
+    whose = next((name for name in (path.stem.rpartition("_")[0], identity) if name in about.faces), about.faces[0])
     face = templates[about.faces.index(whose)] if opened.template is None else opened.template
     if opened.unit not in (None, about.unit):
         scale = metres_per_unit(str(opened.unit)) / metres_per_unit(about.unit)

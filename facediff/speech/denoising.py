@@ -22,5 +22,5 @@ def denoised(speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         raise MissingExtraError("noisereduce", "voice", "--denoise") from error
     if not speech.any():
         return speech
-    made = noisereduce.reduce_noise(y=speech, sr=SAMPLE_RATE, stationary=True)
-    return fit_length(np.nan_to_num(np.asarray(made, np.float32)), len(speech))
+    cleaned = noisereduce.reduce_noise(y=speech, sr=SAMPLE_RATE, stationary=True)
+    return fit_length(np.nan_to_num(np.asarray(cleaned, np.float32)), len(speech))

@@ -28,10 +28,10 @@ class RecursiveFilter:
 
     def feed(self, samples: Wave) -> npt.NDArray[np.float64]:
         """Filter more samples (n,)."""
-        made = np.asarray(samples, np.float64)
+        filtered = np.asarray(samples, np.float64)
         for section in self._sections:
-            made = section.feed(made)
-        return made
+            filtered = section.feed(filtered)
+        return filtered
 
 
 class _Section:
@@ -56,9 +56,9 @@ class _Section:
     def feed(self, samples: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         whole = len(samples) // BLOCK * BLOCK
         blocks = samples[:whole].reshape(-1, BLOCK)
-        made = blocks @ self._direct.T
+        filtered = blocks @ self._direct.T
         gained = blocks @ self._entries[::-1]
-        for row, gain in zip(made, gained, strict=True):
+        for row, gain in zip(filtered, gained, strict=True):
             row += self._free @ self._state
             self._state = self._powers[BLOCK] @ self._state + gain
         rest = samples[whole:]
@@ -66,4 +66,4 @@ class _Section:
         last = self._direct[:count, :count] @ rest + self._free[:count] @ self._state
         if count:
             self._state = self._powers[count] @ self._state + rest @ self._entries[:count][::-1]
-        return np.concatenate([made.reshape(-1), last])
+        return np.concatenate([filtered.reshape(-1), last])

@@ -65,7 +65,7 @@ def read_phonemes(path: Path) -> list[TimedPhoneme]:
     """
     expected = "expected a table with the columns start, end (seconds), ipa"
     try:
-        found = [
+        phonemes = [
             TimedPhoneme(
                 float(row["start"]),
                 float(row["end"]),
@@ -77,16 +77,16 @@ def read_phonemes(path: Path) -> list[TimedPhoneme]:
         ]
     except (KeyError, ValueError) as error:
         raise FaceDiffError(f"{path}: not readable as phonemes ({error}); {expected}") from error
-    if not found or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in found):
+    if not phonemes or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in phonemes):
         raise FaceDiffError(f"{path}: expected phonemes whose start is not below 0 and not after their end")
-    return found
+    return phonemes
 
 
 def closed_times(phonemes: Iterable[TimedPhoneme]) -> list[tuple[float, float]]:
     """Start and end, in seconds, of each p, b and m, in order."""
     return [
         (phoneme.start, phoneme.end)
-        for phoneme in sorted(phonemes, key=lambda each: each.start)
+        for phoneme in sorted(phonemes, key=lambda phoneme: phoneme.start)
         if phoneme.ipa.strip(STRESS + LENGTH) in BILABIALS
     ]
 
@@ -103,18 +103,18 @@ def closures(phonemes: Iterable[TimedPhoneme], frame_rate: float) -> list[tuple[
         are one.
 
     Example:
-        >>> closures([Phoneme(0.0, 0.1, "ˈm"), Phoneme(0.1, 0.3, "a"), Phoneme(0.3, 0.31, "b")], 25)
+        >>> closures([TimedPhoneme(0.0, 0.1, "m"), TimedPhoneme(0.3, 0.31, "b")], 25)
         [(0, 2), (8, 9)]
     """
-    found: list[tuple[int, int]] = []
+    frames: list[tuple[int, int]] = []
     for opens, closes in closed_times(phonemes):
         start = round(opens * frame_rate)
         end = max(start + 1, round(closes * frame_rate))
-        if found and start <= found[-1][1]:
-            found[-1] = (found[-1][0], max(end, found[-1][1]))
+        if frames and start <= frames[-1][1]:
+            frames[-1] = (frames[-1][0], max(end, frames[-1][1]))
         else:
-            found.append((start, end))
-    return found
+            frames.append((start, end))
+    return frames
 
 
 def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPhoneme]]:
@@ -125,8 +125,10 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPho
     """
     from facediff.synthetic.speech import EspeakVoice, speak
 
-    said = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
-    return said.samples, [TimedPhoneme(each.start, each.end, each.ipa) for each in said.phonemes if each.ipa]
+    utterance = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
+    return utterance.samples, [
+        TimedPhoneme(phoneme.start, phoneme.end, phoneme.ipa) for phoneme in utterance.phonemes if phoneme.ipa
+    ]
 
 
 # Alignments from elsewhere: Praat's TextGrid, which the usual aligners write.
@@ -146,8 +148,8 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
     Raises:
         FaceDiffError: if the file is neither, or holds no phonemes.
     """
-    found = _read_textgrid(path) if path.suffix.lower() == ".textgrid" else read_phonemes(path)
-    return [replace(each, ipa=_plain_label(each.ipa)) for each in found]
+    phonemes = _read_textgrid(path) if path.suffix.lower() == ".textgrid" else read_phonemes(path)
+    return [replace(phoneme, ipa=_plain_label(phoneme.ipa)) for phoneme in phonemes]
 
 
 def _plain_label(label: str) -> str:
@@ -180,10 +182,10 @@ def _read_textgrid(path: Path) -> list[TimedPhoneme]:
         tiers = _tiers(tokens[4:])
     except (ValueError, IndexError) as error:
         raise FaceDiffError(f"{path}: not readable as a TextGrid ({error}); {expected}") from error
-    for wanted in TIERS:
+    for tier in TIERS:
         for name, intervals in tiers:
             # Several speakers have a tier each: "Anna - phones".
-            if intervals and name.lower().split(" - ")[-1].strip() == wanted:
+            if intervals and name.lower().split(" - ")[-1].strip() == tier:
                 return intervals
     raise FaceDiffError(
         f"{path}: has no tier of phonemes but {', '.join(name for name, _ in tiers) or 'none'}; {expected}"
@@ -193,7 +195,7 @@ def _read_textgrid(path: Path) -> list[TimedPhoneme]:
 def _tiers(tokens: list[str]) -> list[tuple[str, list[TimedPhoneme]]]:
     """The interval tiers of a TextGrid, from its values behind its times."""
     rest = iter(tokens)
-    found = []
+    tiers = []
     for _ in range(int(float(next(rest, "0")))):
         kind, name = next(rest, ""), next(rest, "")
         next(rest, ""), next(rest, "")
@@ -207,8 +209,8 @@ def _tiers(tokens: list[str]) -> list[tuple[str, list[TimedPhoneme]]]:
             if not (0 <= start <= end < math.inf) or not label.startswith('"'):
                 raise ValueError(f"an interval from {start:g} to {end:g} s")
             intervals.append(TimedPhoneme(start, end, label[1:]))
-        found.append((name.removeprefix('"'), intervals))
-    return found
+        tiers.append((name.removeprefix('"'), intervals))
+    return tiers
 
 
 _TEXTGRID = re.compile(r'"((?:[^"]|"")*)"|(?<![\w\[.-])(-?[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?)(?![\w\].])')

@@ -182,13 +182,13 @@ class ProsodyTracker:
 
     def _measure(self, piece: Wave) -> None:
         """Pitch, level and prominence of one more step."""
-        found = pitch_of(piece[HOP // 2 : HOP // 2 + SPAN])
+        pitch = pitch_of(piece[HOP // 2 : HOP // 2 + SPAN])
         middle = piece[SPAN // 2 - HOP : SPAN // 2 + 2 * HOP]
         level = 10 * math.log10(float(np.square(middle).mean()) + 1e-12)
-        self._pitch.append(None if found is None else 12 * math.log2(found / LOWEST))
+        self._pitch.append(None if pitch is None else 12 * math.log2(pitch / LOWEST))
         self._level.append(level)
         # A median takes out single steps an octave away; it needs two more steps.
-        voiced = [each for each in self._pitch[-5:] if each is not None]
+        voiced = [semitone for semitone in self._pitch[-5:] if semitone is not None]
         at = len(self._pitch) - 3
         prominence = 0.0
         if at >= 0 and len(voiced) >= 3 and self._pitch[at] is not None and self._level[at] > -60:
@@ -217,11 +217,11 @@ class ProsodyTracker:
         if not active:
             return
         low, high = max(0, at - NEAR), at + NEAR + 1
-        around = [_mean(self._prominence, each) for each in range(low, high)]
+        around = [_mean(self._prominence, step) for step in range(low, high)]
         here, before = around[at - low], around[: at - low]
         if here > max(ACCENT, min(before, default=0.0) + RISE, max(before, default=0.0)) and here >= max(around):
             self._add("accent", at, min(1.0, here), apart=ACCENT_APART)
-        levels = [_mean(self._level, each) for each in range(low, high)]
+        levels = [_mean(self._level, step) for step in range(low, high)]
         now, close = levels[at - low], levels[max(0, at - low - 8) : at - low + 9]
         dips = now - max(min(levels[: at - low + 1]), min(levels[at - low :])) > SYLLABLE_DIP
         if now >= max(close) and dips and self._pitch[at] is not None and self._above[at] > -SYLLABLE_DIP:

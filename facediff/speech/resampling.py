@@ -71,10 +71,10 @@ class Resampler:
         places = self._next + self._down * np.arange(count)
         if count:
             windows = np.lib.stride_tricks.sliding_window_view(self._kept, taps)[places // self._up]
-            made = np.einsum("nt,nt->n", windows, self._filters[places % self._up])
+            resampled = np.einsum("nt,nt->n", windows, self._filters[places % self._up])
         else:
-            made = np.zeros(0, np.float32)
+            resampled = np.zeros(0, np.float32)
         self._next += self._down * count
         drop = min(len(self._kept), self._next // self._up)
         self._kept, self._next = self._kept[drop:], self._next - drop * self._up
-        return np.asarray(made, np.float32)
+        return np.asarray(resampled, np.float32)

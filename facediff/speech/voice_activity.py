@@ -199,12 +199,12 @@ class _EnergyListener(Listener):
         if not len(steps):
             return []
         band = self._band.feed(steps.reshape(-1))
-        found = []
+        decisions = []
         for power in np.square(band.reshape(steps.shape)).mean(axis=1).tolist():
             self._follow(power)
             if len(self._waiting) > self.gate.look_ahead:
-                found.append(self._decide())
-        return found
+                decisions.append(self._decide())
+        return decisions
 
     def finish(self) -> list[bool]:
         """Decide on all that is left."""

@@ -216,13 +216,13 @@ class MotionWindow:
         For each its index, and which of the frames that are new in it lie in this window. All frames of the first
         window are new in it, and the last ones of every other.
         """
-        found, overlap, hop = [], self.plan.overlap, self.plan.hop
+        origins, overlap, hop = [], self.plan.overlap, self.plan.hop
         for index in range(max(0, (self.start - overlap) // hop), self.index + 1):
             first = index * hop + overlap if index else 0
             begin, end = max(self.start, first), min(self.end, (index + 1) * hop + overlap)
             if begin < end:
-                found.append((index, slice(begin - first, end - first)))
-        return found
+                origins.append((index, slice(begin - first, end - first)))
+        return origins
 
 
 class MotionStream(Protocol[M_co]):

@@ -166,9 +166,9 @@ class Browser(Receiver):
         """Count a refusal; the first of each kind is reported."""
         with self._lock:
             self._refused += 1
-            known = why in self._reported
+            is_reported = why in self._reported
             self._reported.add(why)
-        if not known:
+        if not is_reported:
             log.warning("%s: refused, %s; the performance goes on", self.name, why)
 
     def _attend(self, connection: ServerConnection) -> None:
@@ -237,10 +237,10 @@ class Browser(Receiver):
         with self._lock:
             viewers = list(self._viewers.values())
             missed = self._missed + sum(viewer.missed for viewer in viewers)
-            words = [f"{len(viewers)} pages at {self.url}", f"{self._came} so far"]
-            words += [f"{missed} frames missed by slow ones"] if missed else []
-            words += [f"{self._refused} refused"] if self._refused else []
-        return ", ".join(words)
+            parts = [f"{len(viewers)} pages at {self.url}", f"{self._came} so far"]
+            parts += [f"{missed} frames missed by slow ones"] if missed else []
+            parts += [f"{self._refused} refused"] if self._refused else []
+        return ", ".join(parts)
 
 
 class _Viewer:
@@ -287,9 +287,9 @@ class _Viewer:
         """Send speech."""
         self._speech.put(data)
 
-    def hears(self, words: str | bytes) -> bool:
+    def hears(self, answer: str | bytes) -> bool:
         """Take note of what the page says; whether it is the index of a frame."""
-        if not isinstance(words, str) or not (words.isascii() and words.isdecimal()):
+        if not isinstance(answer, str) or not (answer.isascii() and answer.isdecimal()):
             return False
         with self._lock:
             self._answers = True
@@ -340,12 +340,12 @@ def page(subject: str) -> list[str]:
     from facediff.export.viewer.page import assemble
 
     facts: dict[str, Any] = {"format": FORMAT}
-    words = {"title": html.escape(subject)}
+    texts = {"title": html.escape(subject)}
     return assemble(
         "live.html",
         ("style.css", "live.css"),
         SCRIPTS,
-        words,
+        texts,
         facts,
         Blobs(),
         loads="img-src data:; connect-src 'self'",

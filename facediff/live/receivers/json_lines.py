@@ -96,7 +96,7 @@ class JsonLines(Receiver):
         sink = self._sink
         if sink is None or not sink.wanted:
             return
-        found: dict[str, object] = {
+        content: dict[str, object] = {
             "type": "frame",
             "index": frame.index,
             "time": round(frame.time, 6),
@@ -104,10 +104,10 @@ class JsonLines(Receiver):
             "dropped": frame.dropped,
         }
         if self.needs_weights and frame.weights is not None:
-            found["weights"] = dict(zip(self._shapes, np.round(frame.weights, 6).astype(float).tolist(), strict=True))
+            content["weights"] = dict(zip(self._shapes, np.round(frame.weights, 6).astype(float).tolist(), strict=True))
         if self.with_vertices:
-            found["vertices"] = _rounded(frame.vertices)
-        sink.write(line(found))
+            content["vertices"] = _rounded(frame.vertices)
+        sink.write(line(content))
 
     def close(self) -> None:
         """Write what waits and the last line, and let go."""
@@ -130,8 +130,8 @@ def line(content: dict[str, object]) -> bytes:
 
 
 def _rounded(points: np.ndarray) -> list[list[float]]:
-    found: list[list[float]] = np.round(points.astype(np.float64), 6).tolist()
-    return found
+    rows: list[list[float]] = np.round(points.astype(np.float64), 6).tolist()
+    return rows
 
 
 def _end(frames: int, dropped: int) -> bytes:
@@ -181,9 +181,9 @@ class _Stream:
                 raise _Unfinished
         self.wanted = False
 
-    def status(self, given: int, dropped: int) -> str:
+    def status(self, written: int, dropped: int) -> str:
         # What waits is written before the end, unless nothing can be written any more.
-        frames = given if self.wanted else self._frames
+        frames = written if self.wanted else self._frames
         return f"{frames} frames" + (f", {dropped} dropped" if dropped else "")
 
 
@@ -273,8 +273,8 @@ class _Clients:
                 client.close()
             self._clients.clear()
 
-    def status(self, given: int, dropped: int) -> str:
+    def status(self, sent: int, dropped: int) -> str:
         with self._lock:
             missed = dropped + self._missed + sum(outbox.dropped for outbox in self._clients.values())
-            words = [f"{given} frames", f"{len(self._clients)} clients", f"{self.connected} so far"]
-        return ", ".join(words + ([f"{missed} frames missed by slow ones"] if missed else []))
+            parts = [f"{sent} frames", f"{len(self._clients)} clients", f"{self.connected} so far"]
+        return ", ".join(parts + ([f"{missed} frames missed by slow ones"] if missed else []))

@@ -50,11 +50,11 @@ def _text(text: str) -> bytes:
 def bundles(messages: Sequence[bytes], most_bytes: int = MOST_BYTES) -> Iterator[bytes]:
     """Messages in as few bundles as hold them, in their order, each of at most so many bytes."""
     current = BUNDLE
-    for each in messages:
-        if len(current) + 4 + len(each) > most_bytes and current != BUNDLE:
+    for packet in messages:
+        if len(current) + 4 + len(packet) > most_bytes and current != BUNDLE:
             yield current
             current = BUNDLE
-        current += struct.pack(">i", len(each)) + each
+        current += struct.pack(">i", len(packet)) + packet
     yield current
 
 
@@ -139,4 +139,4 @@ class Osc(_Osc):
         """The messages of a frame, in their order."""
         weights = self._weights.of(frame).tolist()
         head = message(self._frame, frame.index, float(frame.time), float(frame.lag), frame.dropped)
-        return [head, *(part + struct.pack(">f", each) for part, each in zip(self._parts, weights, strict=True))]
+        return [head, *(part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights, strict=True))]

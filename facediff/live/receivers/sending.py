@@ -120,10 +120,10 @@ class Datagrams:
 
     def status(self) -> str:
         """What was sent, and what was not."""
-        words = [f"{self.sent} frames sent"]
-        words += [f"{self.refused} refused: nobody listened"] if self.refused else []
-        words += [f"{self.lost} lost"] if self.lost else []
-        return ", ".join(words)
+        parts = [f"{self.sent} frames sent"]
+        parts += [f"{self.refused} refused: nobody listened"] if self.refused else []
+        parts += [f"{self.lost} lost"] if self.lost else []
+        return ", ".join(parts)
 
     def close(self) -> None:
         """Let go of the socket."""
@@ -190,10 +190,10 @@ def listen(address: Address, host: str, port: int) -> socket.socket:
     """
     listening = None
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.socket(found[0], found[1], found[2])
+        place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        listening = socket.socket(place[0], place[1], place[2])
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(found[4])
+        listening.bind(place[4])
         listening.listen(16)
     except (OSError, UnicodeError) as error:
         if listening is not None:
@@ -281,18 +281,18 @@ class ArkitWeights:
 
     def __init__(self, performance: Performance, address: Address, order: Sequence[str] = ARKIT) -> None:
         place = {name: index for index, name in enumerate(performance.shapes)}
-        known = [(index, place[name]) for index, name in enumerate(order) if name in place]
-        if not known:
+        pairs = [(index, place[name]) for index, name in enumerate(order) if name in place]
+        if not pairs:
             raise FaceDiffError(
                 f"{OPTION} {address.text}: sends the weights of ARKit's 52 shapes, and the face has none; give shapes "
                 f"under ARKit's names"
             )
-        self._to, self._from = (np.array(column) for column in zip(*known, strict=True))
+        self._to, self._from = (np.array(column) for column in zip(*pairs, strict=True))
         self._count = len(order)
 
     def of(self, frame: LiveFrame) -> npt.NDArray[np.float32]:
         """The weights (len(order),); 0 for a frame without any."""
-        found = np.zeros(self._count, np.float32)
+        weights = np.zeros(self._count, np.float32)
         if frame.weights is not None:
-            found[self._to] = frame.weights[self._from]
-        return found
+            weights[self._to] = frame.weights[self._from]
+        return weights
