@@ -182,7 +182,7 @@ def adapt_audio_encoder(
     """Write a checkpoint with a distilled audio encoder; see :func:`adapt`."""
     from facediff.models.base import PROVENANCE_KEY
     from facediff.models.checkpoint import build_model, read_checkpoint
-    from facediff.pipelines.animate import usable_device
+    from facediff.pipelines.trained import usable_device
     from facediff.utils.licences import require_cleared
 
     started = time.monotonic()

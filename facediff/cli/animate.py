@@ -71,7 +71,8 @@ def animate(
 
     Args:
         speech: recording: wav, flac, ogg, mp3 or a video; several or a folder for a batch; - with --stream
-        checkpoint: trained model (.ckpt)
+        checkpoint: trained model (.ckpt), a folder of `facediff publish` or `facediff export-model`, or USER/NAME of
+            the Hugging Face hub
         output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
         stream: read PCM (16 bit, mono, little endian) from standard input as it comes
         rate: sample rate of that PCM
@@ -108,7 +109,8 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     if not streamed and not several and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
-    check_model_source(checkpoint)
+    if not (checkpoint / "model.json").is_file():  # a folder of `facediff export-model`
+        check_model_source(checkpoint)
     check_scheduler(batch.scheduler)
     check_output(files, batch.suffix if several else ".npy" if stream else output.suffix)
     files = replace(files, quiet=quiet)
@@ -134,7 +136,8 @@ def animate(
             retry_failed=batch.retry_failed,
         )
     from facediff.export import check_export
-    from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for, read_recording
+    from facediff.pipelines.animate import check_options, direction_for, open_pipeline
+    from facediff.speech.inputs import read_recording
     from facediff.speech.voice_activity import speech_problems
 
     if options.direction is not None:
@@ -144,10 +147,10 @@ def animate(
     speech_samples = read_recording(speech[0], options.max_seconds)  # before the model, which takes longer to load
     for problem in speech_problems(speech_samples):
         tell(f"note: {speech[0]}: {problem}")
-    pipeline = AnimationPipeline(options)
+    pipeline = open_pipeline(options)
     seconds, size = pipeline.cost(speech_samples, output, files.size)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
-    written, animation = pipeline.write(speech_samples, speech[0].stem, output, files, seed=options.seed or 0)
+    written, animation = pipeline.write(speech_samples, speech[0].stem, output, files)
     metadata = animation.metadata
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
     notes += f", licence: {metadata['licence']}"

@@ -89,7 +89,7 @@ def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModu
     from facediff.data import collate
     from facediff.export import ExportOptions, write_animations
     from facediff.export.video import drawn_frames
-    from facediff.pipelines.animate import facts_of
+    from facediff.pipelines.trained import facts_of
     from facediff.render import contact_sheet, save_image
 
     written = []

@@ -90,7 +90,7 @@ def generation_metrics(
 
     from facediff.models.checkpoint import load_model
     from facediff.models.generation_metrics import SamplingOptions, means_of, measure
-    from facediff.pipelines.animate import usable_device
+    from facediff.pipelines.trained import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 

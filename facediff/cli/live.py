@@ -124,8 +124,7 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
     from facediff.animation.options import AnimationOptions
     from facediff.live.model import LiveModel
     from facediff.models import load_model
-    from facediff.pipelines.animate import AnimationPipeline, facts_of, usable_device
-    from facediff.pipelines.stream import LiveAnimation
+    from facediff.pipelines.trained import TrainedPipeline, usable_device
     from facediff.speech.windows import LOW_LATENCY
     from facediff.utils.licences import licence_metadata
 
@@ -145,11 +144,11 @@ def trained_model(options: LiveOptions, steps: int | None, device: str) -> LiveM
         seed=options.seed,
         device=device,
     )
-    pipeline = AnimationPipeline(chosen, model=model)
-    facts = facts_of(model.assets, pipeline.identity)
+    pipeline = TrainedPipeline(chosen, model=model)
+    facts = pipeline.facts
     corpus = model.assets.corpus
     return LiveModel(
-        start=lambda: LiveAnimation(pipeline),
+        start=pipeline.stream,
         frame_rate=model.frame_rate,
         neutral=facts["template"],
         faces=np.zeros((0, 3), np.int32) if facts["faces"] is None else facts["faces"],

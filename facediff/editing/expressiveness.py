@@ -175,3 +175,11 @@ def region_weights(
     total = weights.sum(axis=0)
     weights /= np.maximum(total, 1.0)
     return RegionWeights(tuple(named), weights, np.clip(1.0 - total, 0.0, None))
+
+
+def rest_weights(
+    template: npt.NDArray[np.floating], regions: Mapping[str, npt.NDArray[np.integer]]
+) -> npt.NDArray[np.float32]:
+    """How far each vertex (V,) of a neutral face (V, 3) goes to rest in pauses: all that speech moves."""
+    # Fading into the upper face as regions fade elsewhere.
+    return region_factors(np.asarray(template, np.float32), regions, {"upper_face": 0.0, ALL: 1.0}).astype(np.float32)

@@ -14,6 +14,7 @@ from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
     from facediff.runtime import RuntimeModel
+    from facediff.speech.stream import AnimationStream
 
 Array = npt.NDArray[np.float32]
 
@@ -81,12 +82,12 @@ def runtime_model(model: RuntimeModel, *, gate: VoiceGate | None, **chosen: Any)
     Raises:
         FaceDiffError: if a name is unknown or a number out of range.
     """
-    from facediff.runtime.gated import GatedStream
+    from facediff.runtime.gated import gated_stream
 
-    def start() -> GatedStream:
-        return GatedStream(model.stream(**chosen, gate=gate))
+    def start() -> AnimationStream:
+        return gated_stream(model.stream(**chosen, gate=gate))
 
-    stream = start().stream
+    stream = model.stream(**chosen, gate=gate)
     template = model.arrays["templates"][stream.face].astype(np.float32)
     still = model.animation(template[None], stream.face, None, "live", stream.conditions, gate)
     plan = model.windows

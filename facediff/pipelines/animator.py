@@ -1,14 +1,16 @@
-"""A trained model as Python uses it: loaded from anywhere, it animates recordings, arrays and streams of speech.
+"""A model as Python uses it: loaded from anywhere, it animates recordings, arrays and streams of speech.
 
-From top to bottom: :func:`load`; :class:`Animator`, whose methods are what the command line can do with a model; and
-what speech may be given as.
+From top to bottom: :func:`load`; :class:`SpeechAnimator`, what every model can do; and :class:`Animator` and
+:class:`ExportedAnimator`, models with and without PyTorch.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Unpack, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast, overload
 
 from facediff.animation.options import (
     AnimateKeywords,
@@ -17,40 +19,45 @@ from facediff.animation.options import (
     StreamKeywords,
     with_options,
 )
-from facediff.errors import FaceDiffError
-from facediff.pipelines.animate import AnimationPipeline, check_options, check_speech, read_recording, usable_device
+from facediff.editing.controls import keys_of
+from facediff.errors import FaceDiffError, OptionError
+from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for, is_exported
 from facediff.pipelines.motion import Animation, Samples
 from facediff.pipelines.words import in_python_words
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hub import EXPECTED, check_model_source
 from facediff.utils.licences import Commercial, commercial_use, in_words
-from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_number
+from facediff.utils.limits import SAMPLE_RATES, check_number
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
-    from torch import Tensor
+    import torch
 
+    from facediff.animation.options import StyleLike
     from facediff.models import AnimationModel
-    from facediff.models.styles import StyleLike
+    from facediff.pipelines.animate import Progress
+    from facediff.runtime import RuntimeModel
+    from facediff.speech.inputs import Speech, Waveform
 
-FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0)}
-"""What whole numbers are divided by to get a full scale of 1, and where they have silence; as .wav files hold them."""
+    DType = str | torch.dtype
 
-if TYPE_CHECKING:
-    Waveform: TypeAlias = npt.NDArray[np.generic] | Tensor
-    Speech: TypeAlias = str | Path | Waveform | tuple[Waveform, int] | tuple[int, Waveform]
+PRECISIONS: dict[str, Literal["32", "bf16"]] = {"float32": "32", "bfloat16": "bf16"}
+"""What ``precision`` is called by PyTorch."""
 
 
 @in_python_words
-def load(source: str | Path, device: str = "auto", commercial_only: bool = False) -> Animator:
-    """A trained model, ready to animate.
+def load(
+    source: str | Path, device: str = "auto", commercial_only: bool = False, dtype: DType = "float32"
+) -> Animator | ExportedAnimator:
+    """A model, ready to animate.
 
     Args:
-        source: a checkpoint (.ckpt), a model folder that ``facediff publish`` has written, or ``user/name[@revision]``
-            of the Hugging Face hub.
+        source: a checkpoint (.ckpt), a model folder that ``facediff publish`` has written, ``user/name[@revision]`` of
+            the Hugging Face hub, or a folder of ``facediff export-model``, which needs no PyTorch.
         device: where it computes: cpu, cuda …; ``auto`` for a CUDA device where there is one.
         commercial_only: refuse a model whose licence labels do not allow commercial use.
+        dtype: in which it multiplies, float32 or bfloat16.
 
     Raises:
         FaceDiffError: if there is no such model, it cannot be read, its licence is refused, or the device cannot be
@@ -63,10 +70,17 @@ def load(source: str | Path, device: str = "auto", commercial_only: bool = False
     """
     if not isinstance(source, str | Path):
         raise FaceDiffError(f"source: is of the type {type(source).__name__}; {EXPECTED}")
+    if is_exported(source):
+        options = AnimationOptions(
+            checkpoint=source, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
+        )
+        return ExportedAnimator.load(options)
     check_model_source(source)  # before torch is imported
     from facediff.models import load_model
+    from facediff.pipelines.trained import usable_device
 
-    return Animator(load_model(source, usable_device(device), commercial_only=commercial_only), source)
+    module = load_model(source, usable_device(device), commercial_only=commercial_only)
+    return Animator(module, source, dtype=dtype)
 
 
 @in_python_words
@@ -93,29 +107,241 @@ def import_checkpoint(
         [PosixPath('speech.npy')]
     """
     from facediff.models import import_checkpoint as import_model
+    from facediff.pipelines.trained import usable_device
 
     first = Path(paths) if isinstance(paths, str | Path) else Path(next(iter(paths)))
     return Animator(import_model(paths, **options).to(usable_device(device)), first)
 
 
-class Animator:
-    """A trained model: ``model.animate("speech.wav", identity="F1")`` makes an animation.
+class SpeechAnimator(ABC):
+    """A model: ``model.animate("speech.wav", identity="F1")`` makes an animation.
 
     Every method leaves the model as it was: what is chosen for one call does not change the next one.
+
+    Attributes:
+        source: the file, folder or name of the hub that it comes from, for the metadata of animations.
+        dtype: in which it multiplies where a call does not choose, ``float32`` or ``bfloat16``.
+    """
+
+    source: str | Path
+    dtype: str = "float32"
+
+    @property
+    @abstractmethod
+    def identities(self) -> list[str]:
+        """The identities that it was trained on; the first one is the default."""
+
+    @property
+    @abstractmethod
+    def device(self) -> str:
+        """Where it computes."""
+
+    @abstractmethod
+    def open(self, options: AnimationOptions) -> AbstractContextManager[AnimationPipeline]:
+        """The model with its choices made, for as long as the context lasts."""
+
+    @overload
+    def animate(
+        self,
+        speech: Speech,
+        rate: float | None = None,
+        *,
+        samples: Literal[1] = 1,
+        name: str | None = None,
+        progress: bool | Progress = False,
+        dtype: DType | None = None,
+        **options: Unpack[RecordingKeywords],
+    ) -> Animation: ...
+
+    @overload
+    def animate(
+        self,
+        speech: Speech,
+        rate: float | None = None,
+        *,
+        samples: int,
+        name: str | None = None,
+        progress: bool | Progress = False,
+        dtype: DType | None = None,
+        **options: Unpack[RecordingKeywords],
+    ) -> Animation | Samples: ...
+
+    @overload
+    def animate(
+        self,
+        speech: list[Any],
+        rate: float | None = None,
+        *,
+        name: None = None,
+        progress: bool | Progress = False,
+        dtype: DType | None = None,
+        **options: Unpack[AnimateKeywords],
+    ) -> list[Animation | Samples]: ...
+
+    @in_python_words
+    @with_options(AnimationOptions, AnimateKeywords)
+    def animate(
+        self,
+        speech: Any,
+        rate: float | None = None,
+        *,
+        name: str | None = None,
+        progress: bool | Progress = False,
+        dtype: DType | None = None,
+        **options: Any,
+    ) -> Animation | Samples | list[Animation | Samples]:
+        """Animate a face with speech. The keywords are the options of ``facediff animate``.
+
+        Args:
+            speech: a recording's path (wav, flac, ogg, mp3 or a video) or an open sound file; samples as an array or a
+                tensor, (S,) or with several channels, in floating point with full scale 1 or in whole numbers with
+                theirs; a pair of samples and their rate, as soundfile, librosa and torchaudio read them; the audio of a
+                Hugging Face data set, ``{"array", "sampling_rate"}`` or ``{"bytes", "path"}``; or several recordings:
+                a list of any of these, or a folder.
+            rate: sample rate of an array; that of a tensor is 16 kHz if None.
+            name: the animation's name; the recording's if None.
+            progress: whether there is a progress bar; or a function that is called with what is done and the total.
+            dtype: in which the model multiplies, ``float32`` or ``bfloat16``, or PyTorch's of that name; that of the
+                model if None. The same as ``precision`` 32 or bf16.
+            options: listed below. With ``seed=None``, the seed is drawn at random; the metadata names it.
+
+        Returns:
+            the animation; a list of them (:class:`Samples`) where ``samples`` is not 1; and for several recordings a
+            list with what each of them alone would give.
+
+        Raises:
+            FaceDiffError: naming what is wrong with the speech or an option.
+        """
+        chosen = self._options(dtype, quiet=progress is not True, **options)
+        several = recordings_of(speech)
+        if several is not None:
+            for option in ("alignment", "transcript"):
+                if getattr(chosen, option) is not None:
+                    raise OptionError(option, "is for one recording; omit it, or animate them one by one")
+            if name is not None:
+                raise FaceDiffError("name: is for one recording; omit it, each has its own")
+        from facediff.speech.inputs import speech_of
+
+        animations: list[Animation | Samples] = []
+        with self.open(chosen) as pipeline:
+            pipeline.progress = None if isinstance(progress, bool) else progress
+            for recording in [speech] if several is None else several:
+                if chosen.direction is not None and isinstance(recording, str | Path):
+                    direction = direction_for(chosen.direction, Path(recording))
+                    if direction is not chosen.direction:
+                        pipeline.direct(keys_of(direction, pipeline.frame_rate))
+                waveform, usual_name = speech_of(recording, rate, chosen.max_seconds)
+                with pipeline.animations(waveform, name or usual_name) as finished:
+                    samples = [Animation.of(animation) for animation in finished]
+                animations.append(samples[0] if chosen.samples == 1 else Samples(samples))
+        return animations[0] if several is None else animations
+
+    @in_python_words
+    @with_options(AnimationOptions, StreamKeywords)
+    def stream(
+        self,
+        chunks: Iterable[Waveform | bytes],
+        rate: int = SAMPLE_RATE,
+        *,
+        dtype: DType | None = None,
+        **options: Unpack[StreamKeywords],
+    ) -> Iterator[npt.NDArray[np.float32]]:
+        """Animate speech of any length while it arrives, as ``facediff animate --stream`` does.
+
+        The frames are those of the recording as a whole by windows, however the speech is cut into chunks.
+
+        Args:
+            chunks: pieces of mono speech: arrays or tensors (n,), or bytes of 16-bit samples (little endian).
+            rate: their sample rate.
+            dtype: as :meth:`animate` takes it.
+            options: listed below; of ``direction``, keys of blinks, gaze and sway need the whole animation.
+
+        Yields:
+            absolute vertices (m, V, 3) of the next frames, as soon as these are certain.
+
+        Raises:
+            FaceDiffError: naming what is wrong with an option or a chunk.
+
+        Example:
+            >>> for frames in model.stream(microphone(), identity="F1"):  # doctest: +SKIP
+            ...     show(frames)
+        """
+        from facediff.speech.inputs import stream_piece
+
+        rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
+        with self.open(self._options(dtype, **options)) as pipeline:
+            stream = pipeline.stream(rate)
+
+        def frames() -> Iterator[npt.NDArray[np.float32]]:
+            received = False
+            for chunk in chunks:
+                piece = stream_piece(chunk)
+                received = received or bool(len(piece))
+                vertices = stream.feed(piece)
+                if len(vertices):
+                    yield vertices
+            if received and len(vertices := stream.finish()):
+                yield vertices
+
+        return frames()
+
+    def _options(self, dtype: DType | None, **options: Any) -> AnimationOptions:  # noqa: ANN401 - its fields
+        precision = precision_of(self.dtype if dtype is None else dtype)
+        if dtype is not None and options.get("precision", precision) != precision:
+            raise OptionError("precision", f"contradicts dtype {dtype}; give one of them", options["precision"])
+        chosen = AnimationOptions(checkpoint=self.source, **{"precision": precision, **options})
+        check_options(chosen)
+        return chosen
+
+
+class Animator(SpeechAnimator):
+    """A trained model, with PyTorch.
 
     Args:
         module: the model as a LightningModule, in evaluation mode, with the assets of its corpus.
         source: the file, folder or name of the hub that it comes from, for the metadata of animations; the name of its
             class if None.
+        dtype: in which it multiplies, float32 or bfloat16.
 
     Attributes:
         module: the LightningModule.
-        source: as given.
     """
 
-    def __init__(self, module: AnimationModel, source: str | Path | None = None) -> None:
+    def __init__(self, module: AnimationModel, source: str | Path | None = None, *, dtype: DType = "float32") -> None:
+        precision_of(dtype)  # refuses what is none
         self.module = module.eval()
         self.source = type(module).__name__ if source is None else source
+        self.dtype = str(dtype).removeprefix("torch.")
+
+    @contextmanager
+    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
+        """The model with its choices made, which are forgotten at the end of the context."""
+        from facediff.pipelines.trained import TrainedPipeline
+
+        with self.module.choosing():
+            yield TrainedPipeline(options, model=self.module)
+
+    @in_python_words
+    def to(self, device: str, dtype: DType | None = None) -> Self:
+        """Move the model: ``model.to("cuda")``.
+
+        Args:
+            device: cpu, cuda …; ``auto`` for a CUDA device where there is one.
+            dtype: in which it multiplies from now on, float32 or bfloat16; as before if None.
+
+        Returns:
+            the model itself.
+
+        Raises:
+            FaceDiffError: if the device cannot be used.
+        """
+        from facediff.pipelines.trained import usable_device
+
+        if dtype is not None:
+            precision_of(dtype)
+            self.dtype = str(dtype).removeprefix("torch.")
+        self.module.to(usable_device(str(device)))
+        return self
 
     @property
     def identities(self) -> list[str]:
@@ -162,115 +388,6 @@ class Animator:
     def device(self) -> str:
         """Where it computes."""
         return str(self.module.device)
-
-    @overload
-    def animate(
-        self,
-        speech: Speech,
-        rate: float | None = None,
-        *,
-        samples: Literal[1] = 1,
-        name: str | None = None,
-        progress: bool = False,
-        **options: Unpack[RecordingKeywords],
-    ) -> Animation: ...
-
-    @overload
-    def animate(
-        self,
-        speech: Speech,
-        rate: float | None = None,
-        *,
-        samples: int,
-        name: str | None = None,
-        progress: bool = False,
-        **options: Unpack[RecordingKeywords],
-    ) -> Animation | Samples: ...
-
-    @in_python_words
-    @with_options(AnimationOptions, AnimateKeywords)
-    def animate(
-        self,
-        speech: Speech,
-        rate: float | None = None,
-        *,
-        name: str | None = None,
-        progress: bool = False,
-        **options: Any,
-    ) -> Animation | Samples:
-        """Animate a face with speech. The keywords are the options of ``facediff animate``.
-
-        Args:
-            speech: a recording's path (wav, flac, ogg, mp3 or a video); samples as an array or a tensor, (S,) or with
-                several channels, in floating point with full scale 1 or in whole numbers with theirs; or a pair of
-                samples and their rate, as soundfile, librosa and torchaudio read them.
-            rate: sample rate of an array; that of a tensor is 16 kHz if None.
-            name: the animation's name; the recording's if None.
-            progress: whether there is a progress bar.
-            options: listed below.
-
-        Returns:
-            the animation, or a list of them where ``samples`` is not 1.
-
-        Raises:
-            FaceDiffError: naming what is wrong with the speech or an option.
-        """
-        chosen = AnimationOptions(checkpoint=self.source, device=self.device, quiet=not progress, **options)
-        check_options(chosen)
-        samples_of_speech, usual_name = speech_of(speech, rate, chosen.max_seconds)
-        with self.module.choosing():
-            pipeline = AnimationPipeline(chosen, model=self.module)
-            seed = chosen.seed or 0
-            with pipeline.samples(samples_of_speech, name or usual_name, None, seed=seed) as made:
-                animations = [
-                    Animation.of(pipeline.finished(animation, seed + number)) for number, animation in enumerate(made)
-                ]
-        return animations[0] if chosen.samples == 1 else Samples(animations)
-
-    @in_python_words
-    @with_options(AnimationOptions, StreamKeywords)
-    def stream(
-        self, chunks: Iterable[Waveform | bytes], rate: int = SAMPLE_RATE, **options: Unpack[StreamKeywords]
-    ) -> Iterator[npt.NDArray[np.float32]]:
-        """Animate speech of any length while it arrives, as ``facediff animate --stream`` does.
-
-        The frames are those of the recording as a whole by windows, however the speech is cut into chunks.
-
-        Args:
-            chunks: pieces of mono speech: arrays or tensors (n,), or bytes of 16-bit samples (little endian).
-            rate: their sample rate.
-            options: listed below; of ``direction``, keys of blinks, gaze and sway need the whole animation.
-
-        Yields:
-            absolute vertices (m, V, 3) of the next frames, as soon as these are certain.
-
-        Raises:
-            FaceDiffError: naming what is wrong with an option or a chunk.
-
-        Example:
-            >>> for frames in model.stream(microphone(), identity="F1"):  # doctest: +SKIP
-            ...     show(frames)
-        """
-        from facediff.pipelines.stream import LiveAnimation
-
-        rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
-        chosen = AnimationOptions(checkpoint=self.source, device=self.device, **options)
-        check_options(chosen)
-        with self.module.choosing():
-            live = LiveAnimation(AnimationPipeline(chosen, model=self.module), rate=rate)
-
-        def frames() -> Iterator[npt.NDArray[np.float32]]:
-            heard = False
-            for chunk in chunks:
-                piece = mono(chunk)
-                heard = heard or bool(len(piece))
-                part = live.feed(piece)
-                if len(part):
-                    yield part
-            if heard and len(part := live.finish()):
-                yield part
-
-        return frames()
 
     @in_python_words
     def extract_style(
@@ -324,93 +441,79 @@ class Animator:
         )
 
 
-def speech_of(
-    speech: Speech, rate: float | None = None, max_seconds: float | None = None
-) -> tuple[npt.NDArray[np.float32], str]:
-    """Speech (S,) at 16 kHz and its name, from whatever speech may be given as; see :meth:`Animator.animate`.
+class ExportedAnimator(SpeechAnimator):
+    """A folder of ``facediff export-model``, without PyTorch.
+
+    Args:
+        model: the open folder.
+        source: where it lies.
+    """
+
+    def __init__(self, model: RuntimeModel, source: str | Path) -> None:
+        self.model, self.source = model, source
+
+    @classmethod
+    def load(cls, options: AnimationOptions) -> Self:
+        """Open the folder that options name; a device or a precision that it does not have is refused."""
+        from facediff.pipelines.exported import ExportedPipeline
+
+        return cls(ExportedPipeline(options).model, options.checkpoint)
+
+    @property
+    def identities(self) -> list[str]:
+        """The identities that it was trained on; the first one is the default."""
+        return list(self.model.description.identities or self.model.description.faces)
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames a second of its animations."""
+        return self.model.frame_rate
+
+    @property
+    def device(self) -> str:
+        """Where it computes."""
+        return "cpu"
+
+    @contextmanager
+    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
+        """The model with its choices made."""
+        from facediff.pipelines.exported import ExportedPipeline
+
+        yield ExportedPipeline(options, model=self.model)
+
+    def __repr__(self) -> str:
+        about = self.model.description
+        return (
+            f"ExportedAnimator({str(self.source)!r}: {about.model}, identities {', '.join(self.identities)}, "
+            f"{self.frame_rate:g} frames a second, in {about.unit}; {about.licences.get('licence', '')})"
+        )
+
+
+def precision_of(dtype: DType) -> Literal["32", "bf16"]:
+    """The precision that a data type of PyTorch, or its name, stands for.
+
+    Example:
+        >>> precision_of("bfloat16")
+        'bf16'
+    """
+    name = str(dtype).removeprefix("torch.")
+    if name not in PRECISIONS:
+        raise FaceDiffError(f"dtype {name}: expected {' or '.join(PRECISIONS)}")
+    return PRECISIONS[name]
+
+
+def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - whatever speech may be
+    """Several recordings, from a list or a folder; None for one recording.
 
     Raises:
-        FaceDiffError: naming the file or the argument, if it is nothing of that kind, or lasts too short or too long.
+        FaceDiffError: if there is none.
     """
-    if isinstance(speech, str | Path):
-        if rate is not None:
-            raise FaceDiffError(f"rate {rate:g}: belongs to an array, and {speech} says its own; omit it")
-        return read_recording(Path(speech), max_seconds), Path(speech).stem
-    import torch
+    if isinstance(speech, str | Path) and Path(speech).is_dir():
+        from facediff.pipelines.folder import recordings
 
-    from facediff.speech.audio import to_speech
-
-    if isinstance(speech, tuple):
-        if rate is not None or len(speech) != 2:
-            raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
-        first, second = speech
-        speech, rate = (second, first) if isinstance(first, int | float) else (first, second)  # type: ignore[assignment]
-    if rate is None:
-        if not isinstance(speech, torch.Tensor):
-            raise FaceDiffError("rate: is missing; give the array's sample rate, as in animate(samples, rate=48000)")
-        rate = SAMPLE_RATE
-    rate = check_number("speech", "rate", rate, *SAMPLE_RATES, remedy="give the rate in Hz")
-    samples = waveform(speech, "speech")  # type: ignore[arg-type]
-    seconds = len(samples) / rate
-    if max_seconds is not None and seconds > max_seconds:
-        raise FaceDiffError(
-            f"speech: lasts {seconds:.0f} s, more than max_seconds {max_seconds:g}; cut it or raise the limit"
-        )
-    LIMITS.check("seconds", seconds, "speech")
-    made = to_speech(samples, rate, "speech")
-    check_speech(made, "speech")
-    return made, "speech"
-
-
-def waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
-    """Samples (S,) with full scale 1 from an array or a tensor; channels, along the shorter axis, are averaged.
-
-    Raises:
-        FaceDiffError: naming ``name``, if it holds no samples or is of another kind.
-    """
-    import numpy as np
-    import torch
-
-    if isinstance(samples, torch.Tensor):
-        samples = samples.detach().cpu()
-        samples = samples.float() if samples.is_floating_point() else samples  # NumPy has no bfloat16
-    array = np.asarray(samples)
-    scale = FULL_SCALE.get(array.dtype.name)
-    if (array.dtype.kind != "f" and scale is None) or array.ndim not in (1, 2) or not array.size:
-        raise FaceDiffError(
-            f"{name}: is {array.dtype} of shape {array.shape}; expected samples (S,) or (S, channels) in floating "
-            f"point, int16, int32 or uint8, or the path of a recording"
-        )
-    with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is refused
-        plain = (
-            array.astype(np.float32)
-            if scale is None
-            else ((array.astype(np.float64) - scale[1]) / scale[0]).astype(np.float32)
-        )
-    if plain.ndim == 2:
-        plain = plain.mean(axis=int(np.argmin(plain.shape)))
-    return plain
-
-
-def mono(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
-    """A piece (n,) of a stream, which may be empty.
-
-    Raises:
-        FaceDiffError: if it has several channels, holds samples that are not finite, or is of another kind.
-    """
-    import numpy as np
-
-    if isinstance(chunk, bytes):
-        from facediff.speech.pcm import samples_of
-
-        if len(chunk) % 2:
-            raise FaceDiffError(f"chunks: one has {len(chunk)} bytes, half a sample too much; give 16-bit samples")
-        return samples_of(chunk)
-    if np.ndim(chunk) != 1:
-        raise FaceDiffError(f"chunks: one has the shape {np.shape(chunk)}; expected mono samples (n,)")
-    if not len(chunk):
-        return np.zeros(0, np.float32)
-    samples = waveform(chunk, "chunks")
-    if not np.isfinite(samples).all():
-        raise FaceDiffError("chunks: one holds samples that are not finite numbers; give a full scale of 1")
-    return samples
+        return list(recordings([Path(speech)]))
+    if not isinstance(speech, list) or (speech and all(isinstance(sample, int | float) for sample in speech)):
+        return None
+    if not speech:
+        raise FaceDiffError("speech: is an empty list; give at least one recording")
+    return speech

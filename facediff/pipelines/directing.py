@@ -10,7 +10,8 @@ From top to bottom: :func:`plan_runs`, which finds out what must be generated; :
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
@@ -230,27 +231,35 @@ def blend(motions: Sequence[Tensor], runs: Sequence[ConditionedRun], frame_rate:
 class DirectedStream:
     """Animates speech while it arrives, as :class:`facediff.models.inference.SpeechStream` does, along keys over time.
 
-    It gives absolute vertices on the processor.
+    It gives absolute vertices (seeds, m, V, 3) as arrays.
 
     Args:
         model: the animating model.
         runs: what is generated.
         identity: whose face.
         seeds: one for each sample.
+        precision: makes a context within which the network computes; the style is encoded within it as well, as it is
+            for a file.
 
     Attributes:
         frames: how many have been given out so far.
     """
 
     def __init__(
-        self, model: AnimationModel, runs: Sequence[ConditionedRun], *, identity: str, seeds: Sequence[int]
+        self,
+        model: AnimationModel,
+        runs: Sequence[ConditionedRun],
+        *,
+        identity: str,
+        seeds: Sequence[int],
+        precision: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
-        self.model, self.runs = model, list(runs)
+        self.model, self.runs, self._precision = model, list(runs), precision
         self.streams: list[SpeechStream] = []
         self.frames = 0
         self._template = model.assets.template(identity)
         for run in self.runs:
-            with model.choosing(run.choices):
+            with precision(), model.choosing(run.choices):
                 stream = model.stream(identity=identity, condition=run.condition, style=run.style, seeds=seeds)
             self.streams.append(stream)
 
@@ -259,15 +268,17 @@ class DirectedStream:
         """Names of the styles of the runs, each once."""
         return list(dict.fromkeys(stream.clip.reference_names[0] for stream in self.streams))
 
-    def feed(self, samples: npt.NDArray[np.float32]) -> Tensor:
-        """Hear more speech (n,) at 16 kHz, and give the vertices (seeds, m, V, 3) that have become certain."""
+    def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Take more speech (n,) at 16 kHz, and give the vertices (seeds, m, V, 3) that have become certain."""
         return self._blended([self._of(run, stream.feed, samples) for run, stream in self._pairs()])
 
-    def finish(self, frames: int | None = None) -> Tensor:
+    def finish(self, frames: int | None = None) -> npt.NDArray[np.float32]:
         """Give the vertices that are left; of so many frames in all, if they are given."""
         return self._blended([self._of(run, stream.finish, frames) for run, stream in self._pairs()])
 
-    def parts(self, speech: npt.NDArray[np.float32], *, progress: Progress | None = None) -> Iterator[Tensor]:
+    def parts(
+        self, speech: npt.NDArray[np.float32], *, progress: Progress | None = None
+    ) -> Iterator[npt.NDArray[np.float32]]:
         """All vertices for a recording, part by part."""
         return in_parts(self, speech, progress=progress)
 
@@ -275,12 +286,13 @@ class DirectedStream:
         return zip(self.runs, self.streams, strict=True)
 
     def _of(self, run: ConditionedRun, step: Any, argument: Any) -> Tensor:  # noqa: ANN401
-        with self.model.choosing(run.choices):
-            made: Tensor = step(argument)
+        with self._precision(), self.model.choosing(run.choices):
+            offsets: Tensor = step(argument)
         # Absolute vertices are blended, as they are in one pass: the two agree to the last bit.
-        return made.cpu() + self._template
+        return offsets.cpu() + self._template
 
-    def _blended(self, motions: Sequence[Tensor]) -> Tensor:
-        made = blend(motions, self.runs, self.model.frame_rate, self.frames)
-        self.frames += made.shape[1]
-        return made
+    def _blended(self, motions: Sequence[Tensor]) -> npt.NDArray[np.float32]:
+        vertices = blend(motions, self.runs, self.model.frame_rate, self.frames)
+        self.frames += vertices.shape[1]
+        array: npt.NDArray[np.float32] = vertices.numpy()
+        return array

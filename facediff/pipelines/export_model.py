@@ -268,9 +268,9 @@ def described_ends(document: onnx.ModelProto) -> dict[str, list[dict[str, Any]]]
 
 def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDArray[Any]], list[str], list[str]]:
     """What ``arrays.npz`` holds, and the names of its styles and faces."""
+    from facediff.editing.expressiveness import rest_weights
     from facediff.models.styles import vector_of
-    from facediff.pipelines.animate import facts_of
-    from facediff.pipelines.rest import rest_weights
+    from facediff.pipelines.trained import facts_of
 
     assets = model.assets
     faces, facts = list(assets.templates), facts_of(assets)

@@ -17,8 +17,8 @@ from facediff.animation.style_files import style_paths
 from facediff.editing.controls import check_controls, keys_file
 from facediff.errors import FaceDiffError, OptionError, choices, printable
 from facediff.export import FORMATS, check_export
-from facediff.models.checkpoint import read_assets
-from facediff.pipelines.animate import AnimationPipeline, check_options, facts_of, on_processor, read_recording
+from facediff.pipelines.animate import check_options, is_exported, open_pipeline
+from facediff.speech.inputs import read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
@@ -90,8 +90,7 @@ def animate_folder(
 
         # Otherwise every process would fit the mesh, and a second run would find a file that decides the outputs and
         # that the records of the first one do not know.
-        facts = facts_of(read_assets(Path(options.checkpoint)), options.identity)
-        neutral = Animation(name=str(options.checkpoint), vertices=facts["template"][None], **facts)
+        neutral = replace(neutral_face(options), name=str(options.checkpoint))
         retarget(neutral, Path(options.target_mesh), correspondence)
     if (directions := directions_folder(options)) is not None:
         check_directions(options, found, directions)
@@ -106,7 +105,7 @@ def animate_folder(
         make_worker=partial(_load_pipeline, quiet, export),
         files=_deciding_files(options, export),
         files_of=partial(_own_files, options),
-        workers=workers or (None if on_processor(options.device) or is_cluster(scheduler) else 1),
+        workers=workers or (None if computes_on_processor(options) or is_cluster(scheduler) else 1),
         scheduler=scheduler,
         retry_failed=retry_failed,
     )
@@ -151,10 +150,9 @@ def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
 
 def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Path]:
     """The files whose content decides the animations."""
-    files = [
-        *model_files(Path(options.checkpoint)),
-        *style_paths(None if options.style is None else str(options.style)),
-    ]
+    source = Path(options.checkpoint)
+    files = sorted(source.iterdir()) if is_exported(source) else model_files(source)
+    files = [*files, *style_paths(None if options.style is None else str(options.style))]
     optional = (
         options.target_mesh,
         options.eyes,
@@ -170,9 +168,30 @@ def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Pa
     return files
 
 
+def computes_on_processor(options: AnimationOptions) -> bool:
+    """Whether the model computes on the processor, of which every process has a share."""
+    if is_exported(options.checkpoint):
+        return True
+    from facediff.pipelines.trained import on_processor
+
+    return on_processor(options.device)
+
+
+def neutral_face(options: AnimationOptions) -> Animation:
+    """One frame of the neutral face."""
+    if is_exported(options.checkpoint):
+        pipeline = open_pipeline(replace(options, target_mesh=None, correspondence=None))
+        return pipeline.bare(pipeline.facts["template"][None])
+    from facediff.models.checkpoint import read_assets
+    from facediff.pipelines.trained import facts_of
+
+    facts = facts_of(read_assets(Path(options.checkpoint)), options.identity)
+    return Animation(name="face", vertices=facts["template"][None], **facts)
+
+
 def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: list[str]) -> Animate:
     """Load what all recordings have in common, once in each process."""
-    pipeline = AnimationPipeline(options)
+    pipeline = open_pipeline(options)
     own = directions_folder(options) is not None
 
     def animate(recording: Path, output: Path) -> None:
@@ -181,8 +200,8 @@ def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: l
             from facediff.editing.direction import read_direction
 
             file = next(iter(_own_files(options, recording)), None)
-            pipeline.direct(None if file is None else read_direction(file, pipeline.model.frame_rate))
-        pipeline.write(speech, recording.stem, output, export, seed=seed_of_recording(recording, options.seed or 0))
+            pipeline.direct(None if file is None else read_direction(file, pipeline.frame_rate))
+        pipeline.write(speech, recording.stem, output, export, seed=seed_of_recording(recording, pipeline.seed))
 
     return animate
 

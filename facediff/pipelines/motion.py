@@ -490,7 +490,7 @@ class SourceReader:
         defaults = None
         if options.checkpoint is not None:
             from facediff.models.checkpoint import read_assets
-            from facediff.pipelines.animate import facts_of as facts_of_assets
+            from facediff.pipelines.trained import facts_of as facts_of_assets
 
             source = options.checkpoint
             assets = read_assets(Path(source)) if isinstance(source, str | Path) else source.module.assets

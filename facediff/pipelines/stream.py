@@ -15,15 +15,13 @@ from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.errors import FaceDiffError, OptionError
-from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
+from facediff.pipelines.animate import check_options, direction_for, open_pipeline
 from facediff.speech.pcm import pcm
-from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic, check_writable
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
-    from torch import Tensor
 
 
 def animate_stream(options: AnimationOptions, output: Path, export: ExportOptions, *, rate: int = 16_000) -> None:
@@ -40,139 +38,30 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
     """
     check_stream(options, output, export)
 
-    pipeline = AnimationPipeline(options)
-    model = pipeline.model
-    plan = model.windows
-    template = model.assets.template(pipeline.identity)
-    busy, heard = 0.0, 0
+    pipeline = open_pipeline(options)
+    template = pipeline.facts["template"]
+    busy, received = 0.0, 0
     with sink(output, tuple(template.shape)) as write, ended_by_interrupt() as read:
-        live = LiveAnimation(pipeline, rate=rate)
+        stream = pipeline.stream(rate)
         report(
             f"ready; look-ahead {pipeline.look_ahead:.2f} s and the time that a window takes; "
-            f"{plan.in_frames(model.frame_rate).hop} frames at a time, {model.frame_rate:g} a second, "
+            f"{pipeline.windows.in_frames(pipeline.frame_rate).hop} frames at a time, {pipeline.frame_rate:g} a "
+            f"second, "
             f"{len(template)} vertices; reading {rate} Hz, 16 bit"
         )
         for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
-            part = live.feed(samples)
+            part = stream.feed(samples)
             busy += time.perf_counter() - started
-            heard += len(samples)
+            received += len(samples)
             write(part)
-        if not heard:
+        if not received:
             raise FaceDiffError("standard input: ended before any sample came; send 16-bit mono PCM to it")
         started = time.perf_counter()
-        part = live.finish()
+        part = stream.finish()
         busy += time.perf_counter() - started
         write(part)
-    report(f"{heard / rate:.2f} s of speech; real-time factor {busy / max(heard / rate, 1e-9):.2f}")
-
-
-class LiveAnimation:
-    """Animates speech of any length and any sample rate while it arrives; memory does not grow with its length.
-
-    The frames are those of the recording as a whole, however the speech is cut into pieces.
-
-    Args:
-        pipeline: the model with its options, of which this keeps what is chosen now.
-        rate: sample rate of the speech.
-
-    Raises:
-        FaceDiffError: if the style or the windows do not fit the model.
-    """
-
-    def __init__(self, pipeline: AnimationPipeline, *, rate: int = SAMPLE_RATE) -> None:
-        import numpy as np
-
-        from facediff.speech.audio import resampler
-
-        self._pipeline, model, self._seed = pipeline, pipeline.model, pipeline.options.seed or 0
-        self._chosen = model.choices()
-        self._template = model.assets.template(pipeline.identity)
-        self._convert = None if rate == SAMPLE_RATE else resampler(rate)
-        with pipeline.precision():  # the style is encoded within it as well, as it is for a file
-            self._stream = pipeline.stream([self._seed])
-
-        self._rest = pipeline.rest
-        self._openness = None if self._rest is None else self._rest.openness()
-        self._face = pipeline.face
-        if self._face is not None:
-            self._face.refuse_whole_animation()
-        self._performer = pipeline.performer(self._seed)
-        # Frames of the model, how far their mouths may be open, and how they are acted, whichever is certain first.
-        self._held = np.zeros((0, *self._template.shape), np.float32)
-        self._opened = np.zeros(0, np.float32)
-        self._acted = np.zeros((0, 5))
-        self._given = 0
-
-    @property
-    def made(self) -> int:
-        """Frames that the model has generated so far; some of them may wait for the gate or for acting."""
-        return self._stream.frames
-
-    def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Hear samples (n,), and give the frames (m, V, 3) that are certain now; m may be 0."""
-        speech = samples if self._convert is None else self._convert(samples, False)
-        return self._hear(speech)
-
-    def _hear(self, speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """The frames that are certain after more speech (n,) at 16 kHz."""
-        import numpy as np
-
-        with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
-            made = self._first(self._stream.feed(speech))
-        if self._openness is not None:
-            self._opened = np.concatenate([self._opened, self._openness.feed(speech)])
-        if self._performer is not None:
-            self._acted = np.concatenate([self._acted, self._performer.feed(speech)])
-        return self._finished(made)
-
-    def _finished(self, made: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """With more frames of the model, those of which all is known, with the mouth at rest in pauses, and acted."""
-        import numpy as np
-
-        if self._openness is None and self._performer is None and self._face is None:
-            return made
-        held = np.concatenate([self._held, made]) if len(self._held) else made
-        count = len(held)
-        if self._openness is not None:
-            count = min(count, len(self._opened))
-        if self._performer is not None:
-            count = min(count, len(self._acted))
-        part, opened, moves = held[:count], self._opened[:count], self._acted[:count]
-        self._held, self._opened, self._acted = held[count:], self._opened[count:], self._acted[count:]
-        if self._openness is not None:
-            part = self._pipeline.at_rest(part, opened)
-        if self._face is not None and count:
-            animation = self._pipeline.animation_of(part)
-            acted = None if self._performer is None else moves
-            part = self._face.apply(animation, seed=self._seed, start=self._given, acted=acted).vertices
-        self._given += count
-        return part
-
-    def finish(self) -> npt.NDArray[np.float32]:
-        """The frames (m, V, 3) that are left.
-
-        Raises:
-            FaceDiffError: if the speech was shorter than a frame.
-        """
-        import numpy as np
-
-        with self._pipeline.model.choosing(self._chosen), self._pipeline.precision():
-            last = []
-            if self._convert is not None:
-                rest = self._convert(np.zeros(0, np.float32), True)
-                last.append(self._hear(rest))
-            made = self._first(self._stream.finish())
-        if self._openness is not None:
-            self._opened = np.concatenate([self._opened, self._openness.finish(self._stream.frames)])
-        if self._performer is not None:
-            self._acted = np.concatenate([self._acted, self._performer.finish(self._stream.frames)])
-        return np.concatenate([*last, self._finished(made)])
-
-    def _first(self, motion: Tensor) -> npt.NDArray[np.float32]:
-        """Vertices of the first sample."""
-        vertices: npt.NDArray[np.float32] = motion[0].numpy()
-        return vertices
+    report(f"{received / rate:.2f} s of speech; real-time factor {busy / max(received / rate, 1e-9):.2f}")
 
 
 WHOLE = (
@@ -230,7 +119,7 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
     """
     stopped = reading = False
 
-    def hear(*_: object) -> None:
+    def interrupt(*_: object) -> None:
         nonlocal stopped
         if stopped:
             raise KeyboardInterrupt
@@ -252,7 +141,7 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
     if not mine or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield os.read
         return
-    signal.signal(signal.SIGINT, hear)
+    signal.signal(signal.SIGINT, interrupt)
     try:
         yield read
     finally:

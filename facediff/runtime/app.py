@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from facediff.errors import FaceDiffError
-from facediff.runtime.gated import GatedStream
+from facediff.runtime.gated import gated_stream
 from facediff.runtime.model import RuntimeModel, real_time_factor
 from facediff.speech.pcm import pcm
 from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, read_gate
@@ -20,6 +20,7 @@ from facediff.version import __version__
 
 if TYPE_CHECKING:
     from facediff.animation.options import ExportOptions
+    from facediff.speech.stream import AnimationStream
 
 
 def parser() -> argparse.ArgumentParser:
@@ -107,7 +108,7 @@ def run(options: argparse.Namespace) -> None:
     gate = None if options.no_voice_gate else read_gate(QUICK_GATE if options.low_latency else USUAL_GATE)
     choices = {name: getattr(options, name) for name in ("identity", "condition", "style", "seed", "expressivity")}
     if streamed:
-        stream = GatedStream(model.stream(**choices, gate=gate))
+        stream = gated_stream(model.stream(**choices, gate=gate))
         for frames in animated(stream, sys.stdin.buffer):
             sys.stdout.buffer.write(np.ascontiguousarray(frames, "<f4").tobytes())
             sys.stdout.buffer.flush()
@@ -130,7 +131,7 @@ def export_options(options: argparse.Namespace) -> ExportOptions:
     return ExportOptions(shapes=options.shapes)
 
 
-def animated(stream: GatedStream, source: IO[bytes]) -> Iterator[np.ndarray]:
+def animated(stream: AnimationStream, source: IO[bytes]) -> Iterator[np.ndarray]:
     """Vertices (frames, V, 3) of samples that arrive, as soon as they are certain."""
     heard = False
     for samples in pcm(source, SAMPLE_RATE):

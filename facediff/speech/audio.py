@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError
 from facediff.speech.cut_short import refuse_cut_short
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
@@ -65,6 +65,20 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
     return to_speech(samples, rate, str(path))
 
 
+def read_sound(file: IO[bytes], name: str, *, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
+    """Read an open sound file, such as ``io.BytesIO`` of a .wav, as :func:`read_speech` reads one on disk.
+
+    Raises:
+        FaceDiffError: naming ``name``, if it is no sound file, too long, or holds values that are not finite.
+    """
+    length = _Length(Path(name), max_seconds)
+    with open_sound(file, name) as sound:
+        samples, rate = _decoded(sound, length)
+    if not len(samples):
+        raise FaceDiffError(f"{name}: holds no samples; expected a recording of speech")
+    return to_speech(samples, rate, name)
+
+
 def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.NDArray[np.float32]:
     """Samples (S,) or (S, channels), full scale 1, at any rate as (S',) float32 mono at 16 kHz.
 
@@ -111,8 +125,8 @@ class _Length:
         """
         seconds = samples / rate
         if self.most is not None and seconds > self.most:
-            raise FaceDiffError(
-                f"{self.path}: lasts {seconds:.0f} s, more than --max-seconds {self.most:g}; cut it or raise the limit"
+            raise OptionError(
+                "max_seconds", f"{self.path} lasts {seconds:.0f} s; cut it or raise the limit", f"{self.most:g}"
             )
         LIMITS.check("seconds", seconds, self.path)
 
@@ -155,20 +169,24 @@ def _reason(path: Path, error: Exception) -> str:
 def _decode(path: Path, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
     """All samples (S,) of a recording, its channels averaged."""
     with open_sound(path) as file:
-        declared, rate = int(file.frames), int(file.samplerate)
-        known = 0 <= declared < UNKNOWN
-        if known:
-            length.check(declared, rate)
-        parts, decoded = [], 0
-        while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
-            decoded += len(block)
-            length.check(decoded, rate)
-            parts.append(block[:, 0].copy() if file.channels == 1 else block.mean(axis=1))
-        # Without a frame that tells the number of frames, the length of an mp3 is an estimate.
-        if known and decoded < declared and file.format != "MP3":
-            raise FaceDiffError(
-                f"{path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
-            )
+        return _decoded(file, length)
+
+
+def _decoded(file: Any, length: _Length) -> tuple[npt.NDArray[np.float32], int]:  # noqa: ANN401 - a SoundFile
+    declared, rate = int(file.frames), int(file.samplerate)
+    known = 0 <= declared < UNKNOWN
+    if known:
+        length.check(declared, rate)
+    parts, decoded = [], 0
+    while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
+        decoded += len(block)
+        length.check(decoded, rate)
+        parts.append(block[:, 0].copy() if file.channels == 1 else block.mean(axis=1))
+    # Without a frame that tells the number of frames, the length of an mp3 is an estimate.
+    if known and decoded < declared and file.format != "MP3":
+        raise FaceDiffError(
+            f"{length.path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
+        )
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
 
 

@@ -451,3 +451,34 @@ def speech_problems(speech: Wave) -> list[str]:
         else:
             found.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
     return found
+
+
+class MouthAtRest:
+    """Brings the mouth of one face to rest in pauses; the upper face keeps its motion.
+
+    Where the gate is open, the motion is bit for bit the model's.
+
+    Args:
+        gate: finds speech.
+        template: neutral face (V, 3); at rest, the mouth is its mouth.
+        weights: how far each vertex (V,) goes to rest.
+        frame_rate: of the motion.
+    """
+
+    def __init__(
+        self, gate: VoiceGate, template: npt.NDArray[np.floating], weights: npt.NDArray[np.float32], frame_rate: float
+    ) -> None:
+        self.gate, self.frame_rate = gate, frame_rate
+        self.template, self.weights = np.asarray(template, np.float32), weights
+
+    def openness(self) -> Openness:
+        """The openness of a recording that has not begun yet."""
+        return Openness(self.gate, self.frame_rate)
+
+    def openness_of(self, speech: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
+        """The openness of each frame (frames,) of a recording (S,)."""
+        return openness(speech, frames, self.frame_rate, self.gate)
+
+    def apply(self, vertices: npt.NDArray[np.float32], openness: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Vertices (T, V, 3) with the mouth as far at rest as the openness (T,) says."""
+        return toward_rest(vertices, openness, self.template, self.weights)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import shutil
+import typing
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,10 +14,11 @@ import soundfile
 import torch
 
 import facediff
+from facediff.animation.options import AnimateKeywords, StreamKeywords
 from facediff.cli.app import main
 from facediff.models import Style
-from facediff.pipelines.animator import speech_of
 from facediff.pipelines.words import python_words
+from facediff.speech.inputs import speech_of
 
 
 @pytest.fixture
@@ -177,7 +181,7 @@ def test_what_is_no_model_is_refused(
     with pytest.raises(facediff.FaceDiffError, match=named):
         facediff.load(source)  # type: ignore[arg-type]
     with pytest.raises(facediff.FaceDiffError, match="device"):
-        facediff.pipelines.animate.usable_device("cuda:99")
+        facediff.pipelines.trained.usable_device("cuda:99")
 
 
 def test_stream_is_the_recording_by_windows_however_it_is_cut(model: facediff.Animator, tmp_path: Path) -> None:
@@ -266,3 +270,82 @@ def test_models_that_were_just_made_or_saved_animate_alike(
         assert said in repr(model)
     assert model.identities[0] == "F1"
     assert "F4" in model.other_identities
+
+
+def test_a_list_and_a_folder_give_what_each_recording_gives_alone(
+    model: facediff.Animator, speech: Path, tmp_path: Path
+) -> None:
+    alone = [model.animate(speech, seed=3, steps=2), model.animate(TONE, 16000, seed=3, steps=2)]
+    together = model.animate([speech, (TONE, 16000)], seed=3, steps=2)
+    assert isinstance(together, list)
+    assert [animation.name for animation in together] == ["tone", "speech"]
+    for animation, expected in zip(together, alone, strict=True):
+        assert isinstance(animation, facediff.Animation)
+        np.testing.assert_array_equal(animation.vertices, expected.vertices)
+    several = model.animate([TONE, TONE[:9000]], 16000, samples=2, steps=1)
+    assert [len(samples) for samples in several] == [2, 2]
+    (tmp_path / "recordings").mkdir()
+    for name in "ba":
+        shutil.copy(speech, tmp_path / "recordings" / f"{name}.wav")
+    assert [each.name for each in model.animate(tmp_path / "recordings", steps=1)] == ["a", "b"]
+    for options in ({"alignment": "a.csv"}, {"transcript": "hello"}, {"name": "x"}):
+        with pytest.raises(facediff.FaceDiffError, match=next(iter(options))):
+            model.animate([speech, speech], **options)  # type: ignore[call-overload]
+    with pytest.raises(facediff.FaceDiffError, match="empty list"):
+        model.animate([])
+
+
+def test_progress_is_reported_to_a_function(model: facediff.Animator) -> None:
+    reports: list[tuple[int, int]] = []
+    model.animate(TONE, 16000, steps=3, progress=lambda done, total: reports.append((done, total)))
+    assert reports == [(1, 3), (2, 3), (3, 3)]
+    reports.clear()
+    long = np.tile(TONE, 3)
+    model.animate(long, 16000, steps=1, low_latency=True, progress=lambda *report: reports.append(report))
+    assert reports == [(1, 3), (2, 3), (3, 3)], "seconds of speech"
+
+
+def test_low_latency_gives_the_frames_of_its_stream(model: facediff.Animator) -> None:
+    whole = model.animate(TONE, 16000, low_latency=True, seed=2)
+    parts = [*model.stream(np.array_split(TONE, 9), low_latency=True, seed=2)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole.vertices)
+    assert not np.array_equal(whole.vertices, model.animate(TONE, 16000, seed=2).vertices)
+
+
+def test_data_type_is_the_precision_of_the_command(model: facediff.Animator) -> None:
+    half = model.animate(TONE, 16000, steps=2, precision="bf16")
+    assert half.metadata["precision"] == "bfloat16 and float32"
+    for dtype in ("bfloat16", torch.bfloat16):
+        np.testing.assert_array_equal(model.animate(TONE, 16000, steps=2, dtype=dtype).vertices, half.vertices)
+    other = facediff.Animator(model.module, model.source)
+    assert other.to("cpu", torch.bfloat16) is other
+    np.testing.assert_array_equal(other.animate(TONE, 16000, steps=2).vertices, half.vertices)
+    full = other.to("auto" if not torch.cuda.is_available() else "cpu", "float32").animate(TONE, 16000, steps=2)
+    assert not np.array_equal(full.vertices, half.vertices)
+    for options in ({"dtype": "float16"}, {"dtype": "float32", "precision": "bf16"}):
+        with pytest.raises(facediff.FaceDiffError, match="dtype"):
+            model.animate(TONE, 16000, **options)  # type: ignore[call-overload]
+    with pytest.raises(facediff.FaceDiffError, match="device cuda:99"):
+        other.to("cuda:99")
+
+
+def test_random_seed_is_recorded(model: facediff.Animator) -> None:
+    drawn = model.animate(TONE, 16000, steps=2, seed=None)
+    again = model.animate(TONE, 16000, steps=2, seed=int(drawn.metadata["seed"]))
+    np.testing.assert_array_equal(drawn.vertices, again.vertices)
+    assert model.animate(TONE, 16000, steps=1, seed=None).metadata["seed"] != drawn.metadata["seed"]
+
+
+def test_help_shows_every_keyword_with_its_text() -> None:
+    signature = inspect.signature(facediff.Animator.animate)
+    assert signature.parameters["steps"].default is None
+    assert {*option_names(AnimateKeywords), "speech", "rate", "progress", "dtype"} <= {*signature.parameters}
+    text = str(inspect.getdoc(facediff.Animator.stream))
+    for name in option_names(StreamKeywords):
+        assert f"    {name}: " in text
+    with pytest.raises(TypeError, match=r"'stps'.*steps"):
+        facediff.Animator.animate(None, TONE, stps=3)  # type: ignore[call-overload]
+
+
+def option_names(keywords: type) -> list[str]:
+    return list(typing.get_type_hints(keywords))

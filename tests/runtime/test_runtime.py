@@ -28,7 +28,7 @@ from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler,
 from facediff.pipelines.export_model import Precision, export_model, store_weights
 from facediff.runtime import RuntimeModel
 from facediff.runtime.app import main
-from facediff.runtime.gated import GatedStream
+from facediff.runtime.gated import gated_stream
 from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
 from facediff.runtime.styles import read_style
 from facediff.speech.voice_activity import QUICK_GATE, EnergyGate, read_gate
@@ -177,7 +177,7 @@ def test_low_latency_gives_what_the_model_gives(model: AnimationModel, folder: P
     assert largest(found.vertices, wanted) < 1e-4
     assert largest(usual, wanted) > 1e-3
     assert found.metadata["sampler"].endswith("2 steps")
-    stream = GatedStream(runtime.stream(identity="B", seed=1, gate=read_gate(QUICK_GATE)))
+    stream = gated_stream(runtime.stream(identity="B", seed=1, gate=read_gate(QUICK_GATE)))
     made = np.concatenate([*map(stream.feed, np.split(speech, [1, 9000])), stream.finish()])
     gated = runtime.animate(speech, identity="B", seed=1, gate=read_gate(QUICK_GATE)).vertices
     assert np.abs(made - gated).max() < 1e-6 * np.ptp(gated)
@@ -186,7 +186,7 @@ def test_low_latency_gives_what_the_model_gives(model: AnimationModel, folder: P
 def test_gated_stream_gives_what_the_file_gives(folder: Path) -> None:
     runtime = RuntimeModel.open(folder)
     speech = np.concatenate([np.zeros(20_000, np.float32), sound(2.0), np.zeros(20_000, np.float32)])
-    stream = GatedStream(runtime.stream(identity="A", seed=2))
+    stream = gated_stream(runtime.stream(identity="A", seed=2))
     made = np.concatenate([*map(stream.feed, np.split(speech, [1, 9000, 40_000])), stream.finish()])
     wanted = runtime.animate(speech, identity="A", seed=2).vertices
     assert np.abs(made - wanted).max() < 1e-6 * np.ptp(wanted)

@@ -1,0 +1,248 @@
+"""A trained model as a pipeline: motion generated with PyTorch, in one pass, by windows and in streams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from facediff.animation.options import AnimationOptions
+from facediff.editing.direction import Direction
+from facediff.errors import OptionError
+from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
+from facediff.utils.files import valid_text
+from facediff.utils.hub import model_name
+from facediff.utils.licences import licence_metadata
+
+if TYPE_CHECKING:
+    from facediff.data import Assets, Reference
+    from facediff.models import AnimationModel, Style
+    from facediff.pipelines.animate import Array
+    from facediff.pipelines.directing import DirectedStream
+
+
+class TrainedPipeline(AnimationPipeline):
+    """Animates recordings with a trained model.
+
+    Args:
+        options: the choices.
+        model: a model that is loaded already, on its device; it keeps what the options choose. None to load the
+            checkpoint.
+
+    Raises:
+        FaceDiffError: if the checkpoint, the style or another option cannot be used.
+    """
+
+    def __init__(self, options: AnimationOptions, *, model: AnimationModel | None = None) -> None:
+        if model is None:
+            from facediff.models import load_model
+
+            model = load_model(
+                Path(options.checkpoint), usable_device(options.device), commercial_only=options.commercial_only
+            )
+        self.model = model
+        if options.low_latency:
+            model.choose_low_latency()
+        if options.sampler is not None or options.steps is not None:
+            model.choose_sampler(options.sampler, options.steps)
+        if options.guidance is not None:
+            model.choose_guidance(read_scales(options.guidance))
+        model.windows = model.windows.chosen(options.window, options.overlap)
+        self.identity = options.identity or model.identities[0]
+        model.check_condition(options.condition)
+        face = facts_of(model.assets, self.identity)
+        self.options, self.facts = options, face
+        if options.expressivity is not None:
+            self._choose_expressivity()
+        self.style: Reference | Style | None = None
+        if options.style is not None and not (isinstance(options.style, str) and not options.style):
+            from facediff.models.styles import style_from
+
+            self.style = style_from(options.style, self.identity, model, template=options.style_template)
+
+        def rest_weights() -> Array:
+            from facediff.editing.expressiveness import rest_weights
+
+            return rest_weights(face["template"], face["regions"])
+
+        super().__init__(
+            options,
+            face=face,
+            windows=model.windows,
+            model=type(model).__name__,
+            samples=model.samples,
+            rest_weights=rest_weights,
+        )
+        steps = getattr(getattr(model, "sampler", None), "steps", 1)
+        self.step_seconds *= steps * len(self.runs)
+
+    @property
+    def corpus(self) -> str:
+        """What errors call the model's faces."""
+        return f"the checkpoint's corpus {self.model.assets.corpus}"
+
+    def direct(self, direction: Direction | None) -> None:
+        """Follow other keys over time from now on."""
+        from facediff.pipelines.directing import plan_runs
+
+        options = self.options
+        if direction is not None and self.style is not None:
+            direction.refuse_both("style")
+        self.runs = plan_runs(
+            direction, self.model, self.identity, self.style, options.condition, options.style_template
+        )
+        super().direct(direction)
+
+    def frames_of(self, samples: int) -> int:
+        """How many frames the model gives for so many samples of speech."""
+        return self.model.frames_of(samples)
+
+    def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
+        """Absolute vertices: in one part for short speech, by windows for long speech."""
+        if not self.windows.in_one_pass(self.frames_of(len(speech)), self.frame_rate):
+            stream = self._directed(seeds)
+            for part in stream.parts(speech, progress=partial(self.track, description="seconds of speech")):
+                yield [*part]
+            self.style_name = ", ".join(stream.style_names)
+            return
+        import torch
+
+        from facediff.pipelines.directing import blend
+
+        audio, motions = torch.from_numpy(speech).to(self.model.device), []
+        styles: dict[str, None] = {}
+        for run in self.runs:
+            with self.precision(), self.model.choosing(run.choices):
+                samples = self.model.animate_samples(
+                    audio,
+                    identity=self.identity,
+                    condition=run.condition,
+                    style=run.style,
+                    seeds=seeds,
+                    progress=partial(self.track, description="sampling"),
+                )
+            motions.append(torch.stack([sample.vertices for sample in samples]))
+            styles[samples[0].reference_name] = None
+        self.style_name = ", ".join(styles)
+        yield [*blend(motions, self.runs, self.frame_rate).numpy()]
+
+    def generator(self) -> FirstSample:
+        """What generates vertices while speech arrives."""
+        return FirstSample(self._directed([self.seed]))
+
+    def metadata(self, seed: int) -> dict[str, str]:
+        """What an animation says of the model and its choices."""
+        assets, sampler = self.model.assets, getattr(self.model, "sampler", None)
+        trained_on = assets.identity_index(self.identity) >= 0
+        is_half = self.options.precision == "bf16"
+        metadata = {
+            "model": type(self.model).__name__,
+            "checkpoint": valid_text(model_name(self.options.checkpoint)),
+            "corpus": f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus,
+            **licence_metadata(self.model.licences),
+            "identity": self.identity if trained_on else f"{self.identity} (not trained on)",
+            "style": self.style_name,
+            "seed": str(seed),
+            "precision": "bfloat16 and float32" if is_half else "float32",
+        }
+        if self.options.condition is not None:
+            metadata["condition"] = self.options.condition
+        if sampler is not None:
+            metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
+        return metadata
+
+    def precision(self) -> AbstractContextManager[object]:
+        """Within it the network multiplies in the precision asked for; noise and vertices stay as they are."""
+        import torch
+
+        return torch.autocast(self.model.device.type, torch.bfloat16, enabled=self.options.precision == "bf16")
+
+    def _directed(self, seeds: Sequence[int]) -> DirectedStream:
+        from facediff.pipelines.directing import DirectedStream
+
+        return DirectedStream(self.model, self.runs, identity=self.identity, seeds=seeds, precision=self.precision)
+
+    def _choose_expressivity(self) -> None:
+        """Take over the options' expressivity, which may differ between the face's regions."""
+        from facediff.editing.expressiveness import ALL, region_factors
+
+        factors, name = expressivity_of(self.options), type(self.model).__name__
+        if not self.model.samples and {*factors.values()} != {1.0}:
+            raise OptionError(
+                "expressivity",
+                f"{name} makes one animation and no samples around a mean; omit the option",
+                self.options.expressivity,
+            )
+        if {*factors} == {ALL}:
+            self.model.choose_expressivity(factors[ALL])
+            return
+        import torch
+
+        # A region's number fades into the rest as those of expressiveness do, so that no edge is visible.
+        vertex_factors = region_factors(self.facts["template"], self.facts["regions"], factors, self.corpus)
+        self.model.choose_expressivity(torch.from_numpy(vertex_factors).float())
+
+
+class FirstSample:
+    """The only sample of a stream with one seed."""
+
+    def __init__(self, stream: DirectedStream) -> None:
+        self._stream = stream
+
+    @property
+    def frames(self) -> int:
+        """Frames that have been generated so far."""
+        return self._stream.frames
+
+    def feed(self, samples: Array) -> Array:
+        """The frames (m, V, 3) that more speech (n,) at 16 kHz makes certain."""
+        return self._stream.feed(samples)[0]
+
+    def finish(self) -> Array:
+        """The frames (m, V, 3) that are left."""
+        return self._stream.finish()[0]
+
+
+def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
+    """A checkpoint's assets as :class:`facediff.animation.Animation` takes them.
+
+    The neutral face is that of ``identity``, the first one trained on if None.
+    """
+    import numpy as np
+
+    def array(value: object, kind: type) -> object:
+        return None if value is None else np.asarray(value, kind)
+
+    return {
+        "template": array(assets.template(identity or assets.identities[0]), np.float32),
+        "faces": array(assets.faces, np.int32),
+        "frame_rate": assets.frame_rate,
+        "unit": assets.unit,
+        "colours": array(assets.colours, np.uint8),
+        "regions": {name: np.asarray(indices, np.int64) for name, indices in assets.regions.items()},
+        "inner_lip_pairs": array(assets.inner_lip_pairs, np.int64),
+    }
+
+
+def on_processor(device: str) -> bool:
+    """Whether a device is the processor, of which every process has a share."""
+    import torch
+
+    return device == "cpu" or (device == "auto" and not torch.cuda.is_available())
+
+
+def usable_device(name: str) -> str:
+    """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere."""
+    import torch
+
+    if name == "auto":
+        name = "cpu" if on_processor(name) else "cuda"
+    try:
+        # Memory is allocated and read back, which devices that exist in name only cannot do (meta).
+        float(torch.ones(1, device=torch.device(name)).sum())
+    except Exception as error:  # each backend raises its own, down to NotImplementedError and ImportError
+        reason = next(iter(str(error).splitlines()), "")[:200]
+        raise OptionError("device", f"not usable on this machine ({reason}); try {{device}} cpu", name) from error
+    return name

@@ -1,0 +1,57 @@
+"""Speech in the forms that Python gives it in; arrays and tensors are tried in tests/pipelines/test_animator.py."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.errors import FaceDiffError
+from facediff.speech.inputs import speech_of
+
+TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A second in stereo at 22 050 Hz, 16 bits."""
+    path = tmp_path / "tone.wav"
+    soundfile.write(path, np.stack([TONE, -0.5 * TONE], 1), 22050, subtype="PCM_16")
+    return path
+
+
+def test_open_files_and_audio_of_data_sets_are_the_recording(recording: Path) -> None:
+    expected, _ = speech_of(recording)
+    content = recording.read_bytes()
+    samples, rate = soundfile.read(recording)
+    with recording.open("rb") as file:
+        forms = {
+            "open file": (file, "tone"),
+            "content": (io.BytesIO(content), "speech"),
+            "bytes of a data set": ({"bytes": content, "path": "clips/a.wav"}, "a"),
+            "path of a data set": ({"bytes": None, "path": str(recording)}, "tone"),
+            "decoded audio of a data set": ({"array": samples.T, "sampling_rate": rate, "path": None}, "speech"),
+        }
+        for form, (speech, name) in forms.items():
+            found, found_name = speech_of(speech)  # type: ignore[arg-type]
+            assert found_name == name, form
+            np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7, err_msg=form)
+
+
+@pytest.mark.parametrize(
+    ("speech", "rate", "problem"),
+    [
+        (io.BytesIO(b"no sound"), None, "speech"),
+        (io.BytesIO(b""), None, "speech"),
+        (io.BytesIO(b"RIFF"), 16000, "rate"),
+        ({"text": "hello"}, None, "sampling_rate"),
+        ({"array": TONE, "sampling_rate": 16000}, 8000, "rate"),
+        ({"array": TONE[:100], "sampling_rate": 16000}, None, "lasts"),
+    ],
+)
+def test_what_is_no_speech_is_refused(speech: object, rate: float | None, problem: str) -> None:
+    with pytest.raises(FaceDiffError, match=problem):
+        speech_of(speech, rate)  # type: ignore[arg-type]
