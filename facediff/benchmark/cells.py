@@ -126,11 +126,7 @@ class Row:
 
 
 def rows_of(plan: BenchmarkPlan) -> list[Row]:
-    """The rows of a plan, in its order; where there are variants, each method once for each of them.
-
-    Raises:
-        FaceDiffError: if the baseline is none of them.
-    """
+    """The rows of a plan, in its order; where there are variants, each method once for each of them."""
     rows: list[Row] = []
     # Where one method alone is trained, its variants are the rows, and their names say enough.
     alone = sum(method.config is not None for method in plan.methods.values()) == 1
@@ -155,11 +151,7 @@ def rows_of(plan: BenchmarkPlan) -> list[Row]:
 
 
 def cells_of(plan: BenchmarkPlan) -> list[Cell]:
-    """All cells, seed by seed, so that a plan that is stopped early has whole columns of few seeds.
-
-    Raises:
-        FaceDiffError: if a file or a folder is missing.
-    """
+    """All cells, seed by seed, so that a plan that is stopped early has whole columns of few seeds."""
     cells = [
         cell
         for row in rows_of(plan)
@@ -290,11 +282,7 @@ def _config_content(path: Path | None) -> object:
 
 
 def config_content(path: Path) -> object:
-    """The plain data of a config, with those of the configs that it names in their place: comments do not count.
-
-    Raises:
-        FaceDiffError: if one is not readable.
-    """
+    """The plain data of a config, with those of the configs that it names in their place: comments do not count."""
     return _expanded(path, ())
 
 

@@ -43,11 +43,7 @@ def write_outline(folder: Path, outline: ReportOutline) -> None:
 
 
 def read_outline(folder: Path) -> ReportOutline:
-    """The outline of a benchmark's folder.
-
-    Raises:
-        FaceDiffError: if the folder is none of a benchmark, or the file is damaged.
-    """
+    """The outline of a benchmark's folder."""
     path, remedy = folder / FILE, "expected a folder that `facediff benchmark` wrote; run it again"
     if not path.is_file():
         raise FaceDiffError(f"{folder}: holds no {FILE}; expected the folder of a benchmark, such as benchmarks/quick")
@@ -75,11 +71,7 @@ def read_outline(folder: Path) -> ReportOutline:
 
 
 def read_results(folder: Path, outline: ReportOutline) -> tuple[list[Result], list[str]]:
-    """The results of a benchmark's cells, and the names of those that have none yet.
-
-    Raises:
-        FaceDiffError: if a file is damaged.
-    """
+    """The results of a benchmark's cells, and the names of those that have none yet."""
     results, missing = [], []
     for name in outline.cells:
         result = read_result(folder / CELLS / f"{name}.json")

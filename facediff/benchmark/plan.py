@@ -248,11 +248,7 @@ class Section:
 
 
 def find_plan(path: Path) -> Path:
-    """The file of a plan; those that begin with ``configs/`` are installed with the package.
-
-    Raises:
-        FaceDiffError: if there is none.
-    """
+    """The file of a plan; those that begin with ``configs/`` are installed with the package."""
     if path.is_file():
         return path
     bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / path
@@ -268,9 +264,6 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
     Args:
         path: a YAML file.
         roots: folders of corpora by the plan's names, which override the plan's.
-
-    Raises:
-        FaceDiffError: naming the key that is wrong, and what was expected.
     """
     return plan_of(load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path, roots or {})
 
@@ -396,11 +389,7 @@ def _beside(plan: Path, text: str) -> Path:
 
 
 def find_config(text: str, place: str, plan: Path) -> Path:
-    """The file of a config: bundled ones begin with ``configs/``.
-
-    Raises:
-        FaceDiffError: if there is none.
-    """
+    """The file of a config: bundled ones begin with ``configs/``."""
     bundled = config_dir() / text.removeprefix("configs/")
     own = _beside(plan, text)
     if own.is_file():

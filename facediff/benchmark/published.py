@@ -74,11 +74,7 @@ def published() -> dict[str, Published]:
 
 
 def find_published(names: Sequence[str]) -> list[Published]:
-    """Tables by their names.
-
-    Raises:
-        FaceDiffError: if there is none of a name.
-    """
+    """Tables by their names."""
     for name in names:
         if name not in published():
             raise FaceDiffError(f"published: there is no table {name!r}: {choices(name, published())}")

@@ -230,11 +230,7 @@ def predictions_result(
     measured: Mapping[str, Mapping[str, float | None]],
     shown: str,
 ) -> Result:
-    """The result of a cell from what ``facediff evaluate`` wrote; clips outside the test splits do not count.
-
-    Raises:
-        FaceDiffError: if no clip of a test split was predicted.
-    """
+    """The result of a cell from what ``facediff evaluate`` wrote; clips outside the test splits do not count."""
     (method,) = report["methods"]
     facts = {score["metric"]: score for score in method["scores"]}
     columns = {name: {"pooling": score["pooling"], "better": score["better"]} for name, score in facts.items()}

@@ -125,11 +125,7 @@ def record_failure(folder: Path, cell: Cell, problem: str) -> None:
 
 
 def run_cell(setting: Setting, cell: Cell) -> Result:
-    """Do all that a cell needs, and write its result.
-
-    Raises:
-        FaceDiffError: if a command fails; its log is named.
-    """
+    """Do all that a cell needs, and write its result."""
     folder = setting.folder / RUNS / cell.folder_name
     folder.mkdir(parents=True, exist_ok=True)
     machine = machine_of(setting.threads)
@@ -189,11 +185,7 @@ class Runner:
         self.measured: dict[str, dict[str, float | None]] = {}
 
     def fit(self, training: Training, checkpoints: Mapping[str, Path], cell: Cell) -> Path:
-        """Train, or continue a training that was stopped; the checkpoint.
-
-        Raises:
-            FaceDiffError: if the training fails.
-        """
+        """Train, or continue a training that was stopped; the checkpoint."""
         place = self.folder / training.name
         state = read_json(place / STATE) or {}
         last = place / LAST
@@ -223,11 +215,7 @@ class Runner:
         return checkpoint
 
     def run(self, step: str, arguments: Sequence[str]) -> None:
-        """Run a facediff command to its end.
-
-        Raises:
-            FaceDiffError: with what the command reported, if it fails.
-        """
+        """Run a facediff command to its end."""
         log = self._log
         log.parent.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(self.setting.threads))}
@@ -263,11 +251,7 @@ def fit_options(training: Training, checkpoints: Mapping[str, Path], cell: Cell)
 
 
 def refuse_changed(training: Training, cell: Cell) -> None:
-    """Refuse a config that was edited since the cells were made: its result would bear the hash of what it was.
-
-    Raises:
-        FaceDiffError: naming the config.
-    """
+    """Refuse a config that was edited since the cells were made: its result would bear the hash of what it was."""
     (hashed,) = (entry["config"] for entry in cell.trained["trainings"] if entry["name"] == training.name)
     if hash_of(config_content(training.config)) != hash_of(hashed):
         raise FaceDiffError(

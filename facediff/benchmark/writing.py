@@ -41,11 +41,7 @@ BEGIN, END = (
 
 
 def write_report(report: BenchmarkReport, folder: Path) -> list[Path]:
-    """Write all forms into a folder; the files.
-
-    Raises:
-        FaceDiffError: if there is nothing to write, or the folder cannot be written.
-    """
+    """Write all forms into a folder; the files."""
     if not report.tables:
         reason = f"; the first problem: {report.failed[0]}" if report.failed else ""
         raise FaceDiffError(f"{report.outline.name}: no cell has a result yet{reason}; run `facediff benchmark` first")
@@ -286,11 +282,7 @@ def latex_tables(report: BenchmarkReport) -> str:
 
 
 def replace_block(path: Path, report: BenchmarkReport) -> None:
-    """Put the tables into a Markdown page, between two comments that bear the plan's name.
-
-    Raises:
-        FaceDiffError: if the page has no such comments.
-    """
+    """Put the tables into a Markdown page, between two comments that bear the plan's name."""
     name = report.outline.name
     begin, end = BEGIN.format(name=name), END.format(name=name)
     text = path.read_text(encoding="utf-8")

@@ -218,11 +218,7 @@ def write_and_tell(
 def check_cells(
     plan: BenchmarkPlan, cells: Sequence[Cell], left: Sequence[Cell], folder: Path, *, dry_run: bool
 ) -> Setting:
-    """Parse every command that will be run, find every corpus, and make the built-in one; what all cells share.
-
-    Raises:
-        FaceDiffError: naming the row, with what its command would have reported.
-    """
+    """Parse every command that will be run, find every corpus, and make the built-in one; what all cells share."""
     from facediff.benchmark.running import Setting, fit_options, option_words
     from facediff.cli.lightning import parse_fit
 
@@ -304,9 +300,6 @@ def check_checkpoint(
         kind: data module of the plan's corpus, where the plan says it.
         class_path: its name, if it is no part of facediff.
         root: folder of the corpus that the plan's data config names.
-
-    Raises:
-        FaceDiffError: naming the checkpoint.
     """
     from facediff.cli.lightning import corpus_and_folder
     from facediff.models.checkpoint import build_model, read_checkpoint
@@ -338,11 +331,7 @@ def read_data(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def data_class(class_path: str) -> type[SpeechMotionDataModule]:
-    """The data module that a config names.
-
-    Raises:
-        FaceDiffError: if there is none.
-    """
+    """The data module that a config names."""
     from facediff.cli.data import find_own_module
     from facediff.data.check.layouts import by_name
 
@@ -354,11 +343,7 @@ def data_class(class_path: str) -> type[SpeechMotionDataModule]:
 def data_of(
     modules: dict[str, SpeechMotionDataModule], class_path: str, arguments: Mapping[str, Any], *, make: bool
 ) -> SpeechMotionDataModule:
-    """The data module of a config, each once; the built-in corpus is made, any other must be there.
-
-    Raises:
-        FaceDiffError: if the corpus is missing.
-    """
+    """The data module of a config, each once; the built-in corpus is made, any other must be there."""
     mark = f"{class_path} {sorted((key, str(value)) for key, value in arguments.items())}"
     if mark in modules:
         return modules[mark]

@@ -239,11 +239,7 @@ class CorpusInputs:
         return self.corpus is not None and self.frame_rate is not None and (self.corpus / folder).is_dir()
 
     def inputs(self, pair: Pair, needed: Set[str]) -> dict[str, Any]:
-        """What the needs mean for one clip, by the name under which metrics take it.
-
-        Raises:
-            FaceDiffError: if a file of the clip is missing or damaged.
-        """
+        """What the needs mean for one clip, by the name under which metrics take it."""
         inputs: dict[str, Any] = {}
         if "identities" in needed:
             inputs["identities"] = [self.identities.index(pair.truth.name.subject)]

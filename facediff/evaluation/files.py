@@ -48,9 +48,6 @@ class NamePattern:
         pattern: the name without ``.npy``, or the path below the folder if it has a ``/``. It has ``{subject}`` and
             ``{sentence}`` and may have ``{identity}``.
         subjects: known speakers.
-
-    Raises:
-        FaceDiffError: if the pattern has other fields, or lacks one.
     """
 
     def __init__(self, pattern: str, subjects: Collection[str] = ()) -> None:
@@ -87,9 +84,6 @@ def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path
     """The ``.npy`` files of a folder by what their names say, sorted, and the names that no pattern fits.
 
     Files whose names begin with a dot are ignored.
-
-    Raises:
-        FaceDiffError: if there is no such folder, or no ``.npy`` file in it.
     """
     if not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; expected one with .npy files of vertices")
@@ -147,11 +141,7 @@ class Missing:
 
 
 def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
-    """Truths by clip.
-
-    Raises:
-        FaceDiffError: if two files are of the same clip.
-    """
+    """Truths by clip."""
     truths: dict[str, Truth] = {}
     for path, name in names.items():
         if name.clip in truths:
@@ -170,9 +160,6 @@ def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], ident
         truths: truths by clip.
         identity: ``own``: the prediction conditioned on the speaker's own identity, or else the one whose name has no
             condition; ``all``: every condition; or a condition's name.
-
-    Raises:
-        FaceDiffError: if two files are of the same clip and condition.
     """
     pairs, missing = list[Pair](), Missing()
     by_clip: dict[str, dict[str, Path]] = {}
@@ -214,9 +201,6 @@ def find_truths(folder: Path) -> tuple[Path, Path | None]:
 
     Args:
         folder: a corpus folder, its ``vertices_npy``, or any other folder of files.
-
-    Raises:
-        FaceDiffError: if there is no such folder.
     """
     if not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; expected the truth's motion files, or a corpus folder")
@@ -227,11 +211,7 @@ def find_truths(folder: Path) -> tuple[Path, Path | None]:
 
 
 def count_vertices(topology: str | None, templates: Path | None, truth: Path) -> int:
-    """Vertices of the mesh: as the topology says, else the templates, else the first readable truth.
-
-    Raises:
-        FaceDiffError: if none of them says it.
-    """
+    """Vertices of the mesh: as the topology says, else the templates, else the first readable truth."""
     if topology in TOPOLOGIES:
         return TOPOLOGIES[topology].n_vertices
     if templates is not None:
@@ -263,9 +243,6 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
         source: a text file of indices; a pickle; ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a
             pickle; ``mouth_mask.txt>0.1``, the vertices of a file of weights above a threshold; or ``all``. Without
             one, ``lve.txt`` or ``fdd.txt`` is taken, else the masks of FLAME.
-
-    Raises:
-        FaceDiffError: if it is not there, or not what it should be.
     """
     named = part.replace("_", " ")
     advice = f"give --regions FOLDER with {USUAL[part][0]} or FLAME_masks.pkl in it, or {OPTIONS[part]} FILE"
@@ -303,9 +280,6 @@ def read_pairs(source: str | None, corpus: Path | None, n_vertices: int, kind: t
         corpus: the corpus folder.
         n_vertices: vertices of the mesh.
         kind: of the lips or of the eyelids.
-
-    Raises:
-        FaceDiffError: if no pairs are given or found, or they do not belong to this mesh.
     """
     file, option, what = PAIR_FILES[kind]
     if source is None and corpus is not None and (corpus / file).is_file():

@@ -21,9 +21,6 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
         names: of the clips' files, without suffix. Those of 3DMEAD (``M003_001_4_1``: emotion, intensity) and of BIWI
             (``F2_e37``, ``F2_37``: emotional or neutral) say something by themselves.
         by: which attributes.
-
-    Raises:
-        FaceDiffError: if no clip has one of them.
     """
     table = {} if corpus is None else read_clip_table(corpus)
     by_clip = {name: table[name] if name in table else said_by_name(name) for name in names}

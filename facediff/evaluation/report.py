@@ -179,9 +179,6 @@ class MethodTable:
     """One method's values: a row a clip, sorted by clip, so that no order of files or workers changes a digit.
 
     ``found`` has the scores by clip, or in words why there are none; ``missing`` what names alone rule out.
-
-    Raises:
-        FaceDiffError: if nothing can be scored.
     """
 
     def __init__(
@@ -262,11 +259,7 @@ class MethodTable:
         )
 
     def _totals(self) -> list[float]:
-        """The score of each column over all clips.
-
-        Raises:
-            FaceDiffError: if a metric has no value.
-        """
+        """The score of each column over all clips."""
         totals: list[float] = pooled(self.values, self.weights).tolist()
         for place, column in enumerate(self.columns):
             if column.metric in self.rows[0][1].states and column.protocol == METRICS:

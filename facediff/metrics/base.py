@@ -129,11 +129,7 @@ class Clips:
         return self.attach("template", templates)
 
     def check_finite(self) -> None:
-        """Refuse NaN and infinity in the frames that are scored.
-
-        Raises:
-            NotFiniteError: naming the first clip concerned and the side.
-        """
+        """Refuse NaN and infinity in the frames that are scored."""
         sides = [
             (clip.name, side, motion)
             for clip in self.clips
@@ -409,9 +405,6 @@ class SequenceMetric(ExactMetric):
             lengths; ``"prediction"`` cuts the prediction and refuses one that is shorter than the truth.
         check_finite: Whether `update` refuses NaN and infinity; off only where the caller has looked already.
         **kwargs: Those of `ExactMetric`.
-
-    Raises:
-        ValueError: If an option is unknown.
 
     >>> class LastFrameError(SequenceMetric):
     ...     words = "mean distance in the last frame; mean over sequences [unit]"

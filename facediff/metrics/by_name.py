@@ -106,9 +106,6 @@ def parse(text: str) -> Request:
     Args:
         text: A registered name, which may be followed by options of the metric.
 
-    Raises:
-        FaceDiffError: If there is no such metric or option, or a value is of another kind; with the nearest name.
-
     >>> parse("temporal_misalignment:at=path,smoothing=1.5").options
     {'at': 'path', 'smoothing': 1.5}
     """

@@ -181,11 +181,7 @@ class SpectrumDistance(SequenceMetric):
         self.latest = None
 
     def compute(self) -> Tensor:
-        """The score over all sequences so far, a float64 scalar.
-
-        Raises:
-            ValueError: If no process had any sequence, or the truth does not move in any.
-        """
+        """The score over all sequences so far, a float64 scalar."""
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
         if float(self.powers[1].sum()) == 0:

@@ -128,9 +128,6 @@ class OpeningMetric(SequenceMetric):
             offsets_from: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, that
                 prediction and truth are offsets from. **None means that they are absolute vertices**; offsets
                 without it give another, meaningless number.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if ``offsets_from`` does not fit.
         """
         self.add(self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from"))
 
@@ -347,9 +344,6 @@ class BilabialClosureRate(OpeningMetric):
                 do not count.
             offsets_from: Neutral vertices that prediction and truth are offsets from; **None means that they
                 are absolute vertices**.
-
-        Raises:
-            ValueError: As for `OpeningMetric.update`, and if the closures are missing or do not fit.
         """
         if closures is None:
             raise ValueError("closures= is missing; say in which frames the mouth is known to close")

@@ -49,9 +49,6 @@ class Protocol:
         length_rule: What to do where prediction and truth differ in length.
         topology: Name of the mesh, one of `TOPOLOGIES`. Then regions and motion of another mesh are refused,
             and the summary says whether the regions are those in use on it. None for any mesh.
-
-    Raises:
-        ValueError: If an option is unknown.
     """
 
     name: str
@@ -101,9 +98,6 @@ class Protocol:
         Args:
             lips: Lip vertices.
             upper: Upper-face vertices; needed if the protocol has FDD.
-
-        Raises:
-            ValueError: If the upper face is needed and missing, or a region does not fit the topology.
         """
         if self.topology is not None:
             topology = TOPOLOGIES[self.topology]
@@ -137,9 +131,6 @@ def protocol(name: str = "paper", *, topology: str | None = None) -> Protocol:
         topology: One of `TOPOLOGIES`: the mesh that is scored, to have regions and motion of another mesh
             refused and unusual regions pointed out. Regions are given to `Protocol.build` all the same: their
             files belong to the data sets.
-
-    Raises:
-        ValueError: If there is none; the message lists them and the nearest.
 
     >>> print(protocol("meshtalk").describe())  # doctest: +NORMALIZE_WHITESPACE
     protocol meshtalk: MeshTalk's paper
@@ -204,9 +195,6 @@ class ProtocolMetrics(MetricCollection):
         protocol: The setting; usually made by `Protocol.build`.
         lips: Lip vertices.
         upper: Upper-face vertices; may be None if the protocol has no FDD.
-
-    Raises:
-        ValueError: If the protocol needs an upper face and none is given.
     """
 
     def __init__(self, protocol: Protocol, lips: Region, upper: Region | None = None) -> None:

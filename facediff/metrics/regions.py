@@ -119,9 +119,6 @@ class Region:
             indices: Integers, or a one-dimensional integer tensor or array. Masks of booleans are refused.
             n_vertices: Vertices of the mesh, if known.
 
-        Raises:
-            ValueError: If an index is not an integer, or as for `Region`.
-
         >>> region = Region.from_indices("lips", [3, 1, 2, 1])
         >>> region.indices, region.duplicates
         ((1, 2, 3), 1)
@@ -147,9 +144,6 @@ class Region:
             path: The file.
             name: What to call the region; the file's name without its ending by default.
             n_vertices: Vertices of the mesh, if known.
-
-        Raises:
-            ValueError: If the file cannot be read or is not a list of indices; the message names the file.
         """
         path = Path(path)
         indices = read_indices(path)
@@ -173,9 +167,6 @@ class Region:
             threshold: Vertices of exactly this weight do not belong to the region.
             name: What to call the region; by default the file's name without its ending, or "weights", with
                 the threshold.
-
-        Raises:
-            ValueError: If the file cannot be read or holds other things, or no weight is above the threshold.
 
         >>> print(Region.from_weights(torch.tensor([0.0, 0.9, 0.1, 0.4]), 0.1))
         weights > 0.1 (2 vertices, ef96f1f6)
@@ -240,9 +231,6 @@ class LipPairs:
         name: What the pairs are called next to a score, for example ``"flame/inner lips"``.
         pairs: Two different vertex indices each, the smaller first; the pairs strictly increasing.
         duplicates: How many repeated pairs the source held.
-
-    Raises:
-        ValueError: If there is no pair, or they are not as described.
     """
 
     what: ClassVar[str] = "lip pairs"
@@ -290,11 +278,7 @@ class LipPairs:
         return {"name": self.name, "count": self.count, "hash": self.hash, "duplicates": self.duplicates}
 
     def check(self, n_vertices: int) -> None:
-        """Refuse a mesh that these pairs cannot belong to.
-
-        Raises:
-            ValueError: If an index is not below ``n_vertices``.
-        """
+        """Refuse a mesh that these pairs cannot belong to."""
         largest = max(second for _, second in self.pairs)
         if largest >= n_vertices:
             raise ValueError(
@@ -309,9 +293,6 @@ class LipPairs:
         Args:
             name: What to call them.
             pairs: Two integers each, or an integer tensor (pairs, 2).
-
-        Raises:
-            ValueError: If a pair is not two integers, or as for `LipPairs`.
 
         >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
         middle (1 pairs, de4cd82d)
@@ -329,9 +310,6 @@ class LipPairs:
         Args:
             path: The file.
             name: What to call them; the file's name without its ending by default.
-
-        Raises:
-            ValueError: If the file cannot be read or is not a list of pairs; the message names the file.
         """
         path = Path(path)
         indices = read_indices(path)
@@ -417,11 +395,7 @@ class Topology:
     upper: dict[int, str]
 
     def bind(self, region: Region) -> Region:
-        """The region as one of this mesh, so that motion of another mesh is refused.
-
-        Raises:
-            ValueError: If the region is known to belong to another mesh, or reaches beyond this one.
-        """
+        """The region as one of this mesh, so that motion of another mesh is refused."""
         region.check(self.n_vertices)
         return replace(region, n_vertices=self.n_vertices)
 

@@ -99,9 +99,6 @@ class OfSamples(SequenceMetric):
                 vertices, 3), floating point.
             truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
             **batch: Those of `UpdateOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
         """
         self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
 
@@ -298,9 +295,6 @@ class SampleDiversity(Diversity):
                 floating point.
             lengths: Valid frames of each sequence (batch,), or a mask (batch, frames).
             clip_names: One name per sequence, for messages.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if there are not ``n_samples`` samples.
         """
         self.add(align_samples(samples, None, n_samples=self.n_samples, lengths=lengths, clip_names=clip_names))
 
@@ -342,9 +336,6 @@ class IdentityDiversity(Diversity):
                 vertices, 3), floating point.
             lengths: Valid frames of each sequence (batch,), or a mask (batch, frames).
             clip_names: One name per sequence, for messages.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`.
         """
         self.add(align_samples(predictions, None, n_samples=None, lengths=lengths, clip_names=clip_names))
 

@@ -44,9 +44,6 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
     Returns:
         (frames,), float64, in the waveform's unit.
 
-    Raises:
-        ValueError: If the last frame has no sample, or a sample is NaN or infinite.
-
     >>> speech_intensity(torch.tensor([3.0, 3.0, 0.0, 4.0]), 2, 50, 25)
     tensor([3.0000, 2.8284], dtype=torch.float64)
     """
@@ -74,9 +71,6 @@ class SpeechLipMetric(SequenceMetric):
         sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
         frames_per_second: Of the motion; likewise.
         **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
-
-    Raises:
-        ValueError: If an option is unknown, or only one of the rates is given, or they do not fit.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lips", "speech")
@@ -120,10 +114,6 @@ class SpeechLipMetric(SequenceMetric):
             waveform: The sound (batch, samples), or (samples,) of one sequence, at the metric's
                 ``sample_rate``, beginning with the first frame. Samples beyond the scored frames are not read.
             intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if the speech is missing, given twice, too short or not
-                finite.
         """
         clips = self.align(prediction, truth, **batch)
         self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
@@ -289,9 +279,6 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
             identities: Number of each sequence's identity, below ``n_identities``; needed unless there is one.
             waveform: The sound; see `SpeechLipMetric.update`.
             intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
-
-        Raises:
-            ValueError: As for `SpeechLipMetric.update`, and if the identities are missing or do not fit.
         """
         clips = self.align(prediction, truth, **batch)
         clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
@@ -339,11 +326,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         return (self.moments[:, _CLIPS] > 1) & (_deviation(self.moments, _SPEECH, _SPEECH_SQUARED) > 0)
 
     def compute(self) -> Tensor:
-        """The correlation over all clips so far, a float64 scalar.
-
-        Raises:
-            ValueError: If no process had any sequence, or no identity enters.
-        """
+        """The correlation over all clips so far, a float64 scalar."""
         moments = self.moments[self._enter()]
         if not len(moments):
             self.refuse_to_compute(self.covered().left_out)

@@ -28,9 +28,6 @@ class RealTimeFactor(ExactMetric):
     Args:
         hardware: What it was computed on, for the summary: see `device_name`.
 
-    Raises:
-        ValueError: If the hardware is not named.
-
     >>> metric = RealTimeFactor("one core")
     >>> metric.update(1.0, 10.0)
     >>> metric.update(2.0, 2.0)
@@ -89,11 +86,7 @@ class RealTimeFactor(ExactMetric):
         self.update(time.perf_counter() - start, speech)
 
     def compute(self) -> Tensor:
-        """The factor over all clips so far, a float64 scalar.
-
-        Raises:
-            ValueError: If no process had any clip.
-        """
+        """The factor over all clips so far, a float64 scalar."""
         computing, speech = self.seconds
         if float(speech) == 0:
             self.leave_synchronised_state()

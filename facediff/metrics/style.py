@@ -46,9 +46,6 @@ class StyleRetrievalAccuracy(ExactMetric):
     Args:
         closeness: ``"cosine"`` or ``"euclidean"``.
 
-    Raises:
-        ValueError: If the closeness is unknown.
-
     >>> metric = StyleRetrievalAccuracy()
     >>> metric.update(torch.tensor([[1.0, 0.0], [0.9, 0.1], [0.0, 1.0], [0.6, 0.6]]), [7, 7, 8, 8])
     >>> metric.compute().item(), metric.queries()
@@ -222,9 +219,6 @@ class NearestSpeakerAccuracy(SequenceMetric):
         components: Principal components K, at most.
         shrinkage: How much of an even covariance is added, so that no direction decides alone.
 
-    Raises:
-        ValueError: If an option is out of range.
-
     >>> means = torch.tensor([[[0.0, 0.0, 0.0]], [[0.0, 2.0, 0.0]], [[5.0, 0.0, 0.0]], [[5.0, 2.0, 0.0]]])
     >>> gallery = SpeakerGallery(means, (0, 0, 1, 1))
     >>> motion = torch.tensor([[4.0, 9.0, 0.0], [4.0, 7.0, 0.0]])[:, None]
@@ -312,9 +306,6 @@ class NearestSpeakerAccuracy(SequenceMetric):
             identities: The number of the speaker whom each sequence should show.
             template: Neutral vertices, when the prediction is absolute vertices. **None means that it is offsets from
                 the template already.**
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if the identities do not fit.
         """
         clips = self.align(prediction, prediction, **batch).attach_templates(template)
         numbers = torch.as_tensor(identities).reshape(-1)

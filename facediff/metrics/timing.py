@@ -212,9 +212,6 @@ class TemporalMisalignment(OpeningMetric):
             deviations, and the series is mirrored at its ends.
         frames_per_second: Of the motion, for a result in milliseconds; None for frames.
 
-    Raises:
-        ValueError: If an option is unknown or out of range.
-
     >>> import torch
     >>> truth = torch.zeros(40, 2, 3)
     >>> truth[:, 0, 1] = torch.linspace(0, 12, 40).sin() + 1

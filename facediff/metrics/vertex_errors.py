@@ -209,9 +209,6 @@ class FaceDynamicsDeviation(SequenceMetric):
             template: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
                 prediction and truth are absolute vertices. **None means that they are offsets from the
                 template already**; absolute vertices without a template give another, meaningless number.
-
-        Raises:
-            ValueError: As for `SequenceMetric.update`, and if the template does not fit.
         """
         self.add(self.align(prediction, truth, **batch).attach_templates(template))
 

@@ -39,11 +39,7 @@ LONGEST_LABEL = 34  # Letters of a legend's entry
 
 
 def matplotlib() -> ModuleType:
-    """The package matplotlib.
-
-    Raises:
-        MissingExtraError: if it is not installed.
-    """
+    """The package matplotlib."""
     try:
         import matplotlib as package
         import matplotlib.backends.backend_agg

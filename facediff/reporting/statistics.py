@@ -58,9 +58,6 @@ class Bootstrap:
         resamples: how many; 0 for no intervals.
         level: share of the resamples inside an interval.
         seed: of the random numbers; equal seeds and numbers of sequences give the same resamples.
-
-    Raises:
-        FaceDiffError: if a number is out of range.
     """
 
     resamples: ranges.Resamples = 1000

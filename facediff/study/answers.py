@@ -68,11 +68,7 @@ class Rater:
 
 
 def read_answers(path: Path, study: Study, others: Collection[str] = ()) -> Rater | None:
-    """The answers that a rater has downloaded; None if they belong to one of ``others``, ids of other studies.
-
-    Raises:
-        FaceDiffError: naming the file and the field, if it is none of this study's, or not what the page writes.
-    """
+    """The answers that a rater has downloaded; None if they belong to one of ``others``, ids of other studies."""
     remedy = "expected a file that the study's page has made"
     try:
         size = path.stat().st_size
@@ -148,9 +144,6 @@ def check_answer(content: object, study: Study, number: int, source: object) -> 
         study: what was asked.
         number: of the rater, whose schedule must hold the trial.
         source: for messages.
-
-    Raises:
-        FaceDiffError: naming the field.
     """
     if not isinstance(content, dict):
         raise FaceDiffError(f"{source}: an answer is {quoted(content)}; expected an object")
@@ -197,11 +190,7 @@ def check_comments(content: object, study: Study, source: object) -> dict[str, s
 
 
 def clean(text: object, name: str, source: object, longest: int) -> str:
-    """A text from elsewhere without characters that control a terminal, or that no file can hold.
-
-    Raises:
-        FaceDiffError: if it is no text, or longer than ``longest`` characters.
-    """
+    """A text from elsewhere without characters that control a terminal, or that no file can hold."""
     if not isinstance(text, str) or len(text) > longest:
         what = quoted(text) if not isinstance(text, str) else f"{len(text)} characters long"
         raise FaceDiffError(f"{source}: {name} is {what}; expected a text of at most {longest} characters")

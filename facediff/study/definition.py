@@ -186,11 +186,7 @@ class Study:
 
 
 def read_study(folder: Path) -> Study:
-    """Read the study of a folder that ``facediff study make`` has finished.
-
-    Raises:
-        FaceDiffError: if there is none, or its file is damaged.
-    """
+    """Read the study of a folder that ``facediff study make`` has finished."""
     path = folder / STUDY_FILE
     remedy = "expected a folder that `facediff study make` has finished"
     if not path.is_file():
@@ -261,11 +257,7 @@ def read_study(folder: Path) -> Study:
 
 
 def make_rule(content: object, source: object) -> Rule:
-    """The rule that a file states; fields that it omits have their defaults.
-
-    Raises:
-        FaceDiffError: naming the field.
-    """
+    """The rule that a file states; fields that it omits have their defaults."""
     if content is None:
         return Rule()
     if not isinstance(content, dict):

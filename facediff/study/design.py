@@ -83,9 +83,6 @@ def make_forms(
         repeats: pairs that come a second time, with their sides exchanged.
         seed: of which clips the controls show.
 
-    Raises:
-        FaceDiffError: if a form would have too many trials.
-
     Example:
         >>> forms = make_forms(["a", "b"], [("ours", "theirs")], design="latin", still=0, same=0, repeats=0, seed=0)
         >>> [[(each.clip, each.left) for each in form] for form in forms]

@@ -93,11 +93,7 @@ class VideoTask(FileTask):
 
 
 def draw(task: VideoTask) -> int:
-    """Draw a video, whole or not at all; the number of its frames.
-
-    Raises:
-        FaceDiffError: if a file is damaged, or the video cannot be written.
-    """
+    """Draw a video, whole or not at all; the number of its frames."""
     first = task.panels[0][0].read()
     animations = [in_unit_of(first, motion.read()) for motion, _ in task.panels]
     frames = task.frames or len(first.vertices)
@@ -207,11 +203,7 @@ class StudyPlan:
 
 
 def check_output(output: Path, study: Study) -> None:
-    """Refuse a folder that holds anything but this study, or an earlier one that nobody has answered.
-
-    Raises:
-        FaceDiffError: naming the folder.
-    """
+    """Refuse a folder that holds anything but this study, or an earlier one that nobody has answered."""
     check_folder_writable(output)
     if not output.exists():
         return
@@ -255,9 +247,6 @@ def plan_study(
         mesh: likewise.
         frame_rate: likewise.
         unit: likewise.
-
-    Raises:
-        FaceDiffError: naming the folder, the clip or the option.
     """
     options = options or StudyOptions()
     if len(methods) + (truth is not None) < 2:
@@ -335,11 +324,7 @@ def plan_study(
 
 
 def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
-    """The clips that are asked for, or a seeded choice, evenly among the speakers.
-
-    Raises:
-        FaceDiffError: if there is no such clip.
-    """
+    """The clips that are asked for, or a seeded choice, evenly among the speakers."""
     if options.clips is not None:
         for name in options.clips:
             if name not in material.clips:

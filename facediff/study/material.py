@@ -43,11 +43,7 @@ class MotionFile:
     stride: int = 1
 
     def read(self) -> Animation:
-        """The animation; all of its frames are finite, and it can be drawn.
-
-        Raises:
-            FaceDiffError: if the file is damaged, or its mesh or its frame rate is not known.
-        """
+        """The animation; all of its frames are finite, and it can be drawn."""
         animation = read_animation(self.path, {}, self.facts)
         if animation.faces is None:
             raise FaceDiffError(f"{self.path}: comes without a mesh (triangles); give one with --mesh")
@@ -120,9 +116,6 @@ class StudyAnimations:
     Attributes:
         methods: names of the methods.
         remark: stands below every video, such as that the corpus is synthetic.
-
-    Raises:
-        FaceDiffError: if a folder holds no animation, or there is no clip that all have.
     """
 
     def __init__(
@@ -280,9 +273,6 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
         folder: holds ``<clip>.npz``, ``<clip>.npy`` or ``<clip>_condition_<identity>.npy``.
         subjects: known speakers.
         identity: which of several conditions is taken: ``own``, the speaker's own, or an identity's name.
-
-    Raises:
-        FaceDiffError: if there is no animation, or two of one clip.
     """
     if not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; expected the animations of a method")
@@ -343,11 +333,7 @@ def in_unit_of(first: Animation, other: Animation) -> Animation:
 
 
 def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int]:
-    """Speech (S,) of so many seconds, cut or padded with silence, and its sample rate; from a recording or an archive.
-
-    Raises:
-        FaceDiffError: if the file is damaged or holds no speech.
-    """
+    """Speech (S,) of so many seconds, cut or padded with silence, and its sample rate; from a recording or an archive."""
     if path.suffix == ".npz":
         animation = read_animation(path)
         if animation.speech is None:

@@ -222,11 +222,7 @@ def gather_raters(
 
 
 def answer_files(paths: Sequence[Path]) -> list[Path]:
-    """Files, and the .json files of folders, each once.
-
-    Raises:
-        FaceDiffError: if one is not there, or a folder has none.
-    """
+    """Files, and the .json files of folders, each once."""
     files: dict[Path, Path] = {}
     for path in paths:
         inside = sorted(path.glob("*.json")) if path.is_dir() else [path]

@@ -149,11 +149,7 @@ def serve(
 
 
 def check_folder(folder: Path) -> Study:
-    """The study of a folder whose page and videos are all there.
-
-    Raises:
-        FaceDiffError: naming the file that is missing.
-    """
+    """The study of a folder whose page and videos are all there."""
     study = read_study(folder)
     page = folder / PAGE_FOLDER
     for path in (page / PAGE, *(page / VIDEO_FOLDER / name for name in study.videos())):

@@ -44,9 +44,6 @@ def simulate(
         spread: standard deviation of the raters' own scores around these, so that answers of one rater are alike.
         no_difference: share of the answers that see no difference, where a question allows it.
         seed: of everything.
-
-    Raises:
-        FaceDiffError: if a condition has no score.
     """
     shown = {name for trial in study.trials for name in (trial.left, trial.right)}
     lacking = sorted(shown - {*scores, STILL})

@@ -49,9 +49,6 @@ class AnswerStore:
         study: that the answers belong to.
         most_raters: of all.
         read_only: whether nothing is written, not even an empty file.
-
-    Raises:
-        FaceDiffError: if the file is no such database, or holds answers to another study.
     """
 
     def __init__(self, path: Path, study: Study, *, most_raters: int = MOST_RATERS, read_only: bool = False) -> None:

@@ -39,11 +39,7 @@ def bundled_texts() -> dict[str, dict[str, Any]]:
 
 
 def check_languages(languages: Sequence[str] | None) -> list[str]:
-    """The languages of a study; all bundled ones if None.
-
-    Raises:
-        FaceDiffError: if the words of one are not bundled.
-    """
+    """The languages of a study; all bundled ones if None."""
     bundled = bundled_texts()
     for language in languages or ():
         if language not in bundled:
@@ -57,11 +53,7 @@ def standard(name: str, languages: Sequence[str]) -> dict[str, str]:
 
 
 def bundled_question(name: str, languages: Sequence[str]) -> Question:
-    """A question whose text is bundled.
-
-    Raises:
-        FaceDiffError: if there is none of that name.
-    """
+    """A question whose text is bundled."""
     if name not in BUNDLED:
         raise FaceDiffError(f'there is no bundled question "{name}": {choices(name, BUNDLED)}')
     question = BUNDLED[name]
@@ -83,9 +75,6 @@ class Questionnaire:
         consent: what raters agree to.
         rule: whose answers are not counted.
         chosen: whether the file names the questions, so that none may be left out for lack of references.
-
-    Raises:
-        FaceDiffError: naming the file and the field.
     """
 
     def __init__(self, path: Path | None, languages: Sequence[str]) -> None:

@@ -23,9 +23,6 @@ def find_phoneme(selector: str, phonemes: Sequence[TimedPhoneme], clip: str) -> 
 
     An exact match takes precedence; else stress marks are ignored, then length marks and diacritics; else the name is
     that of a viseme, ``PP``.
-
-    Raises:
-        FaceDiffError: if the clip has no such phoneme, or not so many.
     """
     name, _, number = selector.rpartition(":") if re.search(r".:\d+$", selector) else (selector, "", "1")
     place, spoken = int(number), [phoneme for phoneme in phonemes if phoneme.ipa]
@@ -75,11 +72,7 @@ def frame_at(time: float, frame_rate: float) -> int:
 
 
 def pick_frames(material: FigureData, clip: str, moments: Sequence[Moment]) -> dict[str, list[Array]]:
-    """Faces (V, 3) of the truth and each method at every moment.
-
-    Raises:
-        FaceDiffError: if a moment is outside a motion, or a frame holds NaN or infinity.
-    """
+    """Faces (V, 3) of the truth and each method at every moment."""
     picked: dict[str, list[Array]] = {}
     for name, motion in material.open(clip).items():
         picked[name] = []
@@ -118,9 +111,6 @@ def draw_frames(
         paper: width, resolution and font.
         view: a name in :data:`facediff.render.VIEWS`.
         region: vertices to show in a close-up, such as the lips; the whole face if None.
-
-    Raises:
-        FaceDiffError: if there is no moment or no mesh, or a file cannot be used.
     """
     check_output(output)
     if not moments:

@@ -56,9 +56,6 @@ def gather(
         frame_rate: frames a second of the predictions.
         truth_stride: use every n-th frame of the truth; by the frame rates if None.
         unit: unit of the vertices.
-
-    Raises:
-        FaceDiffError: if a folder or a file is missing, damaged, or does not fit the others.
     """
     if truth == Path("puppet") and not truth.is_dir():
         built_in = made_root(0)
@@ -96,11 +93,7 @@ def gather(
 
 
 def sound_of(material: FigureData, clip: str, file: Path | None = None) -> npt.NDArray[np.float32] | None:
-    """Speech (S,) of a clip at 16 kHz: from the file given, else the corpus's; None if there is none.
-
-    Raises:
-        FaceDiffError: if the file given is missing or unreadable.
-    """
+    """Speech (S,) of a clip at 16 kHz: from the file given, else the corpus's; None if there is none."""
     if file is None and material.corpus is not None:
         file = material.corpus / "wav" / f"{material.truths[clip].path.stem}.wav"
         file = file if file.is_file() else None
@@ -108,11 +101,7 @@ def sound_of(material: FigureData, clip: str, file: Path | None = None) -> npt.N
 
 
 def phonemes_of(material: FigureData, clip: str, file: Path | None = None) -> list[TimedPhoneme]:
-    """Phonemes of a clip: from the table given, else the corpus's; none if there is no table.
-
-    Raises:
-        FaceDiffError: if the table is missing or damaged.
-    """
+    """Phonemes of a clip: from the table given, else the corpus's; none if there is no table."""
     path = file or phonemes_file(material.corpus, material.truths[clip].path.stem)
     return read_phonemes(path) if path else []
 

@@ -52,9 +52,6 @@ def motion_maps(
 
     Returns:
         a map by name, the truth's first; and notes on frames that were left out.
-
-    Raises:
-        FaceDiffError: if a file cannot be used or a template is missing.
     """
     return _vertex_maps(material, clips, material.names, _from_template, workers, scheduler)
 
@@ -80,9 +77,6 @@ def error_maps(
 
     Returns:
         a map by method; and notes on frames that were left out.
-
-    Raises:
-        FaceDiffError: if a file cannot be used.
     """
     return _vertex_maps(material, clips, list(material.methods), _from_truth, workers, scheduler)
 
@@ -186,9 +180,6 @@ def draw_heatmap(
 
     Returns:
         notes on what was left out.
-
-    Raises:
-        FaceDiffError: if there is no mesh, or a file cannot be used.
     """
     check_output(output)
     material.mesh(clips)  # refuses before the work

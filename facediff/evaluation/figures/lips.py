@@ -58,9 +58,6 @@ def opening_curves(material: FigureData, clip: str, pairs: LipPairs) -> tuple[Cu
 
     Returns:
         the curves in the length that all have; and a note if lengths differ.
-
-    Raises:
-        FaceDiffError: if a file cannot be used.
     """
     motions = material.open(clip)
     frames, note = shortest(motions)
@@ -109,9 +106,6 @@ def draw_lips(
         scale: what openings are multiplied by, and the resulting unit.
         span: first and last second; the whole clip if None.
         remark: small text below everything.
-
-    Raises:
-        FaceDiffError: if the span has no frame in it.
     """
     check_output(output)
     paper = paper or Paper()

@@ -81,21 +81,13 @@ class FigureData:
 
     @property
     def rate(self) -> float:
-        """Frames a second.
-
-        Raises:
-            FaceDiffError: if it is not known.
-        """
+        """Frames a second."""
         if self.frame_rate is None:
             raise FaceDiffError("the frame rate of the predictions is not known; give --frame-rate")
         return self.frame_rate
 
     def choose(self, clips: Sequence[str] | None = None) -> list[str]:
-        """Clips to draw: those asked for, else all that the truth and every method have.
-
-        Raises:
-            FaceDiffError: if a clip does not exist, or there is none that all have.
-        """
+        """Clips to draw: those asked for, else all that the truth and every method have."""
         common = [clip for clip in self.truths if all(clip in files for files in self.methods.values())]
         if clips is None:
             if not common:
@@ -133,11 +125,7 @@ class FigureData:
         return self.truths[clip].path if name == TRUTH else self.methods[name][clip]
 
     def template(self, clip: str) -> Array:
-        """Neutral face (V, 3) of a clip's speaker.
-
-        Raises:
-            FaceDiffError: if there is none.
-        """
+        """Neutral face (V, 3) of a clip's speaker."""
         subject = self.truths[clip].name.subject
         if subject not in self.templates:
             advice = (
@@ -147,11 +135,7 @@ class FigureData:
         return np.asarray(self.templates[subject], np.float64)
 
     def mesh(self, clips: Sequence[str]) -> tuple[npt.NDArray[np.int32], Array]:
-        """Triangles (F, 3), and a face at rest (V, 3): the mean of the clips' templates, else the mesh file's own.
-
-        Raises:
-            FaceDiffError: if no mesh is known.
-        """
+        """Triangles (F, 3), and a face at rest (V, 3): the mean of the clips' templates, else the mesh file's own."""
         if self.faces is None or self.rest is None:
             raise FaceDiffError(
                 "the triangles of the mesh are not known; give --mesh FILE, a .ply or .obj of this topology"
@@ -173,9 +157,6 @@ def find_clips(
     """Truths by clip and each method's predictions by clip, matched by their names as ``facediff evaluate`` does.
 
     ``subjects`` are the known speakers; ``identity`` is ``own``, or the identity whose predictions are drawn.
-
-    Raises:
-        FaceDiffError: if a folder is missing or has no file whose name matches, or a method has none of a truth's clip.
     """
     if identity == ALL:
         raise FaceDiffError("--identity all: a figure shows one condition; expected own or an identity's name")
@@ -277,11 +258,7 @@ class Painter:
         return float((high[0] - low[0]) / (high[1] - low[1]))
 
     def set_size(self, width: int, height: int) -> None:
-        """Choose how many pixels a picture has.
-
-        Raises:
-            FaceDiffError: if they are too few to see anything.
-        """
+        """Choose how many pixels a picture has."""
         if min(width, height) < SMALLEST_PICTURE:
             raise FaceDiffError(
                 f"a picture of {width} × {height} pixels shows nothing; draw fewer columns, or raise --width or --dpi"

@@ -57,11 +57,7 @@ class Paper:
 
 
 def check_output(path: Path) -> None:
-    """Check, before any work is done, that a figure can be written to a file.
-
-    Raises:
-        FaceDiffError: if the suffix is no format, or the place cannot be written.
-    """
+    """Check, before any work is done, that a figure can be written to a file."""
     if path.suffix.lower() not in SUFFIXES:
         raise FaceDiffError(f'--output {path}: unknown suffix "{path.suffix}"; expected one of {", ".join(SUFFIXES)}')
     check_writable(path)
@@ -69,11 +65,7 @@ def check_output(path: Path) -> None:
 
 @contextmanager
 def style(paper: Paper) -> Iterator[None]:
-    """Settings of matplotlib for drawing and saving a figure; the caller's own are restored afterwards.
-
-    Raises:
-        FaceDiffError: if the font is not installed, or lacks a letter.
-    """
+    """Settings of matplotlib for drawing and saving a figure; the caller's own are restored afterwards."""
     matplotlib()
     from matplotlib import font_manager
 
@@ -108,9 +100,6 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure in the format of the file's suffix, whole or not at all; the same figure gives the same bytes.
 
     Call it inside :func:`style`.
-
-    Raises:
-        FaceDiffError: if the suffix is unknown or the file cannot be written.
     """
     check_output(path)
     dates: dict[str, dict[str, Any]] = {

@@ -47,9 +47,6 @@ def draw_regions(
 
     Returns:
         a line for each region: name, vertex count, hash, source.
-
-    Raises:
-        FaceDiffError: if the folder is no corpus, or its mesh or a region is missing or damaged.
     """
     view = find_view(root, corpus)
     mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)

@@ -37,11 +37,7 @@ class Curve:
 
 
 def find_metrics(run: Path) -> Path:
-    """The ``metrics.csv`` of a run folder, or the file itself.
-
-    Raises:
-        FaceDiffError: if there is none; the message names runs below the folder.
-    """
+    """The ``metrics.csv`` of a run folder, or the file itself."""
     path = run if run.name.endswith(".csv") else run / METRICS
     if path.is_file():
         return path
@@ -60,9 +56,6 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
     Args:
         path: ``metrics.csv``.
         axis: what the scalars are given over.
-
-    Raises:
-        FaceDiffError: if the file is damaged or has no scalar.
     """
     # The inner dictionaries are by step or epoch: a run that was resumed may repeat steps, and the later one counts.
     columns: dict[str, dict[float, float]] = {}
@@ -83,11 +76,7 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
 
 
 def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str] | None) -> list[str]:
-    """Scalars to draw: those asked for, else the loss of training and the LVE of validation as far as they were logged.
-
-    Raises:
-        FaceDiffError: if a run has not logged a scalar, or none of the usual ones.
-    """
+    """Scalars to draw: those asked for, else the loss of training and the LVE of validation as far as they were logged."""
     if scalars is None:
         scalars = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
         if not scalars:
