@@ -79,7 +79,7 @@ class MethodEntry:
         label: by which tables call it.
         config: experiment config that trains it; ``{corpus}`` stands for the corpus's name.
         checkpoint: a trained model, one for each seed if it has ``{seed}``.
-        predictions: a folder of predicted motion, anybody's; likewise.
+        predictions: a folder of predicted motion, with the same fields in its path.
         options: of the training, or of ``facediff evaluate`` for predictions.
         test_options: of the test.
         before: trainings that come first.

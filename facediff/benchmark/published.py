@@ -30,8 +30,8 @@ class Published:
         protocol: the named protocol that its figures follow.
         rows: scores by the paper's name of the method.
         lips: number of lip vertices; None if it is not said.
-        frames: that were scored; likewise.
-        sequences: that were scored; likewise.
+        frames: that were scored; None if the paper does not say.
+        sequences: that were scored; None if the paper does not say.
         doubt: why its figures cannot be compared with any others; empty if they can.
     """
 

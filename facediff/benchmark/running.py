@@ -51,7 +51,7 @@ class Setting:
         weights: ``last`` or ``best``.
         threads: of each process.
         clips: split of each clip, by the plan's name of a corpus, where predictions are scored.
-        truths: folder, frame stride and so on of the truth, likewise.
+        truths: arguments of `facediff evaluate` for the truth (folder, frame stride), by corpus.
         classes: data module of each corpus that is no part of facediff, which a checkpoint may not import by itself.
         roots: folder of each corpus whose data config names one, for checkpoints that know none, or another machine's.
         launcher: how a facediff command is started.

@@ -78,7 +78,7 @@ class Difference:
         sentences: bootstrap interval over sentences; None if there is none.
         p_sentences: of the permutation test over sentences; None if the score is no mean of those of sentences.
         runs: interval over training runs (Welch); None if the chance between runs is not known.
-        p_runs: of Welch's test; likewise.
+        p_runs: of Welch's test; None as for ``runs``.
         p: the larger of the two; None if one is not known.
         common: sentences that both have.
     """

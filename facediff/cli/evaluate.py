@@ -75,9 +75,9 @@ def evaluate(
         templates: templates.pkl, each speaker's neutral face
         regions: folder with lve.txt and fdd.txt, or with FLAME_masks.pkl
         lips: the lips: index file, FLAME_masks.pkl:lips, weights.txt>0.1, or all
-        upper_face: the upper face, likewise
+        upper_face: the upper face, from the same kinds of source
         lip_pairs: pairs of inner-lip vertices: a file, or 3531-3504,… (default: the corpus's)
-        eyelid_pairs: pairs of eyelid vertices, for blinks, likewise
+        eyelid_pairs: pairs of eyelid vertices, for blinks, as --lip-pairs
         by: group scores by attributes of clips too: columns of the corpus's clips.csv, such as emotion,intensity
         frame_rate: frames per second of the predictions (default: as the corpus's manifest.json says)
         topology: biwi, vocaset, mead3d or multiface: unusual regions are pointed out

@@ -360,5 +360,5 @@ def report(output: Path, notes: Sequence[str] = ()) -> None:
     for note in notes[:NOTES]:
         tell(f"note: {note}")
     if len(notes) > NOTES:
-        tell(f"note: likewise {len(notes) - NOTES} more")
+        tell(f"note: {len(notes) - NOTES} more such notes")
     tell(f"written: {output}")

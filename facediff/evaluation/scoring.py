@@ -194,7 +194,7 @@ class Scorer:
     def _chosen(
         self, pair: Pair, predictions: Mapping[str, Tensor], inputs: dict[str, Any]
     ) -> tuple[list[tuple[float, float]], dict[str, Metric]]:
-        """Value and weight of a clip under each metric chosen by name, and the metrics that have none of single clips."""
+        """Value and weight of a clip under each metric chosen by name, and the metrics that have no such values."""
         valued: list[tuple[float, float]] = []
         states: dict[str, Metric] = {}
         for name, chosen in self.chosen.items():
@@ -269,7 +269,7 @@ class Scorer:
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
-    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3) of any floating-point type, memory-mapped."""
+    """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3) in any float type, memory-mapped."""
     # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
     array = open_vertices(path, n_vertices, mode="c")[::stride]
     if array.dtype not in NATIVE or not array.dtype.isnative:

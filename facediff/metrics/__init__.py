@@ -1,6 +1,6 @@
 """Metrics of speech-driven 3D facial animation, each a definition with named options.
 
-The same three letters mean different numbers in different projects: a `Protocol` is a named setting of the
+The same three letters mean different numbers in different projects: a :class:`Protocol` is a named setting of the
 options and describes its numbers in words. Needs torch and torchmetrics only.
 
 >>> import torch
@@ -16,23 +16,25 @@ protocol paper: lips mouth (2 vertices, 83b97b85), upper brows (2 vertices, 4658
 Every metric is a torchmetrics class, a function made from it, and a name in the registry, both in snake case; the
 class's docstring has the formula, its source, its unit, and what about it is a choice:
 
-- distance from the truth: `MeanVertexError`, `LipVertexError`, `UpperFaceVertexError`
-- amount of movement: `FaceDynamicsDeviation`
-- the mouth: `MouthOpeningDifference`, `BilabialClosureRate`
-- timing: `LipWarpingDistance` (lip DTW), `TemporalMisalignment` (MTM), `LipOpeningCorrelation` and
-  `LipSpeedCorrelation` (lip PCC)
-- loudness: `ClipSpeechLipCorrelation` and `FrameSpeechLipCorrelation` (SLCC)
-- several samples: `MeanEstimateError`, `CoverageError`, `SampleDiversity`
-- does it generate: `MotionLiveliness`, `SpectrumDistance`, `SpreadErrorRatio`, `EnergyScore`
-- the eyes: `BlinkRate`, `BlinkRateRatio`
-- several identities: `IdentityDiversity`, `StyleRetrievalAccuracy`, `NearestSpeakerAccuracy`
-- speed: `RealTimeFactor`
+- distance from the truth: :class:`MeanVertexError`, :class:`LipVertexError`, :class:`UpperFaceVertexError`
+- amount of movement: :class:`FaceDynamicsDeviation`
+- the mouth: :class:`MouthOpeningDifference`, :class:`BilabialClosureRate`
+- timing: :class:`LipWarpingDistance` (lip DTW), :class:`TemporalMisalignment` (MTM), :class:`LipOpeningCorrelation` and
+  :class:`LipSpeedCorrelation` (lip PCC)
+- loudness: :class:`ClipSpeechLipCorrelation` and :class:`FrameSpeechLipCorrelation` (SLCC)
+- several samples: :class:`MeanEstimateError`, :class:`CoverageError`, :class:`SampleDiversity`
+- does it generate: :class:`MotionLiveliness`, :class:`SpectrumDistance`, :class:`SpreadErrorRatio`,
+  :class:`EnergyScore`
+- the eyes: :class:`BlinkRate`, :class:`BlinkRateRatio`
+- several identities: :class:`IdentityDiversity`, :class:`StyleRetrievalAccuracy`, :class:`NearestSpeakerAccuracy`
+- speed: :class:`RealTimeFactor`
 
 Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
 Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would. The options
-that all metrics share are described in `ExactMetric`, `SequenceMetric` and its `update`.
+that all metrics share are described in :class:`ExactMetric`, :class:`SequenceMetric` and its :meth:`update`.
 
-A new metric is a `SequenceMetric` that defines `clip_value`, registered with ``@facediff.registry.metric.register``.
+A new metric is a :class:`SequenceMetric` that defines :meth:`clip_value`, registered with
+``@facediff.registry.metric.register``.
 """
 
 from facediff.metrics.base import Clip as Clip

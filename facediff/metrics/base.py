@@ -76,13 +76,13 @@ class Clip:
     """One sequence to score, with what some metrics read in addition to it.
 
     Args:
-        name: What messages call the sequence.
+        name: what messages call the sequence.
         prediction: (frames, vertices, 3), a view; (frames, samples, vertices, 3) where there are several.
         truth: (frames, vertices, 3), a view; the prediction itself where a metric has no truth.
-        template: Neutral vertices (vertices, 3), as the metric reads them.
-        speech: Intensity of the speech in each frame (frames,), float64; empty if none was given.
-        closures: Closures of the mouth, each a first frame and the frame after the last.
-        identity: Number of the identity.
+        template: neutral vertices (vertices, 3), as the metric reads them.
+        speech: intensity of the speech in each frame (frames,), float64; empty if none was given.
+        closures: closures of the mouth, each a first frame and the frame after the last.
+        identity: number of the identity.
     """
 
     name: str
@@ -164,16 +164,16 @@ def align(
 
     Args:
         prediction: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-        truth: Likewise; its padded number of frames may differ.
-        lengths: Valid frames of the truth, and of the prediction unless ``prediction_lengths`` is given.
+        truth: of the same shape, but for its padded number of frames.
+        lengths: valid frames of the truth, and of the prediction unless ``prediction_lengths`` is given.
             Without it every frame of either tensor is valid.
-        prediction_lengths: Valid frames of the prediction. Needed in addition to ``lengths`` if the two tensors
+        prediction_lengths: valid frames of the prediction. Needed in addition to ``lengths`` if the two tensors
             differ in their padded number of frames.
-        clip_names: One name per sequence, for messages.
-        rule: What to do where the lengths differ.
+        clip_names: one name per sequence, for messages.
+        rule: what to do where the lengths differ.
 
     Raises:
-        ValueError: If shapes, types or lengths do not fit, a clip has no frame, or the rule refuses the
+        ValueError: if shapes, types or lengths do not fit, a clip has no frame, or the rule refuses the
             lengths.
     """
     check_option("length rule", rule, LengthRule)
@@ -253,26 +253,26 @@ def _valid_frames(name: str, lengths: Lengths | None, motion: Tensor) -> list[in
 
 
 class ProcessOptions(TypedDict, total=False):
-    """Options of every metric; see `ExactMetric`."""
+    """Options of every metric; see :class:`ExactMetric`."""
 
     sync_on_compute: bool
     process_group: Any
 
 
 class FiniteOptions(ProcessOptions, total=False):
-    """Options of every metric of sequences; see `SequenceMetric`."""
+    """Options of every metric of sequences; see :class:`SequenceMetric`."""
 
     check_finite: bool
 
 
 class SequenceOptions(FiniteOptions, total=False):
-    """Options of every metric that compares sequences with their truth; see `SequenceMetric`."""
+    """Options of every metric that compares sequences with their truth; see :class:`SequenceMetric`."""
 
     length_rule: LengthRule
 
 
 class UpdateOptions(TypedDict, total=False):
-    """What every `update` takes in addition to motion; see `SequenceMetric.update`."""
+    """What every :meth:`update` takes in addition to motion; see :meth:`SequenceMetric.update`."""
 
     lengths: Lengths | None
     prediction_lengths: Lengths | None
@@ -308,15 +308,15 @@ class ExactMetric(Metric):
     """A metric that describes its definition in words and whose sums stay in float64.
 
     Args:
-        definition: The metric in plain words, with its options.
-        settings: Further options that distinguish the metric from others but need not be described.
-        sync_on_compute: Whether `compute` reduces the states over processes.
-        process_group: Over which processes; all if None.
-        **kwargs: For `torchmetrics.Metric`.
+        definition: the metric in plain words, with its options.
+        settings: further options that distinguish the metric from others but need not be described.
+        sync_on_compute: whether :meth:`compute` reduces the states over processes.
+        process_group: over which processes; all if None.
+        **kwargs: for :class:`torchmetrics.Metric`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
-    """What a metric that is chosen by name needs of the corpus or the run, names of `facediff.metrics.NEEDS`."""
+    """What a metric that is chosen by name needs of the corpus or the run, names of :data:`facediff.metrics.NEEDS`."""
 
     inferred: ClassVar[Inferred] = {}
     """Constructor arguments that the functional form reads from the batch instead of being given them."""
@@ -353,7 +353,7 @@ class ExactMetric(Metric):
         return self.definition
 
     def leave_synchronised_state(self) -> None:
-        """To be called before `compute` raises: torchmetrics would keep the states of all processes."""
+        """To be called before :meth:`compute` raises: torchmetrics would keep the states of all processes."""
         if self._is_synced:
             self.unsync()
 
@@ -373,11 +373,11 @@ class Coverage:
     """What a score was taken over, and what the length rule cut.
 
     Args:
-        frames: Frames scored. A metric that looks at some frames only counts those, see there.
-        sequences: Sequences scored.
-        cut_prediction: Frames cut from predictions.
-        cut_truth: Frames cut from truths.
-        left_out: Sequences that have no value under the metric's definition and do not enter the score.
+        frames: frames scored. A metric that looks at some frames only counts those, see there.
+        sequences: sequences scored.
+        cut_prediction: frames cut from predictions.
+        cut_truth: frames cut from truths.
+        left_out: sequences that have no value under the metric's definition and do not enter the score.
     """
 
     frames: int
@@ -388,23 +388,23 @@ class Coverage:
 
 
 class SequenceMetric(ExactMetric):
-    """Base of metrics that give each sequence one number and pool these; a new metric defines `clip_value`.
+    """Base of metrics that give each sequence one number and pool these; a new metric defines :meth:`clip_value`.
 
     The states are sums (float64) and counts (int64) of fixed size, so that memory does not grow and processes
     that saw different numbers of sequences, or none, reduce to what one process gets. They stay in these
     types when the module that holds the metric is converted to another precision.
 
-    Under several processes `compute` and `coverage` are collective: call them on every rank, also on one that
-    has no sequence (in Lightning from an ``on_…_epoch_end`` hook, not by logging from a step).
+    Under several processes :meth:`compute` and :meth:`coverage` are collective: call them on every rank, also on one
+    that has no sequence (in Lightning from an ``on_…_epoch_end`` hook, not by logging from a step).
 
     Args:
-        definition: The metric in plain words, with all its options; `words` if None.
+        definition: the metric in plain words, with all its options; ``words`` if None.
         pooling: ``"frames"``, all frames of all sequences alike, or ``"sequences"``, the mean of the sequences' means.
-        region: Vertices that are looked at, None for all; motion of another mesh is refused.
+        region: vertices that are looked at, None for all; motion of another mesh is refused.
         length_rule: ``"min"`` cuts prediction and truth to the shorter of the two; ``"error"`` refuses different
             lengths; ``"prediction"`` cuts the prediction and refuses one that is shorter than the truth.
-        check_finite: Whether `update` refuses NaN and infinity; off only where the caller has looked already.
-        **kwargs: Those of `ExactMetric`.
+        check_finite: whether :meth:`update` refuses NaN and infinity; off only where the caller has looked already.
+        **kwargs: those of :class:`ExactMetric`.
 
     >>> class LastFrameError(SequenceMetric):
     ...     words = "mean distance in the last frame; mean over sequences [unit]"
@@ -421,10 +421,10 @@ class SequenceMetric(ExactMetric):
     ``{pooling}`` the pooling in words."""
 
     leaves_out = ""
-    """Which sequences have no value, in words; empty if every sequence has one. `clip_value` gives NaN there."""
+    """Which sequences have no value, in words; empty if every sequence has one. :meth:`clip_value` gives NaN there."""
 
     latest: Tensor | None
-    """What `clip_value` gave for each sequence of the last update, (batch,) float64; None before the first."""
+    """What :meth:`clip_value` gave for each sequence of the last update, (batch,) float64; None before the first."""
     indices: Tensor | None
     total: Tensor
     counts: Tensor
@@ -460,7 +460,7 @@ class SequenceMetric(ExactMetric):
         return self.region
 
     def clip_value(self, clip: Clip) -> Tensor:
-        """The metric of one sequence, a float64 scalar; NaN only if it `leaves_out` the sequence."""
+        """The metric of one sequence, a float64 scalar; NaN only if it ``leaves_out`` the sequence."""
         raise NotImplementedError
 
     def clip_weight(self, clip: Clip) -> int:
@@ -477,20 +477,20 @@ class SequenceMetric(ExactMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            lengths: Valid frames (batch,) or a mask (batch, frames), of the truth and, unless
+            truth: of the same shape as the prediction.
+            lengths: valid frames (batch,) or a mask (batch, frames), of the truth and, unless
                 ``prediction_lengths`` is given, of the prediction. Padding is never read.
-            prediction_lengths: Valid frames of the prediction.
-            clip_names: One name per sequence, for messages.
+            prediction_lengths: valid frames of the prediction.
+            clip_names: one name per sequence, for messages.
 
         Raises:
-            ValueError: If shapes or lengths do not fit or the length rule refuses them, or a valid frame
+            ValueError: if shapes or lengths do not fit or the length rule refuses them, or a valid frame
                 holds NaN or infinity. Nothing is added then.
         """
         self.add(self.align(prediction, truth, **batch))
 
     def align(self, prediction: Tensor, truth: Tensor, **batch: Unpack[UpdateOptions]) -> Clips:
-        """The sequences of a batch as the metric's length rule cuts them; see `update`."""
+        """The sequences of a batch as the metric's length rule cuts them; see :meth:`update`."""
         return align(prediction, truth, rule=self.length_rule, **batch)
 
     def add(self, clips: Clips) -> None:
@@ -518,7 +518,7 @@ class SequenceMetric(ExactMetric):
         """The score over all sequences so far, a float64 scalar.
 
         Raises:
-            ValueError: If no process had any sequence, or none that has a value.
+            ValueError: if no process had any sequence, or none that has a value.
         """
         frames, sequences = self.counts[0], self.counts[1]
         if int(sequences) == 0:
@@ -541,7 +541,7 @@ class SequenceMetric(ExactMetric):
             return self.covered()
 
     def covered(self) -> Coverage:
-        """The `coverage` of the states as they are, without reducing them over processes."""
+        """The :meth:`coverage` of the states as they are, without reducing them over processes."""
         return Coverage(*self.counts.tolist())
 
 
@@ -549,8 +549,8 @@ class LipMetric(SequenceMetric):
     """Base of metrics over the lip vertices that are pooled by sequence and have no options of their own.
 
     Args:
-        lips: Lip vertices, a `Region` or indices.
-        **options: Those of `SequenceOptions`.
+        lips: lip vertices, a :class:`Region` or indices.
+        **options: those of :class:`SequenceOptions`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lips",)
@@ -569,13 +569,13 @@ _NOT_IN_FUNCTIONS = {"definition", "check_finite", "sync_on_compute", "process_g
 def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> Callable[..., Tensor]:
     """The functional form of a metric: its class, used once on one sequence or one padded batch.
 
-    Both give the same number by construction. The function takes the motion that `update` takes, then what the class
-    is made of (regions, pairs), then the options of both by keyword. NumPy arrays do where tensors do. Processes are
-    not brought together.
+    Both give the same number by construction. The function takes the motion that :meth:`update` takes, then what the
+    class is made of (regions, pairs), then the options of both by keyword. NumPy arrays do where tensors do. Processes
+    are not brought together.
 
     Args:
-        metric: The class; the function has its name in snake case.
-        positional: Keywords of `update` that the function also takes by position, after those of the class.
+        metric: the class; the function has its name in snake case.
+        positional: keywords of :meth:`update` that the function also takes by position, after those of the class.
 
     Returns:
         A function of proper name, signature and docstring, which returns a float64 scalar.
@@ -611,10 +611,11 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
     function.__name__ = function.__qualname__ = name
     function.__module__ = metric.__module__
     function.__doc__ = (
-        f"{summary}\n\nThe functional form of `{metric.__name__}`, whose docstring has formula, unit and source.\n\n"
+        f"{summary}\n\nThe functional form of :class:`{metric.__name__}`, whose docstring has formula, unit and "
+        "source.\n\n"
         "Args:\n"
-        + "\n".join(f"    {name}: {described.get(name, 'See the class.')}" for name in order)
-        + f"\n\nReturns:\n    Float64 scalar.\n\nRaises:\n    ValueError: As `{metric.__name__}` and its `update`.\n"
+        + "\n".join(f"    {name}: {described.get(name, 'see the class.')}" for name in order)
+        + "\n\nReturns:\n    float64 scalar.\n\nRaises:\n    ValueError: as the class and its ``update``.\n"
     )
     function.__signature__ = signature  # type: ignore[attr-defined]  # what help() and IDEs show
     return function

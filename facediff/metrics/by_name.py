@@ -1,8 +1,8 @@
 """Metrics by name: ``lip_vertex_error:squared=false`` becomes a metric that is made for a corpus and fed from it.
 
 A metric states as class data what it ``needs`` (the lips, the speech, several samples …). Whoever scores says in a
-`Context` what the corpus or the run has; `Request.build` brings the two together, and `feed` hands each metric those of
-a batch's inputs that its `update` takes.
+:class:`Context` what the corpus or the run has; :meth:`Request.build` brings the two together, and :func:`feed` hands
+each metric those of a batch's inputs that its :meth:`update` takes.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Context:
     """What a corpus or a run has for metrics.
 
     Args:
-        has: By need, the constructor arguments that meet it; empty where the need is met with each batch.
-        missing: By need, what to do to have it, or why it cannot be had.
+        has: by need, the constructor arguments that meet it; empty where the need is met with each batch.
+        missing: by need, what to do to have it, or why it cannot be had.
     """
 
     has: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -68,14 +68,14 @@ class Request:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What the metric needs, words of `NEEDS`."""
+        """What the metric needs, words of :data:`NEEDS`."""
         return tuple(getattr(metrics.get(self.name), "needs", ()))
 
     def build(self, context: Context) -> Metric:
         """The metric, made for a corpus.
 
         Raises:
-            FaceDiffError: If the corpus lacks something that the metric needs, naming all of it, or an option is
+            FaceDiffError: if the corpus lacks something that the metric needs, naming all of it, or an option is
                 refused.
         """
         lacking = [need for need in self.needs if need not in context.has]
@@ -104,7 +104,7 @@ def parse(text: str) -> Request:
     """Read ``NAME:option=value,option=value``.
 
     Args:
-        text: A registered name, which may be followed by options of the metric.
+        text: a registered name, which may be followed by options of the metric.
 
     >>> parse("temporal_misalignment:at=path,smoothing=1.5").options
     {'at': 'path', 'smoothing': 1.5}
@@ -118,11 +118,11 @@ def parse(text: str) -> Request:
 
 
 def feed(metric: Metric, inputs: Mapping[str, Any]) -> None:
-    """Update a metric with those of the inputs, named as in `NEEDS`, that its `update` takes."""
+    """Update a metric with those of the inputs, named as in :data:`NEEDS`, that its :meth:`update` takes."""
     taken = inspect.signature(type(metric).update).parameters
     metric.update(**{name: value for name, value in inputs.items() if name in taken})
 
 
 def parse_all(texts: Sequence[str]) -> list[Request]:
-    """Read several metrics, each once, as `parse` does."""
+    """Read several metrics, each once, as :func:`parse` does."""
     return list({request.text: request for request in map(parse, texts)}.values())

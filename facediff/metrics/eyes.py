@@ -44,9 +44,9 @@ class BlinkMetric(OpeningMetric, RatioMetric):
     """Base of metrics that count blinks.
 
     Args:
-        pairs: Upper and lower eyelid vertices, `EyelidPairs` or pairs of indices.
-        closed: Share of the usual opening by which the lids must be shut for a blink to begin.
-        reopened: Share by which they may still be shut for another blink to be possible.
+        pairs: upper and lower eyelid vertices, :class:`EyelidPairs` or pairs of indices.
+        closed: share of the usual opening by which the lids must be shut for a blink to begin.
+        reopened: share by which they may still be shut for another blink to be possible.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lid_pairs",)
@@ -123,7 +123,7 @@ class BlinkRate(BlinkMetric):
     """Blink rate: blinks a minute, over all sequences. People who talk blink about 15 to 20 times.
 
     Args:
-        frames_per_second: Of the motion.
+        frames_per_second: of the motion.
         of: ``"prediction"`` or ``"truth"``.
 
     >>> import torch

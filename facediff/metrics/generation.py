@@ -29,7 +29,7 @@ from facediff.registry import metric
 
 
 class RatioMetric(SequenceMetric):
-    """Base of metrics that divide one sum over all sequences by another; a subclass defines `clip_parts`.
+    """Base of metrics that divide one sum over all sequences by another; a subclass defines :meth:`clip_parts`.
 
     The mean of each sequence's own ratio would be ruled by the sequences in which hardly anything happens.
     """
@@ -71,7 +71,7 @@ class RatioMetric(SequenceMetric):
         """The score over all sequences so far, a float64 scalar.
 
         Raises:
-            ValueError: If no process had any sequence, or the denominator is zero on all of them.
+            ValueError: if no process had any sequence, or the denominator is zero on all of them.
         """
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
@@ -124,7 +124,7 @@ class SpectrumDistance(SequenceMetric):
     that much, so that a still face has a finite score.
 
     Args:
-        octaves: How many there are.
+        octaves: how many there are.
 
     >>> import torch
     >>> truth = torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(0))
@@ -206,7 +206,7 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
     scatters more than it knows.
 
     Args:
-        n_samples: How many samples there are of each sequence; other numbers are refused.
+        n_samples: how many samples there are of each sequence; other numbers are refused.
 
     >>> import torch
     >>> random = torch.Generator().manual_seed(0)
@@ -253,7 +253,7 @@ class EnergyScore(OfSamples):
     is better. With a single sample of a deterministic model it is the distance itself.
 
     Args:
-        n_samples: How many samples there are of each sequence; other numbers are refused.
+        n_samples: how many samples there are of each sequence; other numbers are refused.
         of: ``"frames"`` or ``"sequences"``.
         pooling: ``"frames"`` or ``"sequences"``.
 

@@ -3,7 +3,7 @@
 The opening of a frame is o[t] = mean over named pairs (a, b) of inner-lip vertices of ‖x[t, a] − x[t, b]‖₂. It needs
 absolute vertices: of offsets alone the distance means nothing. So motion is taken as absolute unless ``offsets_from=``
 gives the neutral vertices that it is offset from. (FDD's ``template=`` is the other way round; the two have different
-names so that a `torchmetrics.MetricCollection` can pass both.)
+names so that a :class:`torchmetrics.MetricCollection` can pass both.)
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class OpeningMetric(SequenceMetric):
     """Base of metrics that read the opening of the mouth.
 
     Args:
-        pairs: Inner-lip vertex pairs, `LipPairs` or pairs of indices.
-        definition: The metric in words, `words` if None; ``{pairs}`` becomes the pairs' name, number and hash.
+        pairs: inner-lip vertex pairs, :class:`LipPairs` or pairs of indices.
+        definition: the metric in words, ``words`` if None; ``{pairs}`` becomes the pairs' name, number and hash.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lip_pairs",)
@@ -124,8 +124,8 @@ class OpeningMetric(SequenceMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            offsets_from: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, that
+            truth: of the same shape as the prediction.
+            offsets_from: neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, that
                 prediction and truth are offsets from. **None means that they are absolute vertices**; offsets
                 without it give another, meaningless number.
         """
@@ -175,11 +175,11 @@ class LipOpeningCorrelation(OpeningMetric):
     """Lip PCC of the opening: does the mouth open when the truth's does, whatever the amount?
 
     Per sequence Pearson's correlation over frames between o_g and o_p, the openings of the mouth (see
-    `MouthOpeningDifference`); then the mean over sequences. From −1 to 1, without unit; blind to the
+    :class:`MouthOpeningDifference`); then the mean over sequences. From −1 to 1, without unit; blind to the
     size of the movement and to a constant gap.
 
     A prediction that does not vary counts 0. A truth that does not vary, as in a clip of one frame, cannot be
-    followed: the sequence is left out and counted by `coverage`. Both are choices, as is the mean over sequences.
+    followed: the sequence is left out and counted by :meth:`coverage`. Both are choices, as is the mean over sequences.
 
     >>> import torch
     >>> truth = torch.tensor([0.0, 1.0, 0.0, 2.0])[:, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -210,7 +210,7 @@ class LipSpeedCorrelation(LipMetric):
     With m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂, t from the second frame on, Pearson's correlation
     over frames between m_g and m_p in each sequence; then the mean over sequences. From −1 to 1, without unit.
     A template cancels. A prediction that does not vary counts 0; where the truth does not vary, or has fewer
-    than three frames, the sequence is left out and counted by `coverage`. The definition is ours.
+    than three frames, the sequence is left out and counted by :meth:`coverage`. The definition is ours.
     """
 
     higher_is_better = True
@@ -246,7 +246,7 @@ class BilabialClosureRate(OpeningMetric):
     """Bilabial-closure rate: how often the mouth is closed where speech has it closed (p, b, m).
 
     The known closures come with each clip, usually from aligned phonemes. With o[t] the opening of the mouth
-    (see `MouthOpeningDifference`) and o_g the truth's, a frame is closed if
+    (see :class:`MouthOpeningDifference`) and o_g the truth's, a frame is closed if
 
         o[t] ≤ min_t o_g + threshold · (max_t o_g − min_t o_g).
 
@@ -255,11 +255,11 @@ class BilabialClosureRate(OpeningMetric):
     Definition and default threshold are choices; there is no usual formula. Captured truth may miss
     closures too: give ``of="truth"`` next to the prediction's rate, or ``of="gap"``. From 0 to 1, a gap from −1 to 1.
 
-    A clip without a closure in its scored frames is left out; `coverage` counts, as ``frames``, what the rate
+    A clip without a closure in its scored frames is left out; :meth:`coverage` counts, as ``frames``, what the rate
     is a share of.
 
     Args:
-        threshold: Share of the truth's range up to which a mouth counts as closed, 0 to 1.
+        threshold: share of the truth's range up to which a mouth counts as closed, 0 to 1.
         count: ``"frames"``: the share of all frames of closures in which the mouth is closed; ``"closures"``:
             the share of closures in which it is closed in at least one frame.
         of: ``"prediction"``, ``"truth"``, or ``"gap"``: prediction minus truth, negative where the prediction
@@ -337,12 +337,12 @@ class BilabialClosureRate(OpeningMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            closures: Frames of the truth in which the mouth is known to close: a boolean mask (batch, frames),
+            truth: of the same shape as the prediction.
+            closures: frames of the truth in which the mouth is known to close: a boolean mask (batch, frames),
                 a run of true frames being one closure, or for each sequence a list of intervals (first frame,
                 frame after the last) in order and without overlap. They must be given; frames that are not scored
                 do not count.
-            offsets_from: Neutral vertices that prediction and truth are offsets from; **None means that they
+            offsets_from: neutral vertices that prediction and truth are offsets from; **None means that they
                 are absolute vertices**.
         """
         if closures is None:

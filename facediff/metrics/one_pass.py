@@ -1,9 +1,9 @@
 """Vertex errors and dynamics of one sequence from a single pass over its frames: the fast form of the formulas.
 
-The definitions stand in the docstrings of `facediff.metrics.vertex_errors`, against which this is tested. A sequence is
-larger than a processor's cache, and reading it from memory costs as much as some arithmetic on it. So a few frames at
-a time are widened to float64 in buffers that are used again, and all that is asked for is taken from them before the
-next frames are read.
+The definitions stand in the docstrings of :mod:`facediff.metrics.vertex_errors`, against which this is tested. A
+sequence is larger than a processor's cache, and reading it from memory costs as much as some arithmetic on it. So a few
+frames at a time are widened to float64 in buffers that are used again, and all that is asked for is taken from them
+before the next frames are read.
 """
 
 from __future__ import annotations

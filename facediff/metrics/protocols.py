@@ -38,16 +38,16 @@ class Protocol:
     """A named setting of the metrics' options.
 
     Args:
-        name: What to print next to the numbers.
-        source: Where the setting comes from.
-        mve: Reduction over vertices of the mean vertex error; None omits the metric.
-        mve_squared: Whether its distances are squared.
-        lve_squared: Whether the lip vertex error's distances are squared.
-        fdd: Signs of the face dynamics deviation to report; the first is called ``fdd``, a second
+        name: what to print next to the numbers.
+        source: where the setting comes from.
+        mve: reduction over vertices of the mean vertex error; None omits the metric.
+        mve_squared: whether its distances are squared.
+        lve_squared: whether the lip vertex error's distances are squared.
+        fdd: signs of the face dynamics deviation to report; the first is called ``fdd``, a second
             ``fdd_<sign>``; empty omits the metric.
-        pooling: Of MVE and LVE; FDD is always a mean over sequences.
-        length_rule: What to do where prediction and truth differ in length.
-        topology: Name of the mesh, one of `TOPOLOGIES`. Then regions and motion of another mesh are refused,
+        pooling: of MVE and LVE; FDD is always a mean over sequences.
+        length_rule: what to do where prediction and truth differ in length.
+        topology: name of the mesh, one of :data:`TOPOLOGIES`. Then regions and motion of another mesh are refused,
             and the summary says whether the regions are those in use on it. None for any mesh.
     """
 
@@ -96,8 +96,8 @@ class Protocol:
         """The metrics of this protocol for a topology.
 
         Args:
-            lips: Lip vertices.
-            upper: Upper-face vertices; needed if the protocol has FDD.
+            lips: lip vertices.
+            upper: upper-face vertices; needed if the protocol has FDD.
         """
         if self.topology is not None:
             topology = TOPOLOGIES[self.topology]
@@ -127,9 +127,9 @@ def protocol(name: str = "paper", *, topology: str | None = None) -> Protocol:
     """The protocol of that name.
 
     Args:
-        name: One of `PROTOCOLS`.
-        topology: One of `TOPOLOGIES`: the mesh that is scored, to have regions and motion of another mesh
-            refused and unusual regions pointed out. Regions are given to `Protocol.build` all the same: their
+        name: one of :data:`PROTOCOLS`.
+        topology: one of :data:`TOPOLOGIES`: the mesh that is scored, to have regions and motion of another mesh
+            refused and unusual regions pointed out. Regions are given to :meth:`Protocol.build` all the same: their
             files belong to the data sets.
 
     >>> print(protocol("meshtalk").describe())  # doctest: +NORMALIZE_WHITESPACE
@@ -185,16 +185,16 @@ class Summary:
 
 
 class ProtocolMetrics(MetricCollection):
-    """The metrics of one protocol, updated together, as a `torchmetrics.MetricCollection`.
+    """The metrics of one protocol, updated together, as a :class:`torchmetrics.MetricCollection`.
 
-    `compute` gives a flat dictionary: ``mve``, ``lve``, ``fdd`` as far as the protocol has them; a second
-    sign of FDD is called ``fdd_absolute`` or ``fdd_signed``. Under several processes `compute` and `summary`
-    are collective: call them on every rank, also on one that had no sequence.
+    :meth:`compute` gives a flat dictionary: ``mve``, ``lve``, ``fdd`` as far as the protocol has them; a second sign of
+    FDD is called ``fdd_absolute`` or ``fdd_signed``. Under several processes :meth:`compute` and :meth:`summary` are
+    collective: call them on every rank, also on one that had no sequence.
 
     Args:
-        protocol: The setting; usually made by `Protocol.build`.
-        lips: Lip vertices.
-        upper: Upper-face vertices; may be None if the protocol has no FDD.
+        protocol: the setting; usually made by :meth:`Protocol.build`.
+        lips: lip vertices.
+        upper: upper-face vertices; may be None if the protocol has no FDD.
     """
 
     def __init__(self, protocol: Protocol, lips: Region, upper: Region | None = None) -> None:
@@ -225,13 +225,13 @@ class ProtocolMetrics(MetricCollection):
 
         Args:
             prediction: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            truth: Likewise.
-            template: Neutral vertices (batch, vertices, 3) or (vertices, 3) if the motion is absolute; None
+            truth: of the same shape as the prediction.
+            template: neutral vertices (batch, vertices, 3) or (vertices, 3) if the motion is absolute; None
                 if prediction and truth are offsets from the template already.
-            **batch: ``lengths``, ``prediction_lengths`` and ``clip_names`` as for `SequenceMetric.update`.
+            **batch: ``lengths``, ``prediction_lengths`` and ``clip_names`` as for :meth:`SequenceMetric.update`.
 
         Raises:
-            ValueError: As `SequenceMetric.update`; no metric has changed then.
+            ValueError: as :meth:`SequenceMetric.update`; no metric has changed then.
         """
         self._check(prediction, truth, template, batch)
         super().update(prediction, truth, template=template, **batch)
@@ -239,7 +239,7 @@ class ProtocolMetrics(MetricCollection):
     def forward(
         self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> dict[str, Tensor]:
-        """Add a batch like `update` and return the scores of this batch alone."""
+        """Add a batch like :meth:`update` and return the scores of this batch alone."""
         self._check(prediction, truth, template, batch)
         return cast(dict[str, Tensor], super().forward(prediction, truth, template=template, **batch))
 

@@ -1,7 +1,7 @@
 """Named sets of vertices, so that a score can say exactly which vertices it was taken over.
 
-A `Region` is a set of vertices, `LipPairs` are pairs of an upper and a lower lip vertex, and a `Topology` knows which
-regions are in use on the meshes of the field's data sets.
+A :class:`Region` is a set of vertices, :class:`LipPairs` are pairs of an upper and a lower lip vertex, and a
+:class:`Topology` knows which regions are in use on the meshes of the field's data sets.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ def _short_hash(parts: Iterable[str]) -> str:
 class Region:
     """A named set of vertex indices, sorted and distinct.
 
-    Make one with `Region.from_indices`, `Region.from_file` or `Region.from_weights`, which sort and remove
-    duplicates; the plain constructor takes indices that are sorted and distinct already and refuses others.
+    Make one with :meth:`Region.from_indices`, :meth:`Region.from_file` or :meth:`Region.from_weights`, which sort and
+    remove duplicates; the plain constructor takes indices that are sorted and distinct already and refuses others.
     ``first | second`` is the union of two regions.
 
     Args:
-        name: What the region is called next to a score, for example ``"biwi/lve"``.
-        indices: Vertex indices from 0, strictly increasing.
-        n_vertices: Vertices of the mesh that the region belongs to, if known; it is then refused on others.
-        duplicates: How many repeated indices the source held.
+        name: what the region is called next to a score, for example ``"biwi/lve"``.
+        indices: vertex indices from 0, strictly increasing.
+        n_vertices: vertices of the mesh that the region belongs to, if known; it is then refused on others.
+        duplicates: how many repeated indices the source held.
 
     Raises:
-        ValueError: If there is no index, one is negative or not below ``n_vertices``, or they do not
+        ValueError: if there is no index, one is negative or not below ``n_vertices``, or they do not
             increase.
     """
 
@@ -94,7 +94,7 @@ class Region:
         """Refuse a mesh that this region cannot belong to.
 
         Raises:
-            ValueError: If the mesh has fewer vertices than an index needs, or is known to be another mesh.
+            ValueError: if the mesh has fewer vertices than an index needs, or is known to be another mesh.
         """
         if self.n_vertices is not None and n_vertices != self.n_vertices:
             raise ValueError(
@@ -115,9 +115,9 @@ class Region:
         """A region from indices in any order, repeated or not.
 
         Args:
-            name: What to call the region.
-            indices: Integers, or a one-dimensional integer tensor or array. Masks of booleans are refused.
-            n_vertices: Vertices of the mesh, if known.
+            name: what to call the region.
+            indices: integers, or a one-dimensional integer tensor or array. Masks of booleans are refused.
+            n_vertices: vertices of the mesh, if known.
 
         >>> region = Region.from_indices("lips", [3, 1, 2, 1])
         >>> region.indices, region.duplicates
@@ -141,9 +141,9 @@ class Region:
         """A region from a text file of indices separated by commas, blanks or line ends, in any mixture.
 
         Args:
-            path: The file.
-            name: What to call the region; the file's name without its ending by default.
-            n_vertices: Vertices of the mesh, if known.
+            path: the file.
+            name: what to call the region; the file's name without its ending by default.
+            n_vertices: vertices of the mesh, if known.
         """
         path = Path(path)
         indices = read_indices(path)
@@ -162,10 +162,10 @@ class Region:
         the forehead where it is above 0.4.
 
         Args:
-            weights: One finite weight for each vertex of the mesh, (vertices,), or a text file of them, one per
+            weights: one finite weight for each vertex of the mesh, (vertices,), or a text file of them, one per
                 line.
-            threshold: Vertices of exactly this weight do not belong to the region.
-            name: What to call the region; by default the file's name without its ending, or "weights", with
+            threshold: vertices of exactly this weight do not belong to the region.
+            name: what to call the region; by default the file's name without its ending, or "weights", with
                 the threshold.
 
         >>> print(Region.from_weights(torch.tensor([0.0, 0.9, 0.1, 0.4]), 0.1))
@@ -188,11 +188,11 @@ class Region:
         """The vertices of this region and others; vertices that they share count as duplicates.
 
         Args:
-            *others: Regions of the same mesh.
-            name: What to call the union; the names joined by " + " by default.
+            *others: regions of the same mesh.
+            name: what to call the union; the names joined by " + " by default.
 
         Raises:
-            ValueError: If the regions are known to belong to different meshes.
+            ValueError: if the regions are known to belong to different meshes.
 
         >>> print(Region("forehead", (1, 2)).union(Region("eyes", (2, 3))))
         forehead + eyes (3 vertices, 8a6ae151)
@@ -211,7 +211,7 @@ class Region:
 
 
 RegionLike = Region | Sequence[int] | Tensor
-"""A `Region`, or bare indices, which become a region with a general name."""
+"""A :class:`Region`, or bare indices, which become a region with a general name."""
 
 
 def as_region(region: RegionLike, name: str) -> Region:
@@ -223,14 +223,14 @@ def as_region(region: RegionLike, name: str) -> Region:
 class LipPairs:
     """Named pairs of an upper and a lower vertex of the inner lips, sorted and distinct.
 
-    The distance of a pair shows how far the mouth is open. Make them with `LipPairs.from_pairs` or
-    `LipPairs.from_file`. Which vertices to pair is the user's choice and part of every number: the released script
-    of the MTM metric uses the one pair (3531, 3504) of FLAME, the middle of the outer lips.
+    The distance of a pair shows how far the mouth is open. Make them with :meth:`LipPairs.from_pairs` or
+    :meth:`LipPairs.from_file`. Which vertices to pair is the user's choice and part of every number: the released
+    script of the MTM metric uses the one pair (3531, 3504) of FLAME, the middle of the outer lips.
 
     Args:
-        name: What the pairs are called next to a score, for example ``"flame/inner lips"``.
-        pairs: Two different vertex indices each, the smaller first; the pairs strictly increasing.
-        duplicates: How many repeated pairs the source held.
+        name: what the pairs are called next to a score, for example ``"flame/inner lips"``.
+        pairs: two different vertex indices each, the smaller first; the pairs strictly increasing.
+        duplicates: how many repeated pairs the source held.
     """
 
     what: ClassVar[str] = "lip pairs"
@@ -291,8 +291,8 @@ class LipPairs:
         """Pairs in any order, repeated or not, either vertex first.
 
         Args:
-            name: What to call them.
-            pairs: Two integers each, or an integer tensor (pairs, 2).
+            name: what to call them.
+            pairs: two integers each, or an integer tensor (pairs, 2).
 
         >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
         middle (1 pairs, de4cd82d)
@@ -308,8 +308,8 @@ class LipPairs:
         """Pairs of a text file: indices separated by commas, blanks or line ends, each two of them a pair.
 
         Args:
-            path: The file.
-            name: What to call them; the file's name without its ending by default.
+            path: the file.
+            name: what to call them; the file's name without its ending by default.
         """
         path = Path(path)
         indices = read_indices(path)
@@ -322,7 +322,7 @@ class LipPairs:
 
 
 class EyelidPairs(LipPairs):
-    """Named pairs of an upper and a lower eyelid vertex, of one eye or of both, likewise.
+    """Named pairs of an upper and a lower eyelid vertex, of one eye or of both.
 
     Their distance shows how far the eyes are open.
     """
@@ -331,7 +331,7 @@ class EyelidPairs(LipPairs):
 
 
 LipPairsLike = LipPairs | Iterable[Iterable[int]] | Tensor
-"""`LipPairs`, or bare pairs of indices, which get a general name."""
+""":class:`LipPairs`, or bare pairs of indices, which get a general name."""
 
 
 def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:

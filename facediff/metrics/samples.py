@@ -41,7 +41,7 @@ def align_samples(
     rule: LengthRule = "min",
     **batch: Unpack[UpdateOptions],
 ) -> Clips:
-    """As `align`, for equally long predictions of each sequence, which become (frames, samples, vertices, 3).
+    """As :func:`align`, for equally long predictions of each sequence, which become (frames, samples, vertices, 3).
 
     ``samples`` are (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3); without
     ``truth`` only their number of frames counts, and ``n_samples`` is None where there may be any number.
@@ -76,8 +76,8 @@ class OfSamples(SequenceMetric):
     """Base of metrics that compare several samples of each sequence with its truth.
 
     Args:
-        n_samples: How many samples there are of each sequence; other numbers are refused.
-        **options: Those of the next base class.
+        n_samples: how many samples there are of each sequence; other numbers are refused.
+        **options: those of the next base class.
     """
 
     fewest: ClassVar[int] = 2
@@ -95,10 +95,10 @@ class OfSamples(SequenceMetric):
         """Add a batch of sequences.
 
         Args:
-            samples: Predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
+            samples: predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
                 vertices, 3), floating point.
             truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            **batch: Those of `UpdateOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
+            **batch: those of :class:`UpdateOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
         """
         self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
 
@@ -107,9 +107,9 @@ class SamplesMetric(OfSamples):
     """Base of lip errors over several samples of each sequence.
 
     Args:
-        lips: Lip vertices, a `Region` or indices.
+        lips: lip vertices, a :class:`Region` or indices.
         n_samples: N, how many samples there are of each sequence; other numbers are refused.
-        squared: Whether distances are squared; the score is then in the vertices' unit squared.
+        squared: whether distances are squared; the score is then in the vertices' unit squared.
     """
 
     higher_is_better = False
@@ -195,8 +195,8 @@ class Diversity(SequenceMetric):
     In the vertices' unit; a template cancels. There is no best value: noise is diverse too.
 
     Args:
-        region: Vertices to look at, a `Region` or indices; None for all.
-        definition: Which predictions are compared, in words.
+        region: vertices to look at, a :class:`Region` or indices; None for all.
+        definition: which predictions are compared, in words.
     """
 
     def __init__(
@@ -242,11 +242,11 @@ class SampleDiversity(Diversity):
     Args:
         pairing: ``"shuffled"`` as in ProbTalk3D's script, or ``"all"``.
         n_samples: N; other numbers of samples are refused. Even for ``"shuffled"``.
-        seed: Of the order; not used with ``"all"``.
+        seed: of the order; not used with ``"all"``.
         pooling: ``"sequences"`` as in the script, or ``"frames"``.
 
     Raises:
-        ValueError: If an option is unknown, or ``n_samples`` cannot be paired.
+        ValueError: if an option is unknown, or ``n_samples`` cannot be paired.
 
     >>> samples = torch.stack([torch.zeros(4, 2, 3), torch.ones(4, 2, 3)])
     >>> round(sample_diversity(samples).item(), 4)
@@ -293,8 +293,8 @@ class SampleDiversity(Diversity):
         Args:
             samples: (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3),
                 floating point.
-            lengths: Valid frames of each sequence (batch,), or a mask (batch, frames).
-            clip_names: One name per sequence, for messages.
+            lengths: valid frames of each sequence (batch,), or a mask (batch, frames).
+            clip_names: one name per sequence, for messages.
         """
         self.add(align_samples(samples, None, n_samples=self.n_samples, lengths=lengths, clip_names=clip_names))
 
@@ -334,8 +334,8 @@ class IdentityDiversity(Diversity):
         Args:
             predictions: (batch, identities, frames, vertices, 3), or of one sequence (identities, frames,
                 vertices, 3), floating point.
-            lengths: Valid frames of each sequence (batch,), or a mask (batch, frames).
-            clip_names: One name per sequence, for messages.
+            lengths: valid frames of each sequence (batch,), or a mask (batch, frames).
+            clip_names: one name per sequence, for messages.
         """
         self.add(align_samples(predictions, None, n_samples=None, lengths=lengths, clip_names=clip_names))
 

@@ -37,9 +37,9 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
 
     Args:
         waveform: (samples,), floating point; samples beyond the last frame are not read.
-        frames: How many frames.
-        sample_rate: Samples per second.
-        frames_per_second: Frames per second.
+        frames: how many frames.
+        sample_rate: samples per second.
+        frames_per_second: frames per second.
 
     Returns:
         (frames,), float64, in the waveform's unit.
@@ -66,11 +66,11 @@ class SpeechLipMetric(SequenceMetric):
     """Base of metrics that compare the lips' motion with the intensity of the speech.
 
     Args:
-        lips: Lip vertices, a `Region` or indices.
-        of: Whose lips: ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
-        sample_rate: Samples of the speech per second; needed for waveforms, not for intensities.
-        frames_per_second: Of the motion; likewise.
-        **options: Those of `SequenceOptions`; NaN and infinity in the speech are always refused.
+        lips: lip vertices, a :class:`Region` or indices.
+        of: whose lips: ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
+        sample_rate: samples of the speech per second; needed for waveforms, not for intensities.
+        frames_per_second: of the motion; needed with ``sample_rate``.
+        **options: those of :class:`SequenceOptions`; NaN and infinity in the speech are always refused.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lips", "speech")
@@ -110,10 +110,10 @@ class SpeechLipMetric(SequenceMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            waveform: The sound (batch, samples), or (samples,) of one sequence, at the metric's
+            truth: of the same shape as the prediction.
+            waveform: the sound (batch, samples), or (samples,) of one sequence, at the metric's
                 ``sample_rate``, beginning with the first frame. Samples beyond the scored frames are not read.
-            intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
+            intensity: instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
         """
         clips = self.align(prediction, truth, **batch)
         self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
@@ -157,15 +157,15 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
     """Speech–lip intensity correlation (SLCC) over the frames of each sequence.
 
     Per sequence Pearson's correlation over frames, from the second on, between the speech's intensity s[t] and
-    the lips' m[t] (see `facediff.metrics.speech`); then the mean over sequences. From −1 to 1, without unit; the
+    the lips' m[t] (see :mod:`facediff.metrics.speech`); then the mean over sequences. From −1 to 1, without unit; the
     scale of sound and mesh does not matter, nor does a template.
 
     ``of="gap"`` is the prediction's minus the truth's: negative where the lips follow loudness less
     than the truth's. Lips that do not vary count 0; a sequence whose speech does not vary, or with fewer
-    than three frames, is left out and counted by `coverage`.
+    than three frames, is left out and counted by :meth:`coverage`.
 
-    The SLCC of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025) is taken
-    over clips instead: `ClipSpeechLipCorrelation`. This one asks the same within a sentence; the definition is ours.
+    The SLCC of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025) is taken over clips
+    instead: :class:`ClipSpeechLipCorrelation`. This one asks the same within a sentence; the definition is ours.
 
     >>> import torch
     >>> loudness = torch.tensor([0.0, 1.0, 3.0, 2.0])
@@ -208,7 +208,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
     """Speech–lip intensity correlation coefficient (SLCC) over clips.
 
     Each clip gives one intensity of its speech, S = √(mean_t s[t]²), and one of its lips,
-    L = √(mean_t m[t]²) (s and m as in `facediff.metrics.speech`). Both are standardised within each identity,
+    L = √(mean_t m[t]²) (s and m as in :mod:`facediff.metrics.speech`). Both are standardised within each identity,
     and SLCC is Pearson's correlation over all clips, which is Σ_k (n_k − 1) r_k / Σ_k (n_k − 1) with n_k clips
     and the correlation r_k of identity k. From −1 to 1, without unit.
 
@@ -219,12 +219,12 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
 
     Choices where the scripts are silent: an identity with one clip, or whose speech is as loud in every
     clip, does not enter, and one whose lips do not vary counts 0 (the scripts drop it). A clip of one frame has
-    no motion and is left out. `coverage` counts all these.
+    no motion and is left out. :meth:`coverage` counts all these.
 
     Memory grows with ``n_identities``, not with clips or frames.
 
     Args:
-        n_identities: How many identities there are; 1 standardises over all clips together.
+        n_identities: how many identities there are; 1 standardises over all clips together.
 
     >>> import torch
     >>> loudness = torch.tensor([[1.0], [2.0], [4.0]]).expand(3, 5)
@@ -275,10 +275,10 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            identities: Number of each sequence's identity, below ``n_identities``; needed unless there is one.
-            waveform: The sound; see `SpeechLipMetric.update`.
-            intensity: Instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
+            truth: of the same shape as the prediction.
+            identities: number of each sequence's identity, below ``n_identities``; needed unless there is one.
+            waveform: the sound; see :meth:`SpeechLipMetric.update`.
+            intensity: instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
         """
         clips = self.align(prediction, truth, **batch)
         clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
@@ -303,7 +303,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         return torch.stack([clip.speech.square().mean().sqrt(), *lips])
 
     def add(self, clips: Clips) -> None:
-        """Add each clip's intensities to the sums of its identity; see `SequenceMetric.add`."""
+        """Add each clip's intensities to the sums of its identity; see :meth:`SequenceMetric.add`."""
         self.check_vertices(clips.n_vertices)
         if self.check_finite:
             clips.check_finite()

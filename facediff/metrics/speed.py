@@ -26,7 +26,7 @@ class RealTimeFactor(ExactMetric):
     left out.
 
     Args:
-        hardware: What it was computed on, for the summary: see `device_name`.
+        hardware: what it was computed on, for the summary: see :func:`device_name`.
 
     >>> metric = RealTimeFactor("one core")
     >>> metric.update(1.0, 10.0)
@@ -54,11 +54,11 @@ class RealTimeFactor(ExactMetric):
         """Add a clip or several.
 
         Args:
-            computing: Seconds it took, not negative; a number or one for each clip.
-            speech: Seconds of speech, positive; likewise.
+            computing: seconds it took, not negative; a number or one for each clip.
+            speech: seconds of speech, positive; as many as ``computing``.
 
         Raises:
-            ValueError: If a time is negative, not finite, or no speech. Nothing is added then.
+            ValueError: if a time is negative, not finite, or no speech. Nothing is added then.
         """
         device = self.seconds.device
         times = [torch.as_tensor(value, device=device).double().reshape(-1) for value in (computing, speech)]
@@ -74,10 +74,10 @@ class RealTimeFactor(ExactMetric):
         """Time the body of ``with`` and add it; work on GPUs is waited for before and after.
 
         Args:
-            speech: Seconds of speech that it is computed for.
+            speech: seconds of speech that it is computed for.
 
         Raises:
-            ValueError: As `update`. An error inside passes through, and nothing is added then.
+            ValueError: as :meth:`update`. An error inside passes through, and nothing is added then.
         """
         _wait_for_gpus()
         start = time.perf_counter()

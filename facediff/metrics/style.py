@@ -90,11 +90,11 @@ class StyleRetrievalAccuracy(ExactMetric):
 
         Args:
             embeddings: (batch, dim), floating point.
-            labels: Whole numbers (batch,): whose style it is.
-            clip_names: One name per embedding, for messages.
+            labels: whole numbers (batch,): whose style it is.
+            clip_names: one name per embedding, for messages.
 
         Raises:
-            ValueError: If shapes or types do not fit, or an embedding holds NaN or infinity, or is zero and
+            ValueError: if shapes or types do not fit, or an embedding holds NaN or infinity, or is zero and
                 has no direction to compare by cosine. Nothing is added then.
         """
         if embeddings.ndim != 2 or not embeddings.is_floating_point() or embeddings.shape[1] == 0:
@@ -133,7 +133,7 @@ class StyleRetrievalAccuracy(ExactMetric):
         """The accuracy over all embeddings so far, a float64 scalar.
 
         Raises:
-            ValueError: If no label is carried by two embeddings, or processes hold embeddings of different
+            ValueError: if no label is carried by two embeddings, or processes hold embeddings of different
                 sizes.
         """
         flat, labels = self._gathered()
@@ -179,11 +179,11 @@ class SpeakerGallery:
     """Recordings whose speakers are known, each by its mean motion.
 
     Args:
-        means: The mean over time of each recording's offsets from its speaker's template, (recordings, vertices, 3).
-        speakers: The number of each recording's speaker.
+        means: the mean over time of each recording's offsets from its speaker's template, (recordings, vertices, 3).
+        speakers: the number of each recording's speaker.
 
     Raises:
-        ValueError: If they do not fit, are not finite, or are of less than two speakers.
+        ValueError: if they do not fit, are not finite, or are of less than two speakers.
     """
 
     means: Tensor
@@ -206,18 +206,18 @@ class NearestSpeakerAccuracy(SequenceMetric):
 
     People differ in how they hold and move their faces, and so in the mean m of their offsets over a sequence. A
     gallery of recordings (the training clips, and those of no split for unseen speakers) says how: m is taken in the
-    first principal components of the gallery's means; there, with C the covariance within speakers, which is what
-    mood and words do, and S = C + ``shrinkage`` · tr(C) / K · I, the nearest speaker is the one whose mean m̄ has the
-    smallest (m − m̄)ᵀ S⁻¹ (m − m̄). On recorded motion it is right nearly always (Puppet's test splits: 40 of 40 clips);
-    guessing gives 1 / speakers. Definition ours.
+    first principal components of the gallery's means; there, with C the covariance within speakers, which is what mood
+    and words do, and S = C + ``shrinkage`` · tr(C) / K · I, the nearest speaker is the one whose mean m̄ has the
+    smallest (m − m̄)ᵀ S⁻¹ (m − m̄). On recorded motion it is right nearly always (Puppet's test splits: 40 of 40
+    clips); guessing gives 1 / speakers. Definition ours.
 
     Give a model only a reference and no label of the speaker to see whether the reference carries the person:
     ``facediff generation-metrics`` does.
 
     Args:
-        gallery: Recordings whose speakers are known.
-        components: Principal components K, at most.
-        shrinkage: How much of an even covariance is added, so that no direction decides alone.
+        gallery: recordings whose speakers are known.
+        components: principal components K, at most.
+        shrinkage: how much of an even covariance is added, so that no direction decides alone.
 
     >>> means = torch.tensor([[[0.0, 0.0, 0.0]], [[0.0, 2.0, 0.0]], [[5.0, 0.0, 0.0]], [[5.0, 2.0, 0.0]]])
     >>> gallery = SpeakerGallery(means, (0, 0, 1, 1))
@@ -303,8 +303,8 @@ class NearestSpeakerAccuracy(SequenceMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            identities: The number of the speaker whom each sequence should show.
-            template: Neutral vertices, when the prediction is absolute vertices. **None means that it is offsets from
+            identities: the number of the speaker whom each sequence should show.
+            template: neutral vertices, when the prediction is absolute vertices. **None means that it is offsets from
                 the template already.**
         """
         clips = self.align(prediction, prediction, **batch).attach_templates(template)

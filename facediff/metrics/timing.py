@@ -80,7 +80,7 @@ class LipWarpingDistance(LipMetric):
     With d(i, j) = √(mean_{v∈M} ‖g[i, v] − p[j, v]‖²), the root mean square distance between the lips of frame
     i of the truth and frame j of the prediction, the metric of a sequence is the smallest sum of d along a
     warping path from the first frames to the last, divided by the number of pairs on that path; then the mean
-    over sequences, in the vertices' unit. See `warp` for the path and its ties. A template cancels.
+    over sequences, in the vertices' unit. See :func:`warp` for the path and its ties. A template cancels.
 
     The distance is never larger than the mean of d(t, t): what it is smaller by is error of timing.
 
@@ -187,9 +187,9 @@ Moments = Literal["extrema", "path"]
 class TemporalMisalignment(OpeningMetric):
     r"""Mean temporal misalignment (MTM): how many frames, or milliseconds, the mouth is early or late.
 
-    The opening of the mouth over time (see `MouthOpeningDifference`) is smoothed with a Gaussian, and
+    The opening of the mouth over time (see :class:`MouthOpeningDifference`) is smoothed with a Gaussian, and
     derivative dynamic time warping aligns the prediction's with the truth's: the warping path of smallest sum of
-    \|Δo_g[i] − Δo_p[j]\| with Δo[t] = o[t] − o[t − 1], Δo[0] = 0 (see `warp` for the path and its ties).
+    \|Δo_g[i] − Δo_p[j]\| with Δo[t] = o[t] − o[t − 1], Δo[0] = 0 (see :func:`warp` for the path and its ties).
     The misalignment of a sequence is the mean of \|i − j\| over
 
     - ``at="extrema"``: those pairs of the path at which both openings have a local maximum, or both a local
@@ -208,9 +208,9 @@ class TemporalMisalignment(OpeningMetric):
 
     Args:
         at: ``"extrema"`` as the CVPR 2025 paper's script, or ``"path"``.
-        smoothing: Standard deviation of the Gaussian in frames; 0 for none. It is cut off at 4 standard
+        smoothing: standard deviation of the Gaussian in frames; 0 for none. It is cut off at 4 standard
             deviations, and the series is mirrored at its ends.
-        frames_per_second: Of the motion, for a result in milliseconds; None for frames.
+        frames_per_second: of the motion, for a result in milliseconds; None for frames.
 
     >>> import torch
     >>> truth = torch.zeros(40, 2, 3)

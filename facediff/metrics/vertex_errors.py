@@ -1,7 +1,7 @@
 """Distance of the vertices from the truth (MVE, LVE, UVE), and how much the upper face moves (FDD).
 
 g and p are truth and prediction (frames, vertices, 3), and e²[t, v] = Σ_c (g[t, v, c] − p[t, v, c])². The arithmetic,
-in float64 and in one pass over the frames, is in `facediff.metrics.one_pass`.
+in float64 and in one pass over the frames, is in :mod:`facediff.metrics.one_pass`.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class VertexError(SequenceMetric):
     and offsets from the template give the same number, since the template cancels.
 
     Args:
-        region: Vertices to look at, a `Region` or indices; None for all.
+        region: vertices to look at, a :class:`Region` or indices; None for all.
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
-        squared: Whether distances are squared, e² instead of √e²; the score is then in the vertices' unit squared.
+        squared: whether distances are squared, e² instead of √e²; the score is then in the vertices' unit squared.
     """
 
     higher_is_better = False
@@ -63,7 +63,7 @@ class VertexError(SequenceMetric):
         self.squared = squared
 
     def wanted(self) -> ErrorOf:
-        """The error, as `facediff.metrics.one_pass.one_pass` is asked for it."""
+        """The error, as :func:`facediff.metrics.one_pass.one_pass` is asked for it."""
         return ErrorOf(self.indices, self.reduction, self.squared)
 
     def clip_value(self, clip: Clip) -> Tensor:
@@ -105,7 +105,7 @@ class LipVertexError(VertexError):
     unsquared is MeshTalk's paper; squared and pooled by sequences is what DiffSpeaker's code reports.
 
     Args:
-        lips: Lip vertices, a `Region` or indices.
+        lips: lip vertices, a :class:`Region` or indices.
 
     >>> import torch
     >>> metric = LipVertexError([1, 2])
@@ -135,7 +135,7 @@ class UpperFaceVertexError(VertexError):
     is plausible but not the truth's. In the vertices' unit, squared if ``squared``.
 
     Args:
-        upper: Upper-face vertices, a `Region` or indices.
+        upper: upper-face vertices, a :class:`Region` or indices.
     """
 
     needs = ("upper_face",)
@@ -172,7 +172,7 @@ class FaceDynamicsDeviation(SequenceMetric):
     count alike whatever their length; a sequence of one frame does not vary and gives 0.
 
     Args:
-        upper: Upper-face vertices, a `Region` or indices.
+        upper: upper-face vertices, a :class:`Region` or indices.
         sign: ``"signed"`` or ``"absolute"`` in each sequence.
 
     >>> import torch
@@ -205,8 +205,8 @@ class FaceDynamicsDeviation(SequenceMetric):
 
         Args:
             prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: Likewise.
-            template: Neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
+            truth: of the same shape as the prediction.
+            template: neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
                 prediction and truth are absolute vertices. **None means that they are offsets from the
                 template already**; absolute vertices without a template give another, meaningless number.
         """

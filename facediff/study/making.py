@@ -240,13 +240,13 @@ def plan_study(
     Args:
         methods: each method's folder; the first is compared with the others and with the truth.
         options: how the study is made.
-        truth: see :class:`facediff.study.material.StudyAnimations`, likewise the rest.
-        references: likewise.
-        identity: likewise.
-        speech: likewise.
-        mesh: likewise.
-        frame_rate: likewise.
-        unit: likewise.
+        truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
+        references: folder of animations of the same speakers, shown with questions of style.
+        identity: whose style the predictions were given: ``own``, or an identity's name.
+        speech: folder of recordings; the corpus's, or those that the animations hold, if None.
+        mesh: what bare arrays lack: a file with the triangles.
+        frame_rate: frames a second of bare arrays.
+        unit: unit of length of bare arrays.
     """
     options = options or StudyOptions()
     if len(methods) + (truth is not None) < 2:

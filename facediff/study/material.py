@@ -333,7 +333,7 @@ def in_unit_of(first: Animation, other: Animation) -> Animation:
 
 
 def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int]:
-    """Speech (S,) of so many seconds, cut or padded with silence, and its sample rate; from a recording or an archive."""
+    """Speech (S,), cut or padded with silence to so many seconds, and its sample rate; of a recording or archive."""
     if path.suffix == ".npz":
         animation = read_animation(path)
         if animation.speech is None:

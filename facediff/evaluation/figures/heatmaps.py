@@ -73,7 +73,7 @@ def error_maps(
         material: the clips' files.
         clips: names of clips.
         workers: as of :func:`motion_maps`.
-        scheduler: likewise.
+        scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
 
     Returns:
         a map by method; and notes on frames that were left out.
@@ -176,7 +176,7 @@ def draw_heatmap(
         view: a name in :data:`facediff.render.VIEWS`.
         highest: ends of the colour scales of mean and deviation, in the unit shown; the largest value if None.
         workers: clips read at a time; as of :func:`motion_maps`.
-        scheduler: likewise.
+        scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
 
     Returns:
         notes on what was left out.

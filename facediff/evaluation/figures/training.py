@@ -76,7 +76,7 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
 
 
 def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str] | None) -> list[str]:
-    """Scalars to draw: those asked for, else the loss of training and the LVE of validation as far as they were logged."""
+    """Scalars to draw: those asked for, else the loss of training and the LVE of validation if they were logged."""
     if scalars is None:
         scalars = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
         if not scalars:
