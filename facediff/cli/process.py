@@ -1,6 +1,6 @@
-"""What the command line is to the system: standard streams, signals and exit statuses.
+"""The process of a command: standard streams, signals and exit statuses.
 
-A command is stopped by an exception in any case, so that whatever it has begun to write is removed on the way out.
+A command is stopped by an exception in any case, so that half-written files are removed on the way out.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class _StandardOutput(io.FileIO):
 def tell(*lines: object) -> None:
     """Print lines to standard output, in which names of files may hold what is no text, or not one line.
 
-    Everything that the commands print goes this way; where standard output is a pipe, it is given out at once.
+    Everything that the commands print goes this way; where standard output is a pipe, it is flushed immediately.
     """
     encoding = sys.stdout.encoding or "utf-8"
     for line in lines:

@@ -57,7 +57,7 @@ def serve(
     def ready(address: str) -> None:
         tell(f"{address} animates with {model}; Ctrl-C ends it")
         if host not in LOOPBACK:
-            tell(f"note: everybody who reaches {host} may open the page; browsers give it no microphone without https")
+            tell(f"note: any machine that reaches {host} may open the page; without https it gets no microphone")
         if open:
             import webbrowser
 

@@ -1,4 +1,4 @@
-"""Live performance: speech that is heard now, to a face that moves now, in engines, browsers and other programs.
+"""Live performance: a face animated from live speech, in engines, browsers and other programs.
 
 Needs no PyTorch: what animates is an exported model (:mod:`facediff.runtime`), or whatever gives frames for speech.
 """

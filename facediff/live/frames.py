@@ -1,4 +1,4 @@
-"""What a live performance sends, and what receives it: frames, the face that they move, receivers and their addresses.
+"""Frames of a live performance, the face that they animate, receivers and their addresses.
 
 A receiver is registered under the kind ``receiver`` by the scheme of its address: ``vmc://127.0.0.1:39539`` is sent by
 the class that is registered as ``vmc``. Its constructor takes the :class:`Address`, and options with defaults, which
@@ -50,13 +50,13 @@ class LiveFrame:
 
     @property
     def lag(self) -> float:
-        """Seconds since its speech was heard."""
+        """Seconds since its speech arrived."""
         return monotonic() - self.heard
 
 
 @dataclass(frozen=True)
 class Performance:
-    """What stays the same while somebody performs.
+    """Constants of a live session.
 
     Attributes:
         frame_rate: frames a second.
@@ -91,7 +91,7 @@ class Address:
         text: as typed.
         scheme: the receiver's name.
         host: of ``scheme://host:port``; None if not given.
-        port: likewise, or of ``scheme:port``.
+        port: of ``scheme://host:port`` or ``scheme:port``; None if not given.
         path: what else follows the scheme: a file, or ``-``; empty if nothing does.
         options: what follows the question mark.
     """
@@ -131,9 +131,9 @@ class Receiver(ABC):
 
     @abstractmethod
     def open(self, performance: Performance) -> None:
-        """Make what the performance is sent through: a socket, a file, a server.
+        """Open what the performance is sent through: a socket, a file, a server.
 
-        A program that does not listen yet is no error: it is tried again with every frame.
+        A program that does not listen yet is no error: every frame is sent to it.
 
         Raises:
             FaceDiffError: if it cannot work at all: the port is taken, the file cannot be written.
@@ -143,13 +143,13 @@ class Receiver(ABC):
     def send(self, frame: LiveFrame) -> None:
         """Send a frame, within a few milliseconds.
 
-        A receiver that is gone is counted and tried again; nothing that the other side does is an exception here.
+        A failure of the other side is counted and tried again; it is no exception here.
         """
 
-    def hear(self, speech: Array, start: float) -> None:  # noqa: B027 - most receivers are deaf
+    def hear(self, speech: Array, start: float) -> None:  # noqa: B027 - most receivers play no audio
         """Take speech (n,) from 0 to 1 of full scale at the performance's rate, for receivers that play it.
 
-        Called as soon as the speech has been heard: earlier than its frames.
+        Called as soon as the speech has arrived: earlier than its frames.
 
         Args:
             speech: the samples.
@@ -158,7 +158,7 @@ class Receiver(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of everything; may be called twice."""
+        """Close everything; may be called twice."""
 
     def status(self) -> str:
         """A few words for the report: clients, bytes, frames that were lost; empty if there is nothing to report."""

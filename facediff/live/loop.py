@@ -1,4 +1,4 @@
-"""The loop of a live performance: what is heard goes to the model, and its frames leave at their time.
+"""The loop of a live performance: speech goes to the model, and its frames are sent when they are due.
 
 Three threads: the source's, which only hands samples over; the model's; and the caller's, which waits for the time of
 each frame and gives it to the receivers. Between them are a :class:`Backlog` of speech and a queue of frames, both of
@@ -30,7 +30,7 @@ Solver = Callable[[Array], Array]
 
 PATIENCE = (0.5, 3.0)
 """Least and most seconds of speech that may wait for a model which usually is fast enough: as many as its look-ahead
-has, since somebody who waits for a long window anyway prefers waiting to gaps."""
+has: with long windows, buffering is better than dropping speech."""
 
 HURRIED = 0.25
 """The same for a model that is too slow: speech that waits would only make all frames late."""
@@ -41,12 +41,12 @@ RECENT = 3.0
 
 @dataclass
 class LiveSummary:
-    """What a performance was like.
+    """Figures of a performance.
 
     Attributes:
         frames: that were sent.
         dropped: frames that came too late to be sent.
-        speech: seconds that were heard.
+        speech: seconds that were received.
         lost: seconds of speech that were dropped because the model was too slow.
         busy: seconds that the model has computed.
         lag: from the moment that a frame's last sample was spoken until the frame was sent.
@@ -159,7 +159,7 @@ class Loop:
     Args:
         model: animates.
         source: of the speech.
-        receivers: of the frames; they are open, and closed by whoever has opened them.
+        receivers: of the frames; they are open, and closed by the caller.
         hearing: those of them that play the speech.
         solve: finds weights of blendshapes for receivers that need them.
         seconds: of speech, after which it ends; None for the source's own end.
@@ -193,8 +193,8 @@ class Loop:
         self._ended = False
         self._error: BaseException | None = None
         self._interval = Lags()
-        self._abandoned = False  # nobody waits for the frames that are left
-        self._slow_told = False
+        self._abandoned = False  # the frames that are left are not needed
+        self._slow_reported = False
         self._failing: set[str] = set()  # names of receivers that have raised
 
     def run(self) -> LiveSummary:
@@ -304,8 +304,8 @@ class Loop:
         factor = sum(seconds for seconds, _ in recent) / max(heard, 1e-9)
         slow = heard > 0.9 * enough and factor > 1
         self._backlog.limit = hop + (HURRIED if slow else self._patience)
-        if slow and not self._slow_told:
-            self._slow_told = True
+        if slow and not self._slow_reported:
+            self._slow_reported = True
             self._report(
                 f"the model takes {factor:.2f} s for a second of speech on this machine, so that speech is dropped: "
                 f"export it with fewer --steps and --quick-steps, choose a longer --window or a shorter --overlap, or "
@@ -333,7 +333,7 @@ class Loop:
 
     def _send_all(self) -> None:
         """Give every frame to the receivers when it is due, until there are no more."""
-        told = time.monotonic()
+        reported = time.monotonic()
         weights: tuple[int, Array | None] = (-1, None)  # of which frame
         while True:
             with self._changed:
@@ -361,8 +361,8 @@ class Loop:
                 self.summary.dropped += 1
             else:
                 self._send(frame, weights[1] if weights[0] == frame.index else None, solving)
-            if self._every is not None and time.monotonic() - told > self._every:
-                told = time.monotonic()
+            if self._every is not None and time.monotonic() - reported > self._every:
+                reported = time.monotonic()
                 self._tell()
 
     def _wait_for(self, frame: _Ready) -> bool:
@@ -402,7 +402,7 @@ class Loop:
         for receiver in receivers:
             try:
                 do(receiver)
-            except Exception as error:  # noqa: BLE001 - a third party's receiver may raise whatever it likes
+            except Exception as error:  # noqa: BLE001 - a third party's receiver may raise anything
                 if receiver.name not in self._failing:
                     self._failing.add(receiver.name)
                     self._report(f"{receiver.name}: {type(error).__name__}: {error}")

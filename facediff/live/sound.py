@@ -26,7 +26,7 @@ APART = 0.03
 
 
 class SoundOut(Receiver):
-    """Plays the speech of a performance on a sound device; it is deaf to frames.
+    """Plays the speech of a performance on a sound device; it ignores frames.
 
     Args:
         device: number or part of the name; ``default`` for the system's choice.
@@ -96,7 +96,7 @@ class SoundOut(Receiver):
             stream.close()
 
     def status(self) -> str:
-        """How often the sound had to jump to stay with the face."""
+        """How often the sound had to jump to stay in time with the face."""
         return f"{self.jumps} jumps" if self.jumps else ""
 
     def _play(self, out: Array, count: int, clock: Any, status: Any) -> None:  # noqa: ANN401 - of PortAudio

@@ -24,7 +24,7 @@ GROWTH = 0.1
 that is slower than that drops frames."""
 
 SHRINKING, HURRY, FASTEST = 0.01, 0.2, 0.1
-"""Seconds by which the delay shrinks in a second: frames then follow each other 1 % faster, which nobody sees; a delay
+"""Seconds by which the delay shrinks in a second: frames then follow each other 1 % faster, which is invisible; a delay
 that is far too long, after a time in which the machine was busy, shrinks faster by its excess, up to 10 %."""
 
 

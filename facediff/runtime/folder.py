@@ -38,14 +38,14 @@ EXPECTED = "expected a folder that `facediff export-model` wrote"
 
 @dataclass(frozen=True)
 class Description:
-    """What ``model.json`` says.
+    """Content of ``model.json``.
 
     Attributes:
         model: class of the model.
         facediff: version that wrote the folder.
         corpus: that the model was trained on.
-        synthetic: whether that corpus was made by a program.
-        licences: of what the model is made of, by what they cover.
+        synthetic: whether that corpus is synthetic.
+        licences: licence labels by what they cover: data, weights …
         opset: of the graphs.
         precision: how weights are stored: ``float32``, ``float16`` or ``int8``.
         sizes: bytes of each file.
@@ -65,7 +65,7 @@ class Description:
         steps: the diffusion steps visited.
         table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise.
         last_step: the step at which only the mean is left.
-        decoded: what the last graph is given: the ``sample`` or what was ``kept`` of the last step.
+        decoded: input of the last graph: the ``sample``, or what was ``kept`` of the last step.
         generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
             said of the loop is 0, empty, and ``last_step`` −1, as in a model that predicts no mean.
         blending: where windows go over into one another: in all ``steps`` of the loop, or in the ``motion``.
@@ -74,8 +74,8 @@ class Description:
         longest: frames at most of what is animated in one pass; 0 for any number.
         drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.
         noise_of: what noise depends on: the ``clip`` and the seed, or the ``seed``.
-        stillness: how far the stored references move; motion whose still vertices (the array ``still``) lie farther
-            from the neutral face than a part of it is of another face.
+        stillness: how far the stored references move; reference motion is rejected as another face if its static
+            vertices (the array ``still``) deviate by more than a fraction of this.
         quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
         quick_table: for each of them, as in ``table``.
         check: the comparison with PyTorch when the folder was written.
@@ -119,7 +119,7 @@ class Description:
     check: dict[str, Any] = field(default_factory=dict)
 
     def content(self) -> dict[str, Any]:
-        """What is written."""
+        """The JSON object that is written."""
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     @property

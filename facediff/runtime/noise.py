@@ -29,8 +29,8 @@ class NormalStream:
     """
 
     def __init__(self, seed: int) -> None:
-        # The same Mersenne twister, seeded by its authors' first rule, as PyTorch does it; of a larger seed PyTorch
-        # takes the lower 32 bits.
+        # The same Mersenne twister, seeded by its authors' first rule, as in PyTorch, which takes the lower 32 bits of
+        # a larger seed.
         self._bits = np.random.MT19937()
         self._bits._legacy_seeding(seed & 0xFFFFFFFF)
 
@@ -48,7 +48,7 @@ class NormalStream:
         uniform = self._uniform(count)
         normal[:whole] = box_muller(uniform[:whole])
         if whole < count:
-            # What is left over is not drawn by itself: the last 16 numbers are drawn again.
+            # A rest is not drawn by itself: the last 16 numbers are drawn again.
             normal[-BLOCK:] = box_muller(self._uniform(BLOCK))
         return normal.reshape(shape)
 

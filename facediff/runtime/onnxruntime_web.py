@@ -99,7 +99,7 @@ def web_runtime(source: Path | None = None, *, say: Callable[[str], object] = la
     Args:
         source: a folder that holds them, or npm's package of this version; if None they are taken from facediff's
             cache, and fetched from the npm registry the first time.
-        say: told before anything is fetched.
+        say: called with a sentence before anything is fetched.
 
     Raises:
         FaceDiffError: if they are missing, of another version, or cannot be fetched.

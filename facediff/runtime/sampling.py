@@ -1,4 +1,4 @@
-"""What generates the motion of an exported model: its graphs, and the sampler's table of numbers, run with NumPy."""
+"""Motion of an exported model: its graphs, and the sampler's table of coefficients, run with NumPy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float32]
 
 NAME = "speech"
-"""What a clip is called where its noise is drawn; :meth:`facediff.models.inference.Inference.animate` calls it so."""
+"""Name of a clip where its noise is drawn, as :meth:`facediff.models.inference.Inference.animate` names it."""
 
 Draw = Callable[[int, int], Array]
 """Unit noise (1, frames, width) for a number of frames and a width."""
@@ -26,7 +26,7 @@ Draw = Callable[[int, int], Array]
 
 @dataclass(frozen=True)
 class RuntimeConditions:
-    """What motion is conditioned on besides speech."""
+    """Conditions of the motion other than speech."""
 
     identity: int
     style: Array
@@ -38,13 +38,13 @@ class RuntimeConditions:
 
 @dataclass(frozen=True)
 class WindowSpeech:
-    """Speech as a clip or a window hears it.
+    """Speech of a clip or a window.
 
     Attributes:
         speech: samples (S,).
         frames: how many it lasts.
         mean: of all speech so far.
-        deviation: likewise.
+        deviation: standard deviation of all speech so far.
     """
 
     speech: Array
@@ -83,12 +83,12 @@ def window_motion(
     Args:
         model: the model.
         heard: the window's speech, with some before and after it.
-        window: which of its frames are wanted.
+        window: which of its frames are generated.
         conditions: what motion is conditioned on.
-        before: what the window before handed over; None for the first.
+        before: the tail of the window before; None for the first.
 
     Returns:
-        the motion, and what to hand over to the next window.
+        the motion, and the tail that the next window blends with.
     """
     own_frames = slice(window.context, window.context + window.frames)
     if model.description.blending == "motion":
@@ -106,7 +106,7 @@ def window_motion(
 
 
 def conditioned(features: Array, conditions: RuntimeConditions) -> dict[str, npt.NDArray[Any]]:
-    """What every graph after the first is given; each takes what it has a use for."""
+    """Inputs shared by all graphs after the first; a graph ignores those it does not declare."""
     return {
         "mask": np.ones((1, features.shape[1]), bool),
         "identity": np.array([conditions.identity], np.int64),

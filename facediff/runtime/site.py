@@ -198,7 +198,7 @@ def serve_site(
 
     Args:
         site: its files.
-        host: address to listen at; by default nobody but this machine reaches it.
+        host: address to listen at; by default only this machine reaches it.
         port: to listen at; 0 for any free one.
         ready: called with the page's address as soon as it can be opened.
 

@@ -27,7 +27,7 @@ class FrameClock:
     Attributes:
         frame_rate: motion frames a second.
         rule: ``rounded``: as many as fit the speech, which is then cut or filled up to whole frames. With all others
-            the model hears every sample: ``steps``: by the network's steps; ``pairs``: two steps a frame; ``seconds``:
+            the model takes every sample: ``steps``: by the network's steps; ``pairs``: two steps a frame; ``seconds``:
             a frame less than the speech lasts; ``seconds_or_pairs``: the smaller of the two; ``rows``: one of every so
             many rows of a finer clock, from the first on.
         convolutions: kernel and stride of each convolution of the speech network.

@@ -1,7 +1,7 @@
 """The melody of speech: its pitch, and where it has accents, stressed syllables and the ends of phrases.
 
-From top to bottom: the pitch of a piece of speech; :class:`Prosody`, which hears a recording or a stream and says what
-happens when. Every decision waits for the same short time, so that both hear the same.
+From top to bottom: the pitch of a piece of speech; :class:`ProsodyTracker`, which finds the events of a recording or a
+stream. Every decision waits for the same short time, so that both give the same events.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class ProsodicEvent:
 
 
 class ProsodyTracker:
-    """Hears one recording in pieces, and says what happens in it.
+    """Follows the prosody of one recording, in pieces.
 
     An accent is where pitch, and to a lesser part loudness, rises above what is usual for the speaker so far; a
     stressed syllable is a peak of loudness; a phrase ends where half a second of speech or more is followed by a pause.
@@ -155,7 +155,7 @@ class ProsodyTracker:
         return 0 <= at < len(self._active) and self._active[at]
 
     def feed(self, samples: Wave) -> None:
-        """Hear more (n,) at 16 kHz."""
+        """Take more samples (n,) at 16 kHz."""
         new = np.asarray(samples, np.float64)
         self._to_hear = np.concatenate([self._to_hear, new])
         whole = len(self._to_hear) // HOP

@@ -45,8 +45,8 @@ class WindowPlan:
         seconds: length of what a window animates.
         overlap: how much of it the next one shares; at most half of it. With a ``past``: 0, or less than
             all of it.
-        before: speech before the window that the model hears too.
-        after: speech after the window that the model hears too.
+        before: speech before the window that the model receives too.
+        after: speech after the window that the model receives too.
         above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
             in one pass.
         past: motion before the window that it sees and continues.
@@ -106,14 +106,14 @@ class WindowPlan:
         return FramePlan(frames, overlap, before, after, past)
 
     def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
-        """The same with the lengths that somebody asked for; None keeps what is usual.
+        """The plan with other lengths; None keeps a length.
 
         Raises:
             FaceDiffError: if a length is impossible.
         """
         length = self.seconds if seconds is None else seconds
         shared = min(self.overlap, length / 2) if overlap is None else overlap
-        # Who asks for windows gets them, also of a model that else takes speech of any length in one pass.
+        # A chosen window is used also with a model that otherwise takes speech of any length in one pass.
         above = self.above if seconds is None else min(self.above, WindowPlan.above)
         return replace(self, seconds=length, overlap=shared, above=above)
 
@@ -144,8 +144,8 @@ class FramePlan:
     Attributes:
         frames: that a window animates.
         overlap: shared by neighbours.
-        before: heard before a window.
-        after: heard after it.
+        before: of speech before a window.
+        after: of speech after it.
         past: of the motion before a window, which it sees.
     """
 
@@ -196,7 +196,7 @@ class MotionWindow:
 
     @property
     def context(self) -> int:
-        """Frames before the window whose speech the model hears, but which it does not animate."""
+        """Frames before the window whose speech the model receives, but which it does not animate."""
         return min(self.plan.before, self.start)
 
     @property
@@ -226,7 +226,7 @@ class MotionWindow:
 
 
 class MotionStream(Protocol[M_co]):
-    """What hears speech in pieces, and gives motion; it counts the frames that it has given."""
+    """Takes speech in pieces and gives motion; counts the frames that it has given."""
 
     frames: int
 
@@ -298,7 +298,7 @@ class SpeechWindows(ABC, Generic[M]):
             speech: that of the window, with some before and after it.
             frames: how many this speech lasts.
             mean: of all speech so far.
-            deviation: likewise.
+            deviation: standard deviation of all speech so far.
         """
 
     @abstractmethod
@@ -306,7 +306,7 @@ class SpeechWindows(ABC, Generic[M]):
         """Motion of consecutive frames in one piece; there may be no parts."""
 
     def feed(self, samples: Speech) -> M:
-        """Hear more speech at 16 kHz, and give the motion that has become certain; it may have no frames.
+        """Take more speech at 16 kHz, and give the motion that has become certain; it may have no frames.
 
         Raises:
             FaceDiffError: if the stream was finished.

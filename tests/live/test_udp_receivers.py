@@ -214,7 +214,7 @@ def test_a_receiver_that_is_gone_is_counted_and_found_again(opened: Opened, capl
     for index in range(1, 20):
         receiver.send(frame(index))
     assert "refused" in receiver.status()
-    assert len([record for record in caplog.records if "nobody listens" in record.message]) == 1
+    assert len([record for record in caplog.records if "no program listens" in record.message]) == 1
     back = Listener(listener.port)
     for index in range(20, 24):
         receiver.send(frame(index))

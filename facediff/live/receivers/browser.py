@@ -18,7 +18,7 @@ The page asks for itself (``GET /``) and opens the WebSocket ``/live`` of the sa
 
 The page answers every frame with its index as a text. Once it has answered, no more than :data:`ON_THE_WAY` frames go
 unanswered: a page that does not keep up is sent fewer. A program that never answers is sent what its connection takes.
-Whatever else is said ends the connection.
+Any other message ends the connection.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Browser(Receiver):
     Any number of pages up to 16 may be open; they come, go and come back as they like.
 
     Args:
-        address: ``browser``, ``browser:PORT`` or ``browser://HOST:PORT``; nobody but this machine reaches the page
-            unless another host is named.
+        address: ``browser``, ``browser:PORT`` or ``browser://HOST:PORT``; only this machine reaches the page unless
+            another host is named.
         open: whether the page is opened in this machine's browser.
     """
 
@@ -124,7 +124,7 @@ class Browser(Receiver):
         self._page = "".join(page(performance.subject)).encode()
         self._hosts = names_of(self.host)
         listening = listen(self.address, self.host, self.port)
-        # The library reports every visitor that leaves in the middle of a sentence.
+        # The library logs every connection that is closed in the middle of a message.
         quiet = logging.getLogger("facediff.live.browser")
         quiet.setLevel(logging.CRITICAL)
         self._server = serve(
@@ -184,9 +184,9 @@ class Browser(Receiver):
                 self._viewers[number] = viewer
                 self._came += 1
             try:
-                while viewer.hears(connection.recv()):
+                while viewer.acknowledged(connection.recv()):
                     pass
-                self._refuse("a page said what it should not")
+                self._refuse("a page sent an unexpected message")
                 connection.close(1008, "expected the index of a frame")
             except ConnectionClosed as error:
                 if error.sent is not None and error.sent.code in (1002, 1007, 1009):
@@ -244,7 +244,7 @@ class Browser(Receiver):
 
 
 class _Viewer:
-    """One page: what is sent to it, and how far it has come."""
+    """One page: its queues, and how many frames it has not answered."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self._connection = connection
@@ -287,8 +287,8 @@ class _Viewer:
         """Send speech."""
         self._speech.put(data)
 
-    def hears(self, answer: str | bytes) -> bool:
-        """Take note of what the page says; whether it is the index of a frame."""
+    def acknowledged(self, answer: str | bytes) -> bool:
+        """Count the answer of a page; whether it is the index of a frame, as it should be."""
         if not isinstance(answer, str) or not (answer.isascii() and answer.isdecimal()):
             return False
         with self._lock:
@@ -297,7 +297,7 @@ class _Viewer:
             return self._on_the_way >= 0
 
     def leave(self) -> None:
-        """Say goodbye; the page tries again later."""
+        """Close the connection; the page connects again later."""
         with suppress(OSError):
             self._connection.close(1001, "the performance is over")
 

@@ -155,7 +155,7 @@ class _Stream:
         self._put(first)
 
     def write(self, data: bytes) -> None:
-        """Write a frame's line; where nobody reads any more, or the disk is full, it is reported once."""
+        """Write a frame's line; a closed pipe or a full disk is reported once."""
         if self._put(data):
             self._frames += 1
 
@@ -205,7 +205,7 @@ def _to_stdout(data: bytes) -> None:
 
 
 class _Clients:
-    """Everybody who is connected to a port."""
+    """The clients that are connected to a port."""
 
     def __init__(self, address: Address, host: str, port: int, first: bytes) -> None:
         self.address, self._first = address, first
@@ -219,7 +219,7 @@ class _Clients:
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody is there."""
+        """Whether a client is connected."""
         return bool(self._clients)
 
     def _accept(self) -> None:
@@ -258,7 +258,7 @@ class _Clients:
         client.close()
 
     def close(self, dropped: int) -> None:
-        """Send the last line to whoever takes it within a second, and close the port."""
+        """Send the last line to clients that take it within a second, and close the port."""
         with suppress(OSError):
             self._listening.shutdown(socket.SHUT_RDWR)  # wakes the thread that accepts
         self._listening.close()

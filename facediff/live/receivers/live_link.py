@@ -57,7 +57,7 @@ class LiveLink(UdpReceiver):
     Args:
         address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
         subject: name of the face in Live Link; that of the performance if empty.
-        device: what tells this sender from others; one that is always the same for a subject if empty.
+        device: identifier of this sender; if empty, one that is the same for a subject every time.
     """
 
     default_port = 11_111

@@ -20,7 +20,7 @@ from facediff.registry import receiver
 
 MOST_BYTES = 1400
 """Of a datagram: more would be split on the way, and lost where one of its parts is lost."""
-BUNDLE = b"#bundle\0" + struct.pack(">Q", 1)  # the time tag 1 means at once
+BUNDLE = b"#bundle\0" + struct.pack(">Q", 1)  # the time tag 1 means immediately
 
 
 def message(address: str, *arguments: int | float | str) -> bytes:
@@ -59,10 +59,10 @@ def bundles(messages: Sequence[bytes], most_bytes: int = MOST_BYTES) -> Iterator
 
 
 class _Osc(UdpReceiver):
-    """What both protocols share: the messages of a frame, in bundles."""
+    """Shared by both protocols: the messages of a frame, in bundles."""
 
     def open(self, performance: Performance) -> None:
-        """Make the socket.
+        """Open the socket.
 
         Raises:
             FaceDiffError: if the host is unknown or the face has no shapes of ARKit's.

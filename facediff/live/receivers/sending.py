@@ -1,4 +1,4 @@
-"""What receivers share: hosts, datagrams, servers' sockets, and queues that never make a performance wait."""
+"""Shared by receivers: hosts, UDP datagrams, listening sockets, and queues that never block a performance."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiv
 Item = TypeVar("Item")
 
 log = logging.getLogger("facediff.live")
-"""What goes wrong on the way and ends nothing; without a handler, Python writes it to standard error."""
+"""Failures that do not end a performance; without a handler, Python writes them to standard error."""
 
 THIS_MACHINE = "127.0.0.1"
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine itself, which nobody else reaches or hears.
+    """Whether a host is this machine itself, which no other machine can reach.
 
     Example:
         >>> [is_loopback(host) for host in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.0.7")]
@@ -64,7 +64,7 @@ def endpoint(address: Address, default_port: int, *, listens: bool = False) -> t
 
 
 class Datagrams:
-    """Sends UDP datagrams to one place, and knows whether somebody listens there.
+    """Sends UDP datagrams to one place, and counts those that no program received.
 
     Args:
         address: of the receiver, for reports.
@@ -86,7 +86,7 @@ class Datagrams:
             raise _unreachable(address, error) from error
         try:
             self._socket.setblocking(False)
-            # A connected socket hears of datagrams that nobody took.
+            # A connected UDP socket reports when the port is unreachable (ICMP).
             self._socket.connect(place)
         except OSError as error:
             self._socket.close()
@@ -115,18 +115,18 @@ class Datagrams:
 
     def _report(self, *, listened: bool) -> None:
         if self._listened and not listened:
-            log.warning("%s: nobody listens there; frames are sent on until somebody does", self.address.text)
+            log.warning("%s: no program listens there; frames are sent all the same", self.address.text)
         self._listened = listened
 
     def status(self) -> str:
-        """What was sent, and what was not."""
+        """Numbers of frames that were sent, refused and lost."""
         parts = [f"{self.sent} frames sent"]
-        parts += [f"{self.refused} refused: nobody listened"] if self.refused else []
+        parts += [f"{self.refused} refused: no program listened"] if self.refused else []
         parts += [f"{self.lost} lost"] if self.lost else []
         return ", ".join(parts)
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         self._closed = True
         self._socket.close()
 
@@ -155,7 +155,7 @@ class UdpReceiver(Receiver):
         self._sending: Datagrams | None = None
 
     def open(self, performance: Performance) -> None:
-        """Make the socket; whether somebody listens shows when frames are sent.
+        """Open the socket; whether a program listens shows when frames are sent.
 
         Raises:
             FaceDiffError: if the host is unknown.
@@ -165,7 +165,7 @@ class UdpReceiver(Receiver):
 
     @abstractmethod
     def datagrams(self, frame: LiveFrame) -> Sequence[bytes]:
-        """What is sent for a frame, each part by itself."""
+        """The datagrams of a frame."""
 
     def send(self, frame: LiveFrame) -> None:
         """Send a frame."""
@@ -173,7 +173,7 @@ class UdpReceiver(Receiver):
             self._sending.send(self.datagrams(frame))
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         if self._sending is not None:
             self._sending.close()
 
@@ -210,10 +210,10 @@ class Outbox(Generic[Item]):
     """A short queue that a thread of its own empties; where that is too slow, the oldest items are dropped.
 
     Args:
-        take: what is done with each item, in the thread; an :class:`OSError` from it ends the thread.
+        take: called with each item, in the thread; an :class:`OSError` from it ends the thread.
         most: items that may wait.
         name: of the thread.
-        first: what is taken before all else, and never dropped.
+        first: an item that is taken first and never dropped.
     """
 
     def __init__(self, take: Callable[[Item], object], most: int, name: str, first: Item | None = None) -> None:
@@ -229,7 +229,7 @@ class Outbox(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Hand an item over, without waiting."""
+        """Queue an item without waiting."""
         with self._changed:
             self.given += 1
             if self._closed or self.failure is not None:
@@ -259,7 +259,7 @@ class Outbox(Generic[Item]):
                 self._waiting.clear()
 
     def close(self, seconds: float = 1.0) -> None:
-        """Take what still waits, if that does not take longer than so many seconds."""
+        """Empty the queue, for at most so many seconds."""
         with self._changed:
             self._closed = True
             self._changed.notify()
