@@ -10,7 +10,6 @@ import secrets
 import shutil
 import socket
 import sys
-import tempfile
 import time
 import zlib
 from collections.abc import Iterator
@@ -47,8 +46,8 @@ def config_dir() -> Path:
 def atomic(path: Path) -> Iterator[Path]:
     r"""Write a file whole or not at all.
 
-    Where ``path`` is a link, the file that it leads to is written and the link stays. A device, a pipe or a descriptor
-    (``/dev/stdout``) gets the bytes of the whole file. A file that is replaced hands its owner and its permissions on.
+    Where ``path`` is a link, the file that it leads to is written and the link stays. A file that is replaced hands its
+    owner and its permissions on.
 
     Yields:
         a temporary path next to the file, which is renamed at the end and removed if anything fails. Its suffix is that
@@ -67,25 +66,18 @@ def atomic(path: Path) -> Iterator[Path]:
         'clip,lve\n'
     """
     with _writing(path):
-        where = destination(path)
-        if where.special:
-            place = Path(tempfile.gettempdir()) / f"facediff-{path.name}"
-            with scratch_folder(place, private=True) as folder, _writing(path):
-                temporary = folder / f"whole{_short_suffix(path.suffix)}"
-                yield temporary
-                where.receive(temporary)
-            return
-        _refuse_unwritable(path, where.path)
-        temporary = _partial(where.path, path.suffix)
-        with _new_folders(where.path.parent):
-            if not os.access(where.path.parent, os.W_OK):  # not every writer's error says so
+        target = destination(path)
+        _refuse_unwritable(path, target)
+        temporary = _partial(target, path.suffix)
+        with _new_folders(target.parent):
+            if not os.access(target.parent, os.W_OK):  # not every writer's error says so
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-            _sweep(where.path.parent)
+            _sweep(target.parent)
             try:
                 yield temporary
-                _hand_on(where.path, temporary)
-                os.replace(temporary, where.path)
-                _note_swept(where.path.parent)
+                _hand_on(target, temporary)
+                os.replace(temporary, target)
+                _note_swept(target.parent)
             finally:
                 discard(temporary)  # never written, or renamed, or to be given up
 
@@ -146,14 +138,13 @@ def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
     :class:`FaceDiffError` that names ``path``. Nobody else may look into a ``private`` folder.
     """
     with _writing(path):
-        where = destination(path)
-        place = Path(tempfile.gettempdir()) / path.name if where.special else where.path
+        place = destination(path)
         with _new_folders(place.parent):
             _sweep(place.parent)
             folder = _partial(place)
             # The folder is locked before it gets its name, so that no other process removes it as abandoned.
             unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
-            unnamed.mkdir(mode=0o700 if private or where.special else 0o777)
+            unnamed.mkdir(mode=0o700 if private else 0o777)
             with _locked_folder(unnamed):
                 try:
                     unnamed.rename(folder)
@@ -166,19 +157,14 @@ def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
 def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
     """Move a finished file or folder to its name; a folder at ``target`` steps aside first and is then removed.
 
-    As in :func:`atomic`, links are followed, devices get the bytes, and owner and permissions of a file stay. Without
-    ``replace``, only an empty folder may be replaced.
+    As in :func:`atomic`, links are followed, and owner and permissions of a file stay. Without ``replace``, only an
+    empty folder may be replaced.
 
     Raises:
         OSError: if that fails; what was at ``target`` is there again.
         FaceDiffError: if ``target`` is, or holds, an input of the running command.
     """
-    where = destination(target)
-    if where.special:
-        where.receive(source)
-        source.unlink()
-        return
-    place = where.path
+    place = destination(target)
     if place.is_dir():
         refuse_protected(target, folder=True)
     else:
@@ -282,15 +268,11 @@ def check_writable(path: Path) -> None:
         FaceDiffError: if the folder cannot be made or written, if the path is a folder, or an input of the command.
     """
     with _writing(path):
-        where = destination(path)
-        if where.path.is_dir():
+        target = destination(path)
+        if target.is_dir():
             raise FaceDiffError(f"{path}: is a folder; expected the name of a file to write")
-        if where.special:
-            if where.descriptor is None and not os.access(where.path, os.W_OK):
-                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-            return
-        _refuse_unwritable(path, where.path)
-        _try_to_write(where.path)
+        _refuse_unwritable(path, target)
+        _try_to_write(target)
 
 
 def check_folder_writable(path: Path) -> None:
@@ -300,10 +282,10 @@ def check_folder_writable(path: Path) -> None:
         FaceDiffError: if it is a file, or cannot be made or written.
     """
     with _writing(path):
-        where = destination(path)
-        if where.special or (where.path.exists() and not where.path.is_dir()):
+        folder = destination(path)
+        if folder.exists() and not folder.is_dir():
             raise FaceDiffError(f"{path}: is a file; expected a folder to write to")
-        _try_to_write(where.path / "file")
+        _try_to_write(folder / "file")
 
 
 def _try_to_write(path: Path) -> None:
@@ -449,14 +431,14 @@ def _writing(path: Path) -> Iterator[None]:
 @contextmanager
 def _new_folders(folder: Path) -> Iterator[None]:
     """Make a folder and its parents; those that are still empty at the end are removed."""
-    made = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
+    missing = [place for place in (folder, *folder.parents) if not os.path.lexists(place)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        for each in made:
+        for place in missing:
             with suppress(OSError):  # not empty
-                each.rmdir()
+                place.rmdir()
 
 
 # Locks.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -105,6 +106,12 @@ def test_plain_yaml_holds_numbers_and_texts_and_no_objects(tmp_path: Path) -> No
             load_yaml(path, "expected a plan")
 
 
+def printed_config(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    with pytest.raises(SystemExit, match="0"):
+        main(["fit", *words, "--print_config"])
+    return dict(yaml.safe_load(capsys.readouterr().out))
+
+
 def test_bundled_parts_are_named_inside_ones_own_config(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,14 +121,12 @@ def test_bundled_parts_are_named_inside_ones_own_config(
         "trainer: configs/trainer/published_cpu.yaml\n"
     )
     monkeypatch.chdir(tmp_path)
-    assert main(["fit", "--config", "mine.yaml", "--print_config"]) == 0
-    config = yaml.safe_load(capsys.readouterr().out)
+    config = printed_config(capsys, "--config", "mine.yaml")
     assert config["trainer"]["max_epochs"] == 30
     assert config["model"]["class_path"].endswith("Voca")
     (tmp_path / "configs" / "trainer").mkdir(parents=True)
     (tmp_path / "configs" / "trainer" / "published_cpu.yaml").write_text("max_epochs: 7\n")
-    assert main(["fit", "--config", "mine.yaml", "--print_config"]) == 0
-    assert yaml.safe_load(capsys.readouterr().out)["trainer"]["max_epochs"] == 7
+    assert printed_config(capsys, "--config", "mine.yaml")["trainer"]["max_epochs"] == 7
 
 
 @pytest.mark.parametrize("name", ["configs/trainer/cpu.yaml", "trainer/cpu"])
@@ -129,8 +134,8 @@ def test_a_bundled_part_is_given_as_a_config(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["fit", "--config", name, "--model=Voca", "--data=Puppet", "--print_config"]) == 0
-    assert yaml.safe_load(capsys.readouterr().out)["trainer"]["logger"]["init_args"]["save_dir"] == "runs"
+    config = printed_config(capsys, "--config", name, "--model=Voca", "--data=Puppet")
+    assert config["trainer"]["logger"]["init_args"]["save_dir"] == "runs"
 
 
 def test_a_bundled_experiment_is_known_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,17 +118,16 @@ def typed(name: str, parameter: str, path: Path) -> object:
 
 @pytest.mark.parametrize(("name", "source", "target"), PAIRS)
 def test_an_output_that_is_an_input_is_refused_and_stays(name: str, source: str, target: str, tmp_path: Path) -> None:
-    """Under the same name, another one, through a link or as a hard link."""
+    """Under the same name, another one, or through a link."""
     file = tmp_path / "precious.bin"
     file.write_text("precious")
     (tmp_path / "soft").symlink_to(file)
-    (tmp_path / "hard").hardlink_to(file)
-    for output in (file, tmp_path / ".." / tmp_path.name / file.name, tmp_path / "soft", tmp_path / "hard"):
+    for output in (file, tmp_path / ".." / tmp_path.name / file.name, tmp_path / "soft"):
         with pytest.raises(FaceDiffError) as caught, reading():
             check_paths(flat(OWN[name]), {source: typed(name, source, file), target: typed(name, target, output)})
         assert str(output) in str(caught.value)
     assert file.read_text() == "precious"
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.parametrize(("name", "target"), WRITING)
@@ -174,7 +173,6 @@ def test_two_outputs_are_two_files(tmp_path: Path) -> None:
     for other in (tmp_path / "a.csv", tmp_path / "link"):
         with pytest.raises(FaceDiffError, match="named for two outputs"):
             check("x", "-o", tmp_path / "a.csv", "--second", other)
-    check("x", "-o", "/dev/null", "--second", "/dev/null")
     with pytest.raises(FaceDiffError, match="named for two outputs"):
         check("x", "-o", tmp_path / "a.npz", "--correspondence", tmp_path / "a.npz")
 
