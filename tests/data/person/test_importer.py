@@ -53,6 +53,16 @@ def files(tmp_path_factory: pytest.TempPathFactory, known: Person) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def brief(files: Path, tmp_path_factory: pytest.TempPathFactory, known: Person) -> Path:
+    """The same with the first three seconds of the motion, for tests that do not look at the result."""
+    folder = tmp_path_factory.mktemp("brief")
+    (folder / "corpus").symlink_to(files / "corpus")
+    write_speech(folder / "sound.wav", 3)
+    np.save(folder / "motion.npy", known.seen[:90].astype(np.float32))
+    return folder
+
+
 def words(files: Path, motion: str, out: Path, *more: str) -> list[str]:
     given = [str(files / motion), "--audio", str(files / "sound.wav"), "--name", "Target", "--frame-rate", "30"]
     given += ["--corpus", str(files / "corpus"), "-o", str(out), "--clip-seconds", "2", "--quiet"]
@@ -260,8 +270,8 @@ def test_what_is_printed(files: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(imported(out)) == 225
 
 
-def test_the_command_line_leads_here(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = words(files, "motion.npy", tmp_path / "out")
+def test_the_command_line_leads_here(brief: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = words(brief, "motion.npy", tmp_path / "out")
     assert main(["data", "import-person", *arguments]) == 0
     assert main(["data", "import-person", *arguments]) == 2
     error = capsys.readouterr().err
@@ -420,7 +430,7 @@ def test_a_flawed_folder_gets_one_sentence(
         (["-o", "{tmp}/silent.wav/out"], "cannot be written"),
     ],
 )
-def test_a_wrong_option_gets_one_sentence(files: Path, tmp_path: Path, options: list[str], sentence: str) -> None:
+def test_a_wrong_option_gets_one_sentence(brief: Path, tmp_path: Path, options: list[str], sentence: str) -> None:
     (tmp_path / "bare").mkdir()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")
@@ -434,7 +444,7 @@ def test_a_wrong_option_gets_one_sentence(files: Path, tmp_path: Path, options: 
     (tmp_path / "model.pkl").touch()
     more = [option.format(tmp=tmp_path) for option in options]
     with pytest.raises(FaceDiffError, match=sentence):
-        run("data import-person", words(files, "motion.npy", tmp_path / "out", *more))
+        run("data import-person", words(brief, "motion.npy", tmp_path / "out", *more))
     assert nothing_left(tmp_path)
     assert (tmp_path / "full" / "thesis.txt").read_text() == "mine"
 
@@ -445,15 +455,15 @@ def test_the_corpus_s_frame_rate_must_be_known(files: Path, tmp_path: Path) -> N
         run("data import-person", words(files, "motion.npy", tmp_path / "out", "--corpus", str(corpus)))
 
 
-def test_an_empty_folder_may_be_the_output(files: Path, tmp_path: Path) -> None:
+def test_an_empty_folder_may_be_the_output(brief: Path, tmp_path: Path) -> None:
     (tmp_path / "target").mkdir()
-    assert run("data import-person", words(files, "motion.npy", tmp_path / "target")) == 0
+    assert run("data import-person", words(brief, "motion.npy", tmp_path / "target")) == 0
     assert (tmp_path / "target" / "manifest.json").is_file()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_an_interruption_or_a_full_disk_leaves_nothing(
-    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     def stop(*_: object, **__: object) -> None:
         raise error
@@ -461,20 +471,20 @@ def test_an_interruption_or_a_full_disk_leaves_nothing(
     monkeypatch.setattr("facediff.data.person.importer.write_templates", stop)
     expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else FaceDiffError
     with pytest.raises(expected, match=None if expected is KeyboardInterrupt else "No space left on device"):
-        run("data import-person", words(files, "motion.npy", tmp_path / "new" / "out"))
+        run("data import-person", words(brief, "motion.npy", tmp_path / "new" / "out"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_faces_of_a_ply_template_are_compared(files: Path, tmp_path: Path, known: Person) -> None:
+def test_faces_of_a_ply_template_are_compared(brief: Path, tmp_path: Path, known: Person) -> None:
     write_plys(tmp_path / "frames", 1000 * face()[None])
     (tmp_path / "frames" / "000000.ply").rename(tmp_path / "face.ply")
     out = tmp_path / "out"
-    assert run("data import-person", words(files, "motion.npy", out, "--template", str(tmp_path / "face.ply"))) == 0
+    assert run("data import-person", words(brief, "motion.npy", out, "--template", str(tmp_path / "face.ply"))) == 0
     flipped = [f"f {a} {b} {c}" for a, b, c in grid_faces()[:, [0, 1, 2]]]  # counted from 0: every triangle is shifted
     points = [f"v {x} {y} {z}" for x, y, z in 1000 * face()]
     (tmp_path / "face.obj").write_text("\n".join([*points, *flipped[1:]]))
     with pytest.raises(FaceDiffError, match=r"face\.obj: \d+ triangles are not those"):
         run(
             "data import-person",
-            words(files, "motion.npy", tmp_path / "out2", "--template", str(tmp_path / "face.obj")),
+            words(brief, "motion.npy", tmp_path / "out2", "--template", str(tmp_path / "face.obj")),
         )
