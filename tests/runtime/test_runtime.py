@@ -396,3 +396,55 @@ def test_only_what_was_learnt_is_stored_in_fewer_bits(precision: Precision, stor
     found = {each.name: each.data_type for each in document.graph.initializer}
     assert found.pop("kernel") == TensorProto.FLOAT
     assert {kind for name, kind in found.items() if "scale" not in name} == {getattr(TensorProto, stored)}
+
+
+def test_facediff_load_animates_a_folder_as_a_model(folder: Path, tmp_path: Path) -> None:
+    import facediff
+
+    model, runtime, speech = facediff.load(folder), RuntimeModel.open(folder), sound(4.3)
+    assert model.identities[0] in runtime.description.identities
+    for options in ({"seed": 2}, {"identity": "B", "expressivity": 0.5, "voice_gate": "off"}):
+        animation = model.animate(speech, 16_000, **options)  # type: ignore[call-overload]
+        assert isinstance(animation, facediff.Animation)
+        plain = dict(options)
+        gate = {"gate": None} if plain.pop("voice_gate", "") else {}
+        np.testing.assert_array_equal(animation.vertices, runtime.animate(speech, **plain, **gate).vertices)
+        streamed = np.concatenate([*model.stream(np.array_split(speech, 5), **options)])  # type: ignore[arg-type]
+        assert np.abs(streamed - animation.vertices).max() < 1e-6 * np.ptp(streamed)
+    assert model.animate([speech, speech[:9000]], 16_000, seed=None, low_latency=True)[1].metadata["seed"]
+    assert len(model.animate(speech[:9000], 16_000, samples=2)) == 2
+    np.testing.assert_array_equal(model.model.windows, runtime.windows)
+    for option, value in {"steps": 3, "guidance": {"style": 2}, "precision": "bf16", "device": "cuda"}.items():
+        with pytest.raises(FaceDiffError, match=f"{option} .*fixed in an exported model"):
+            if option == "device":
+                facediff.load(folder, device="cuda")
+            else:
+                model.animate(speech, 16_000, **{option: value})  # type: ignore[call-overload]
+    with pytest.raises(FaceDiffError, match="expressivity"):
+        model.animate(speech, 16_000, expressivity={"lips": 0.5})
+
+
+def test_command_animates_a_folder(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import soundfile
+
+    from facediff.animation import read_animation
+    from facediff.cli.app import main as facediff_main
+
+    soundfile.write(tmp_path / "a.wav", sound(1.0), 16_000, subtype="FLOAT")
+    words = [
+        "animate",
+        str(tmp_path / "a.wav"),
+        "--checkpoint",
+        str(folder),
+        "-o",
+        str(tmp_path / "a.npz"),
+        "--seed",
+        "3",
+    ]
+    assert facediff_main(words) == 0
+    expected = RuntimeModel.open(folder).animate(sound(1.0), seed=3)
+    found = read_animation(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.vertices, expected.vertices)
+    assert found.metadata["seed"] == "3"
+    assert facediff_main([*words, "--steps", "3"]) == 2
+    assert "--steps 3: is fixed in an exported model" in capsys.readouterr().err
