@@ -88,7 +88,20 @@ class OptionError(FaceDiffError):
 
     def __init__(self, option: str, problem: str, value: object = None, *, place: str = "") -> None:
         self.option, self.problem, self.value, self.place = option, problem, value, place
+        self._is_sentence = not option
         super().__init__(self._sentence(str))
+
+    @classmethod
+    def naming(cls, sentence: str) -> OptionError:
+        """The error of a sentence that names its options in braces: "face.obj: has no triangles; give {mesh}".
+
+        Example:
+            >>> OptionError.naming("face.obj: has no triangles; give {mesh}").on_command_line
+            'face.obj: has no triangles; give --mesh'
+        """
+        error = cls("", sentence)
+        error.option = next(iter(_OPTION_NAME.findall(sentence)), "")
+        return error
 
     @property
     def on_command_line(self) -> str:
@@ -97,17 +110,18 @@ class OptionError(FaceDiffError):
 
     def within(self, place: object) -> OptionError:
         """The same error with the place it comes from in front of the message."""
-        return OptionError(self.option, self.problem, self.value, place=f"{place}: {self.place}")
+        option = "" if self._is_sentence else self.option
+        return OptionError(option, self.problem, self.value, place=f"{place}: {self.place}")
 
     def _sentence(self, spelled: Callable[[str], str]) -> str:
         value = "" if self.value is None else f" {self.value}"
-        subject = f"{spelled(self.option)}{value}: " if self.option else ""
+        subject = "" if self._is_sentence else f"{spelled(self.option)}{value}: "
         return self.place + subject + _OPTION_NAME.sub(lambda match: spelled(match[1]), self.problem)
 
     def __reduce__(self) -> tuple[Callable[..., OptionError], tuple[str, str, str | None, str]]:
         """Pickling, by which worker processes hand errors over."""
         value = None if self.value is None else str(self.value)
-        return _option_error, (self.option, self.problem, value, self.place)
+        return _option_error, ("" if self._is_sentence else self.option, self.problem, value, self.place)
 
 
 def _option_error(option: str, problem: str, value: str | None, place: str) -> OptionError:

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh.flame import rotations
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import in_range
@@ -114,8 +114,8 @@ class Animation:
             FaceDiffError: if there are none.
         """
         if self.faces is None or not len(self.faces):
-            raise FaceDiffError(
-                f"{self.name}: comes without a mesh (triangles); give one with --mesh, or write .npy, .npz, .pc2 or "
+            raise OptionError.naming(
+                f"{self.name}: comes without a mesh (triangles); give one with {{mesh}}, or write .npy, .npz, .pc2 or "
                 f".mdd, which need none"
             )
         return self.faces

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import OUT_OF_RANGE, Animation
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.arrays import in_range, open_vertices, read_arrays
 from facediff.utils.files import atomic
 from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, quoted
@@ -84,7 +84,7 @@ def read_animation(
         vertices = open_vertices(path).astype(np.float32, copy=False)
     facts = complete(overrides, defaults)
     if "frame_rate" not in facts:
-        raise FaceDiffError(f"{path}: an array has no frame rate; give --frame-rate or --checkpoint")
+        raise OptionError.naming(f"{path}: an array has no frame rate; give {{frame_rate}} or {{checkpoint}}")
     if "template" not in facts:
         if not in_range(vertices[0]):
             raise FaceDiffError(f"{path}: frame 0 holds {OUT_OF_RANGE}; generate the motion again")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,7 +58,9 @@ def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
         found = re.fullmatch(rf"(.*):\s*({NUMBER})\s*", word, re.IGNORECASE)
         name = (found[1] if found else word).strip()
         if not name:
-            raise FaceDiffError(f"--style {words}: expected names or files with weights, such as a.npy:0.3,b.npy:0.7")
+            raise OptionError.naming(
+                f"{{style}} {words}: expected names or files with weights, such as a.npy:0.3,b.npy:0.7"
+            )
         parts.append(Weighted(name, float(found[2]) if found else None))
     return parts
 
@@ -78,13 +80,13 @@ def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
     if not given:
         return [1.0 / len(weights)] * len(weights)
     if len(given) < len(weights):
-        raise FaceDiffError(f"--style {words}: give every style a weight (A:0.3,B:0.7), or none of them")
+        raise OptionError.naming(f"{{style}} {words}: give every style a weight (A:0.3,B:0.7), or none of them")
     total = math.fsum(given)
     # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture, which
     # is divided by it, would be huge.
     if not all(map(math.isfinite, given)) or not abs(total) > CANCELLED * math.fsum(map(abs, given)):
-        raise FaceDiffError(
-            f"--style {words}: expected finite weights whose sum is not 0, since they are divided by it"
+        raise OptionError.naming(
+            f"{{style}} {words}: expected finite weights whose sum is not 0, since they are divided by it"
         )
     shares = [weight / total for weight in given]
     if abs(total - 1.0) > 1e-6:
@@ -117,11 +119,11 @@ def open_style(path: Path) -> StyleFile:
     from facediff.utils.arrays import open_array
 
     if not path.is_file():
-        raise FaceDiffError(f"--style {path}: no such file")
+        raise OptionError.naming(f"{{style}} {path}: no such file")
     if path.suffix == ".npz":
         animation = read_archive(path)
         return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
-    return StyleFile(path, open_array(path, kinds="fiu", name=f"--style {path}"))
+    return StyleFile(path, open_array(path, kinds="fiu", name=f"style {path}"))
 
 
 def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.float32]:
@@ -139,13 +141,13 @@ def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.f
 
     array = opened.array
     if array.ndim not in (2, 3) or not len(array) or array.shape[1:] not in ((vertices, 3), (3 * vertices,)):
-        raise FaceDiffError(
-            f"--style {opened.path}: has shape {array.shape}; the model's faces have {vertices} vertices, "
+        raise OptionError.naming(
+            f"{{style}} {opened.path}: has shape {array.shape}; the model's faces have {vertices} vertices, "
             f"so (frames, {vertices}, 3) or (frames, {3 * vertices}) is expected"
         )
     motion = np.array(array[::stride], np.float32).reshape(-1, vertices, 3)
     if not np.isfinite(motion).all():
-        raise FaceDiffError(f"--style {opened.path}: holds NaN or infinity")
+        raise OptionError.naming(f"{{style}} {opened.path}: holds NaN or infinity")
     return motion
 
 
@@ -157,8 +159,8 @@ def stride_of(path: Path, stored: float, wanted: float) -> int:
     """
     stride = round(stored / wanted)
     if stride < 1 or abs(stride * wanted - stored) > 1e-6:
-        raise FaceDiffError(
-            f"--style {path}: has {stored:g} frames a second, the model {wanted:g}; give a motion at that rate"
+        raise OptionError.naming(
+            f"{{style}} {path}: has {stored:g} frames a second, the model {wanted:g}; give a motion at that rate"
         )
     return stride
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 from facediff.registry import UnknownComponentError, acting, checks_arguments
 from facediff.speech.prosody import ProsodicEvent, ProsodyTracker
 from facediff.speech.voice_activity import HOP, Wave
@@ -81,7 +81,7 @@ def read_acting(text: str) -> Acting:
         name, options = acting.read(text)
         return cast(Acting, acting.get(name)(**options))
     except UnknownComponentError as error:
-        raise FaceDiffError(f"--acting {text}: {error}") from error
+        raise OptionError.naming(f"{{acting}} {text}: {error}") from error
 
 
 def acted(kind: Acting, speech: Wave, frames: int, frame_rate: float, seed: int) -> Acted:
@@ -97,7 +97,7 @@ def act(kind: Acting, animation: Animation, seed: int) -> Acted:
         FaceDiffError: if it is silent.
     """
     if animation.speech is None:
-        raise FaceDiffError(f"{animation.name}: --acting: has no speech to act on; give it with --speech")
+        raise OptionError.naming(f"{animation.name}: {{acting}}: has no speech to act on; give it with {{speech}}")
     from facediff.speech.audio import to_speech
 
     speech = animation.speech

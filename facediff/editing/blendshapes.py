@@ -12,7 +12,7 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.bounded import Problem, minimise, minimise_sparse
 from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.mesh import triangle_areas
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
@@ -64,7 +64,7 @@ class SolveOptions:
     max_iterations: ranges.Steps = 200
 
     def __post_init__(self) -> None:
-        ranges.check_fields(self)
+        ranges.check_options(self)
         if not self.lower < self.upper:
             raise FaceDiffError(f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1")
 
@@ -240,10 +240,10 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     millimetres = 1000.0 * metres_per_unit(animation.unit)
     remaining = float(np.sqrt(np.square(rms).mean()))
     if remaining > options.residual_limit * amplitude and millimetres * remaining > VISIBLE_MM:
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{animation.name}: the weights leave {remaining / amplitude:.0%} of the motion "
             f"({millimetres * remaining:.2g} of {millimetres * amplitude:.2g} mm), as shapes of another face or "
-            f"in another unit do; look at them, or raise --residual-limit from {options.residual_limit:g}"
+            f"in another unit do; look at them, or raise {{residual_limit}} from {options.residual_limit:g}"
         )
     about = {
         "smoothness": f"{options.smoothness:g}",
@@ -344,7 +344,7 @@ def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions)
     used = np.arange(len(animation.template))
     if options.region is not None:
         if not animation.regions:
-            raise FaceDiffError(f"{animation.name}: has no regions; give --checkpoint, or omit the region")
+            raise OptionError.naming(f"{animation.name}: has no regions; give {{checkpoint}}, or omit the region")
         if options.region not in animation.regions:
             raise FaceDiffError(
                 f'{animation.name}: has no region "{options.region}"; {choices(options.region, animation.regions)}'
@@ -427,9 +427,9 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
     """
     column = {name: index for index, name in enumerate(weights.names)}
     if not any(name in column for name in ARKIT):
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{path}: none of the shapes ({', '.join(weights.names[:3])} …) has a name of ARKit's, which are this "
-            f"table's columns; rename them, or write a table of their own names with --plain"
+            f"table's columns; rename them, or write a table of their own names with {{plain}}"
         )
     header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]

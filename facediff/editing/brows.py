@@ -13,7 +13,7 @@ from facediff.animation.animation import metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
 from facediff.editing.eyes import Array, Eyes, nearest_puppet
 from facediff.editing.procedural import copied
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 
 REGION = "brows"
 """A region of this name says where the brows are."""
@@ -88,8 +88,8 @@ def _carried(
         seen = find_features(laid, found.target_faces, find_features(found.source_vertices, found.source_faces))
         if seen is not None and not found.fits_badly:
             return carry_displacements(found, fields)
-    raise FaceDiffError(
-        'brows: where they are is not known for this face; list their vertices as "brows" in the file of --eyes, or '
+    raise OptionError.naming(
+        'brows: where they are is not known for this face; list their vertices as "brows" in the file of {eyes}, or '
         "give a mesh with triangles whose mouth can open"
     )
 
@@ -99,7 +99,9 @@ def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:
     displacements = np.asarray(field, np.float64)
     largest = float(np.linalg.norm(displacements, axis=-1).max(initial=0.0))
     if largest <= 0:
-        raise FaceDiffError("brows: no vertex of this face moves with them; list their vertices in the file of --eyes")
+        raise OptionError.naming(
+            "brows: no vertex of this face moves with them; list their vertices in the file of {eyes}"
+        )
     return np.asarray(displacements * (0.001 / metres_per_unit(unit) / largest), np.float32)
 
 

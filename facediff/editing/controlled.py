@@ -21,7 +21,7 @@ from facediff.editing.controls import keys_of
 from facediff.editing.direction import METADATA, Direction, channel_of, curve
 from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
 from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, noted
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 
 if TYPE_CHECKING:
     from facediff.animation.options import AnimationControls
@@ -110,9 +110,9 @@ class ControlledFace:
         """The face's eyes, if anything needs them; some controls only work better where they are known."""
         controls = self.controls
         lids = (
-            "--blinks" if controls.blinks is not None else next((n for n in ("blinks", "lids") if self._keys(n)), None)
+            "{blinks}" if controls.blinks is not None else next((n for n in ("blinks", "lids") if self._keys(n)), None)
         )
-        balls = "--gaze" if controls.gaze is not None else "gaze" if self._keys("gaze") else None
+        balls = "{gaze}" if controls.gaze is not None else "gaze" if self._keys("gaze") else None
         helped = controls.expressiveness is not None or controls.acting is not None
         helped = helped or bool(self._keys("expressiveness") or self._keys("brows"))
         asking = lids or balls
@@ -122,7 +122,7 @@ class ControlledFace:
         if asking is None:
             return eyes
         if eyes is None:
-            raise FaceDiffError(
+            raise OptionError.naming(
                 f"{asking}: needs to know where lids and eyeballs are, which is known for the built-in puppet only; "
                 f"{GIVE}"
             )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.limits import quoted
 from facediff.utils.plain_files import load_json
@@ -22,7 +22,7 @@ Indices = npt.NDArray[np.int64]
 Vertices = npt.NDArray[np.floating]
 
 GIVE = (
-    "give --eyes FILE, which says where lids and eyeballs are (docs/animation_controls.md shows one for FLAME and for "
+    "give {eyes}: a file that says where lids and eyeballs are (docs/animation_controls.md shows one for FLAME and for "
     "any mesh)"
 )
 STILL = 0.01  # Vertices that a blink moves by less than this share of its largest way are left alone
@@ -59,7 +59,7 @@ class Eyes:
     def lids(self) -> tuple[Indices, npt.NDArray[np.float32]]:
         """The vertices (L,) that a blink moves, and their ways (L, 3); refused if the way is not known."""
         if self.closing is None:
-            raise FaceDiffError(f"{self.source}: does not say how the lids shut; {GIVE}")
+            raise OptionError.naming(f"{self.source}: does not say how the lids shut; {GIVE}")
         way = np.linalg.norm(self.closing, axis=-1)
         chosen = np.flatnonzero(way > STILL * way.max())
         return chosen, self.closing[chosen]
@@ -132,11 +132,11 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
         FaceDiffError: naming the file and what is wrong with it.
     """
     if not path.is_file():
-        raise FaceDiffError(
-            f"--eyes {path}: no such file; expected .json or .npz that says where lids and eyeballs are"
+        raise OptionError.naming(
+            f"{{eyes}} {path}: no such file; expected .json or .npz that says where lids and eyeballs are"
         )
     if path.suffix.lower() == ".npz":
-        found = read_arrays(path, name=f"--eyes {path}")
+        found = read_arrays(path, name=f"eyes {path}")
         names = sorted(name for name in found if name.startswith("eyeball"))
         balls = tuple(_checked(path, found[name], len(template)) for name in names)
         closing, neutral = found.get("closing"), found.get("neutral")
@@ -144,36 +144,36 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
     elif path.suffix.lower() == ".json":
         closing, neutral, balls, brows = _read_json(path, template)
     else:
-        raise FaceDiffError(f"--eyes {path}: expected .json or .npz")
+        raise OptionError.naming(f"{{eyes}} {path}: expected .json or .npz")
     if closing is None and not balls and brows is None:
-        raise FaceDiffError(
-            f"--eyes {path}: says nothing of lids or eyeballs, nor of brows; known are {', '.join(KEYS)}"
+        raise OptionError.naming(
+            f"{{eyes}} {path}: says nothing of lids or eyeballs, nor of brows; known are {', '.join(KEYS)}"
         )
     if closing is None:
-        return Eyes(None, balls, f"--eyes {path}", brows)
+        return Eyes(None, balls, f"eyes {path}", brows)
     size = float(np.linalg.norm(np.ptp(template, axis=0)))
     if closing.shape != template.shape or (neutral is not None and neutral.shape != template.shape):
-        raise FaceDiffError(f"--eyes {path}: its blink has shape {closing.shape}; the face has {template.shape}")
+        raise OptionError.naming(f"{{eyes}} {path}: its blink has shape {closing.shape}; the face has {template.shape}")
     scale = 1.0 if neutral is None else size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
     way = scale * float(np.linalg.norm(closing, axis=-1).max())
     if not PLAUSIBLE[0] * size < way < PLAUSIBLE[1] * size:
-        raise FaceDiffError(
-            f"--eyes {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
+        raise OptionError.naming(
+            f"{{eyes}} {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
             f'eyes, and as "neutral" the open face in the same unit'
         )
-    return Eyes(np.asarray(scale * closing, np.float32), balls, f"--eyes {path}", brows)
+    return Eyes(np.asarray(scale * closing, np.float32), balls, f"eyes {path}", brows)
 
 
 def _read_json(
     path: Path, template: Vertices
 ) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...], Indices | None]:
     """How the lids shut, by shapes or by edges; the open face; eyeballs; brows. None where the file does not say."""
-    content = load_json(path, name=f"--eyes {path}")
+    content = load_json(path, name=f"eyes {path}")
     fit = isinstance(content, dict) and all(isinstance(content.get(key, []), list) for key in KEYS[1:])
     unknown = [key for key in content if key not in KEYS] if fit else []
     if not fit or unknown or not isinstance(content.get("neutral", ""), str):
-        raise FaceDiffError(
-            f"--eyes {path}: expected an object with {', '.join(KEYS)}, all but the first of them lists"
+        raise OptionError.naming(
+            f"{{eyes}} {path}: expected an object with {', '.join(KEYS)}, all but the first of them lists"
             + (f', not "{unknown[0]}"' if unknown else "")
         )
     count = len(template)
@@ -189,16 +189,20 @@ def _read_json(
             shape = _read_shape(path, name)
             absolute = Path(str(name)).suffix.lower() != ".npy"
             if absolute and neutral is None:
-                raise FaceDiffError(f'--eyes {path}: "{name}" is a whole face; give the open one as "neutral" as well')
+                raise OptionError.naming(
+                    f'{{eyes}} {path}: "{name}" is a whole face; give the open one as "neutral" as well'
+                )
             if len(shape) != count or (neutral is not None and len(neutral) != count):
-                raise FaceDiffError(f'--eyes {path}: "{name}" has {len(shape)} vertices, the face {count}')
+                raise OptionError.naming(f'{{eyes}} {path}: "{name}" has {len(shape)} vertices, the face {count}')
             total = total + (shape - neutral if absolute and neutral is not None else shape)
         return total, neutral, balls, brows
     if content.get("lids"):
         try:
             sides = [(lid["upper"], lid["lower"]) for lid in content["lids"]]
         except (TypeError, KeyError) as error:
-            raise FaceDiffError(f'--eyes {path}: expected "lids" as a list of {{"upper": …, "lower": …}}') from error
+            raise OptionError.naming(
+                f'{{eyes}} {path}: expected "lids" as a list of {{"upper": …, "lower": …}}'
+            ) from error
         edges = [(_indices(path, upper, count), _indices(path, lower, count)) for upper, lower in sides]
         return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls, brows
     return None, neutral, balls, brows
@@ -209,13 +213,13 @@ def _read_shape(path: Path, name: object) -> Vertices:
     from facediff.mesh import read_mesh
 
     if not isinstance(name, str):
-        raise FaceDiffError(f"--eyes {path}: {quoted(name)} is no file name; expected meshes or .npy files")
+        raise OptionError.naming(f"{{eyes}} {path}: {quoted(name)} is no file name; expected meshes or .npy files")
     file = path.parent / name
     if file.suffix.lower() != ".npy":
         return read_mesh(file).vertices
-    array = open_array(file, kinds="f", name=f"--eyes {path}: {file}")
+    array = open_array(file, kinds="f", name=f"eyes {path}: {file}")
     if array.size % 3:
-        raise FaceDiffError(f"--eyes {path}: {file} has shape {array.shape}; expected displacements (V, 3)")
+        raise OptionError.naming(f"{{eyes}} {path}: {file} has shape {array.shape}; expected displacements (V, 3)")
     return np.asarray(array.reshape(-1, 3), np.float64)
 
 
@@ -230,14 +234,14 @@ def _indices(path: Path, listed: object, n_vertices: int) -> Indices:
         file, _, mask = listed.partition(":") if ".pkl:" in listed else (listed, "", "")
         read = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
     except ValueError as error:
-        raise FaceDiffError(f"--eyes {path}: {error}") from error
+        raise OptionError.naming(f"{{eyes}} {path}: {error}") from error
     return _checked(path, np.asarray(read), n_vertices)
 
 
 def _checked(path: Path, indices: npt.NDArray[Any], n_vertices: int) -> Indices:
     fit = indices.ndim == 1 and len(indices) and np.issubdtype(indices.dtype, np.integer)
     if not fit or not 0 <= indices.min() <= indices.max() < n_vertices:
-        raise FaceDiffError(f"--eyes {path}: expected lists of vertex indices from 0 to {n_vertices - 1}")
+        raise OptionError.naming(f"{{eyes}} {path}: expected lists of vertex indices from 0 to {n_vertices - 1}")
     return indices.astype(np.int64)
 
 

@@ -11,7 +11,7 @@ from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import Correspondence
 from facediff.editing.face_features import find_features
 from facediff.editing.surface import Surface, nearest
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 
 Array = npt.NDArray[np.float64]
 
@@ -75,9 +75,9 @@ def refuse_poor(source: object, report: FitReport) -> None:
         FaceDiffError: beginning with ``source`` and naming the first fault.
     """
     if not report.good:
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{source}: {report.faults[0]}. Look at it with `facediff retarget --show`, show places that are the same "
-            f"with --pick or --landmarks, or write it as it is with --accept-poor"
+            f"with {{pick}} or {{landmarks}}, or write it as it is with {{accept_poor}}"
         )
 
 

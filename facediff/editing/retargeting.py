@@ -24,7 +24,7 @@ from facediff.editing.fit_check import check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
 from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
 from facediff.editing.surface import Surface
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.parts import named_triangles
@@ -67,13 +67,13 @@ def retarget(
     mesh = read_mesh(mesh_path)
     if correspondence_path is not None and correspondence_path.exists():
         if landmarks_path is not None:
-            raise FaceDiffError(
-                f"--landmarks {landmarks_path}: {correspondence_path} exists and would be used without them; remove "
+            raise OptionError.naming(
+                f"{{landmarks}} {landmarks_path}: {correspondence_path} exists and would be used without them; remove "
                 f"it, or omit the landmarks"
             )
         if parts:
-            raise FaceDiffError(
-                f"--part {parts[0]}: {correspondence_path} exists and would be used without it; remove that file, or "
+            raise OptionError.naming(
+                f"{{part}} {parts[0]}: {correspondence_path} exists and would be used without it; remove that file, or "
                 f"omit the part"
             )
         found = load_correspondence(correspondence_path)
@@ -84,7 +84,7 @@ def retarget(
         return made, found
     if correspondence_path is not None:
         if correspondence_path.suffix != ".npz":
-            raise FaceDiffError(f"--correspondence {correspondence_path}: expected a name that ends in .npz")
+            raise OptionError.naming(f"{{correspondence}} {correspondence_path}: expected a name that ends in .npz")
         check_writable(correspondence_path)
     # Everything that can be wrong with the options is found before the meshes are compared, which takes seconds.
     landmarks = None
@@ -298,9 +298,9 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
         if reports[-1].good:
             break
     if not reports[-1].good:
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{path}: its shapes cannot be carried to {animation.name}: {reports[0].faults[0]}. Carry the animation to "
-            f"their mesh with `facediff retarget`, and give them without --carry"
+            f"their mesh with `facediff retarget`, and give them without {{carry}}"
         )
     moves = carry_displacements(found, points[:, used] - neutral[used])
     moved = replace(

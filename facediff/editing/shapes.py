@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
 from facediff.editing.glb_shapes import read_targets
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import face_size, read_mesh, robust_align
 from facediff.mesh.glb import open_glb
 
@@ -161,8 +161,8 @@ def check_shapes(path: Path) -> None:
         FaceDiffError: naming the path.
     """
     if not path.exists() and not is_built_in(path):
-        raise FaceDiffError(
-            f"--shapes {path}: no such folder or file; expected a folder of meshes, a .glb with targets, or puppet"
+        raise OptionError.naming(
+            f"{{shapes}} {path}: no such folder or file; expected a folder of meshes, a .glb with targets, or puppet"
         )
 
 
@@ -221,9 +221,9 @@ def lay_onto(files: ShapeFiles, goal: Array, notes: list[str], unit: str) -> Arr
         raise FaceDiffError(f"{rest}: cannot be aligned with the animation's face: {error}") from error
     apart = np.linalg.norm(found.apply(neutral * factor) - goal, axis=1)
     if np.median(apart) > ANOTHER_ORDER * face_size(goal):
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{rest}: has the vertices of the animation's template in another order; write it again with the order "
-            f"kept (Blender: import and export with vertex order), or use --carry"
+            f"kept (Blender: import and export with vertex order), or use {{carry}}"
         )
     # A small difference in size or pose is another speaker's head, whose movements are used as they are.
     scale = found.scale if not 1 / SAME_SIZE < found.scale < SAME_SIZE else 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 from facediff.speech.cepstra import align_features, cepstra
 from facediff.speech.phonemes import TimedPhoneme, spoken_by_machine
 from facediff.speech.voice_activity import EnergyGate, openness
@@ -30,12 +30,14 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPh
         MissingExtraError: if espeak-ng or the library for warping is not installed.
     """
     if not any(letter.isalpha() for letter in text) or len(text) > LONGEST:
-        raise FaceDiffError(f"--transcript: has {len(text)} characters; expected English words, at most {LONGEST}")
+        raise OptionError.naming(
+            f"{{transcript}}: has {len(text)} characters; expected English words, at most {LONGEST}"
+        )
     synthetic, voiced = spoken_by_machine(text)
     steps = max(2, int(len(speech) / SAMPLE_RATE * RATE))
     spoken = np.flatnonzero(openness(speech, steps, RATE, EnergyGate(lead=0.02, attack=0.0, hold=0.02, release=0.0)))
     if not len(spoken):
-        raise FaceDiffError("--transcript: the recording has no speech; omit it, or give another recording")
+        raise OptionError.naming("{transcript}: the recording has no speech; omit it, or give another recording")
     # Only the stretch with speech is aligned: silence around it would be spread over the first and the last sound.
     first, last = int(spoken[0]), int(spoken[-1]) + 1
     recorded = speech[round(first / RATE * SAMPLE_RATE) : round(last / RATE * SAMPLE_RATE)]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
 
@@ -66,7 +66,9 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     parts = mesh_parts(path)
     known = list(dict.fromkeys(name for part in parts for name in part.names))
     if not known:
-        raise FaceDiffError(f"{path}: its parts have no names; expected a .glb or .obj with named parts, or no --part")
+        raise OptionError.naming(
+            f"{path}: its parts have no names; expected a .glb or .obj with named parts, or no {{part}}"
+        )
     chosen = []
     for wanted in names:
         for fold in (str, str.casefold):  # another case counts only where nothing is written so

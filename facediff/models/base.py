@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
 from facediff.data.packed.stores import address_of
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
@@ -431,7 +431,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         if self.motion_scaling == "none":
             return 1.0
         if self.assets.motion_scale is None:
-            raise FaceDiffError("the model has never been trained: give a checkpoint (--ckpt_path, --checkpoint)")
+            raise OptionError.naming("the model has never been trained: give a checkpoint (--ckpt_path, {checkpoint})")
         return self.assets.motion_scale
 
     def adopt(self, assets: Assets) -> None:

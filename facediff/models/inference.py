@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.speech.audio import samples_for
 from facediff.speech.frame_clock import FrameClock
@@ -343,7 +343,9 @@ class Inference(ABC):
             FaceDiffError: if it has none.
         """
         if identity not in self.assets.references:
-            raise FaceDiffError(f"style: the checkpoint holds no reference motion of {identity}; give one with --style")
+            raise OptionError.naming(
+                f"style: the checkpoint holds no reference motion of {identity}; give one with {{style}}"
+            )
         return self.assets.references[identity]
 
     @property
@@ -365,7 +367,7 @@ class Inference(ABC):
         Raises:
             FaceDiffError: if the model does not sample, or there is no such sampler.
         """
-        raise FaceDiffError(f"{type(self).__name__} does not sample: omit --sampler and --steps")
+        raise OptionError.naming(f"{type(self).__name__} does not sample: omit {{sampler}} and {{steps}}")
 
     def has_sampler(self, name: str | None) -> bool:
         """Whether :meth:`choose_sampler` takes this name; a model that samples is asked for registered ones."""

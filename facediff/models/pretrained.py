@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from facediff.data.batch import DATA_SOURCE_KEY
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.models.model_card import Facts, card, check_languages, read_scores
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
@@ -75,7 +75,9 @@ def publish(
     """Write a model folder with its card, whole or not at all; see :meth:`AnimationModel.save_pretrained`."""
     _ = model.assets  # an untrained model is refused before anything is written
     if licence is not None and not (licence.strip() and is_plain_text(licence) and len(licence) <= LONGEST_LICENCE):
-        raise FaceDiffError(f"--license {quoted(licence)}: expected a short name, such as apache-2.0 or cc-by-nc-4.0")
+        raise OptionError.naming(
+            f"{{license}} {quoted(licence)}: expected a short name, such as apache-2.0 or cc-by-nc-4.0"
+        )
     check_languages(languages or ())
     rows = [] if scores is None else read_scores(scores)
     before = model.licences

@@ -21,7 +21,7 @@ from facediff.animation.style_files import (
     stillness_of,
     stride_of,
 )
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 
 if TYPE_CHECKING:
     import numpy as np
@@ -61,15 +61,15 @@ def read_styles(
 
     own = model.own_styles()
     if not own and not style_width(model):
-        raise FaceDiffError(
-            f"--style {words}: this checkpoint was trained without a dynamic style, so a style would change nothing; "
-            f"omit --style"
+        raise OptionError.naming(
+            f"{{style}} {words}: this checkpoint was trained without a dynamic style, so a style would change nothing; "
+            f"omit {{style}}"
         )
     parts = split_styles(words, [*own, *(reference.clip for reference in model.assets.references.values())])
     if len(parts) == 1:
         if parts[0].weight not in (None, 1.0):
-            raise FaceDiffError(
-                f"--style {words}: one style alone cannot be weighted; mix it with another one (A:0.3,B:0.7)"
+            raise OptionError.naming(
+                f"{{style}} {words}: one style alone cannot be weighted; mix it with another one (A:0.3,B:0.7)"
             )
         return read_style(parts[0].name, identity, model, template=template)
     shares = normalised(words, [part.weight for part in parts])
@@ -108,16 +108,16 @@ def style_from(
     if isinstance(given, str | Path):
         return read_styles(str(given), identity, model, template=template)
     if not style_width(model):
-        raise FaceDiffError(
-            "--style: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
+        raise OptionError.naming(
+            "{style}: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
         )
     if isinstance(given, Animation):
         motion = StyleFile(Path(given.name), given.vertices, given.template, given.frame_rate, given.unit)
         return style_of(motion, identity, model)
     array = np.asarray(given)
     if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
-        raise FaceDiffError(
-            f"--style: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
+        raise OptionError.naming(
+            f"{{style}}: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
             f"(frames, vertices, 3) or a style vector"
         )
     return style_of(StyleFile(Path("style"), array), identity, model, template=template)
@@ -196,8 +196,8 @@ def read_style(
     if own:
         # Such a model has no style encoder: there is nothing to make a style of motion with.
         if style not in own:
-            raise FaceDiffError(
-                f"--style {style}: {type(model).__name__} takes no motion as a style, but a training identity or a "
+            raise OptionError.naming(
+                f"{{style}} {style}: {type(model).__name__} takes no motion as a style, but a training identity or a "
                 f"mixture of several (A:0.3,B:0.7): {choices(style, own)}"
             )
         return own[style]
@@ -246,7 +246,7 @@ def corpus_clip(name: str, model: AnimationModel) -> Path:
     path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
     if path is None or not path.is_file():
         where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"
-        raise FaceDiffError(f"--style {name}: no clip of that name {where}; give a .npy file or another clip")
+        raise OptionError.naming(f"{{style}} {name}: no clip of that name {where}; give a .npy file or another clip")
     return path
 
 
@@ -257,9 +257,9 @@ def read_vector(opened: StyleFile, model: AnimationModel) -> Tensor:
 
     vector, width = np.array(opened.array, np.float32), style_width(model)
     if len(vector) != width or not np.isfinite(vector).all():
-        raise FaceDiffError(
-            f"--style {opened.path}: holds {len(vector)} numbers, but this checkpoint's style vectors have {width} (no "
-            f"NaN); make one with `facediff style extract` from this very checkpoint"
+        raise OptionError.naming(
+            f"{{style}} {opened.path}: holds {len(vector)} numbers, but this checkpoint's style vectors have {width} "
+            f"(no NaN); make one with `facediff style extract` from this very checkpoint"
         )
     return torch.from_numpy(vector)
 
@@ -321,9 +321,9 @@ def given_face(template: str | Path, opened: StyleFile, assets: Assets) -> Tenso
     fits = read.size == 3 * assets.n_vertices
     face = np.asarray(read, np.float32).reshape(-1, 3) if fits else np.zeros((0, 3), np.float32)
     if not fits or not np.isfinite(face).all():
-        raise FaceDiffError(
-            f"--style-template {path}: has shape {read.shape}; expected the neutral face of {assets.n_vertices} finite "
-            f"vertices whose motion is in --style, as .obj, .ply or .npy, or the word {MEDIAN}"
+        raise OptionError.naming(
+            f"{{style_template}} {path}: has shape {read.shape}; expected the neutral face of {assets.n_vertices} "
+            f"finite vertices whose motion is in {{style}}, as .obj, .ply or .npy, or the word {MEDIAN}"
         )
     return torch.from_numpy(face)
 
@@ -344,12 +344,13 @@ def check_face(path: Path, offsets: Tensor, assets: Assets, whose: str | None) -
     if stillness is None or not stillness.another_face(offsets.numpy()):
         return
     if whose is None:
-        raise FaceDiffError(
-            f"--style {path}: does not lie on its template: the head moves, or the template is another person's or in "
-            f"another unit; give that person's own, and a head that keeps still (`facediff data import-person` does it)"
+        raise OptionError.naming(
+            f"{{style}} {path}: does not lie on its template: the head moves, or the template is another person's or "
+            f"in another unit; give that person's own, and a head that keeps still (`facediff data import-person` does "
+            f"it)"
         )
-    raise FaceDiffError(
-        f"--style {path}: is not a motion of {whose}'s face, so it must be another person's; give that person's "
-        f"neutral face with --style-template, or name the file <identity>_<clip>.npy with an identity that the "
+    raise OptionError.naming(
+        f"{{style}} {path}: is not a motion of {whose}'s face, so it must be another person's; give that person's "
+        f"neutral face with {{style_template}}, or name the file <identity>_<clip>.npy with an identity that the "
         f"checkpoint knows ({', '.join(sorted(assets.templates))})"
     )

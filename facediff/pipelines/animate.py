@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
-from facediff.errors import OptionError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import SAMPLE_RATE, ranges
 from facediff.utils.files import scratch_folder, valid_text
 from facediff.utils.progress import track
@@ -461,7 +461,11 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
                 "expected each condition once with its scale, such as style=1.5,speech=1.2",
                 ranges.shown(text),
             )
-        scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"--guidance {name.strip()}", number.strip())
+        try:
+            scales[name.strip()] = ranges.GUIDANCE_SCALE.read(name.strip(), number.strip())
+        except FaceDiffError as error:
+            expected = ranges.GUIDANCE_SCALE.numbers()
+            raise OptionError("guidance", f"expected {expected}", f"{name.strip()} {number.strip()}") from error
     return scales
 
 

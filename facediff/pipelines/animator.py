@@ -23,7 +23,6 @@ from facediff.editing.controls import keys_of
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for, is_exported
 from facediff.pipelines.motion import Animation, Samples
-from facediff.pipelines.words import in_python_words
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hub import EXPECTED, check_model_source
 from facediff.utils.licences import Commercial, commercial_use, in_words
@@ -46,7 +45,6 @@ PRECISIONS: dict[str, Literal["32", "bf16"]] = {"float32": "32", "bfloat16": "bf
 """What ``precision`` is called by PyTorch."""
 
 
-@in_python_words
 def load(
     source: str | Path, device: str = "auto", commercial_only: bool = False, dtype: DType = "float32"
 ) -> Animator | ExportedAnimator:
@@ -83,7 +81,6 @@ def load(
     return Animator(module, source, dtype=dtype)
 
 
-@in_python_words
 def import_checkpoint(
     paths: str | Path | Sequence[str | Path],
     *,
@@ -178,7 +175,6 @@ class SpeechAnimator(ABC):
         **options: Unpack[AnimateKeywords],
     ) -> list[Animation | Samples]: ...
 
-    @in_python_words
     @with_options(AnimationOptions, AnimateKeywords)
     def animate(
         self,
@@ -236,7 +232,6 @@ class SpeechAnimator(ABC):
                 animations.append(samples[0] if chosen.samples == 1 else Samples(samples))
         return animations[0] if several is None else animations
 
-    @in_python_words
     @with_options(AnimationOptions, StreamKeywords)
     def stream(
         self,
@@ -321,7 +316,6 @@ class Animator(SpeechAnimator):
         with self.module.choosing():
             yield TrainedPipeline(options, model=self.module)
 
-    @in_python_words
     def to(self, device: str, dtype: DType | None = None) -> Self:
         """Move the model: ``model.to("cuda")``.
 
@@ -389,7 +383,6 @@ class Animator(SpeechAnimator):
         """Where it computes."""
         return str(self.module.device)
 
-    @in_python_words
     def extract_style(
         self, clips: StyleLike | Sequence[str | Path | Animation], *, identity: str | None = None
     ) -> npt.NDArray[np.float32]:

@@ -177,7 +177,7 @@ def _named(direction: Direction, channel: str, step: Any) -> Any:  # noqa: ANN40
     try:
         return step()
     except FaceDiffError as error:
-        raise FaceDiffError(f"{direction.source}: channel {channel}: {error}") from error
+        raise error.within(f"{direction.source}: channel {channel}") from error
 
 
 def _expressivity(
@@ -194,7 +194,7 @@ def _expressivity(
     try:
         weights = region_weights(template, regions, list(constants), f"the checkpoint's corpus {model.assets.corpus}")
     except FaceDiffError as error:
-        raise FaceDiffError(f"{direction.source}: channel expressivity: {error}") from error
+        raise error.within(f"{direction.source}: channel expressivity") from error
     if None not in constants.values():
         factors = {name: float(value) for name, value in constants.items() if value is not None}
         whole = {*factors} == {ALL}

@@ -17,7 +17,6 @@ from facediff import animation as finished
 from facediff.animation.files import AnimationFacts, complete, facts_of, read_animation
 from facediff.animation.options import AnimationControls, DirectionLike, ExportOptions, Scales, SourceOptions
 from facediff.errors import FaceDiffError, OptionError
-from facediff.pipelines.words import in_python_words
 from facediff.utils import ranges
 
 if TYPE_CHECKING:
@@ -55,7 +54,6 @@ class Animation(finished.Animation):
             return animation
         return cls(**{field.name: getattr(animation, field.name) for field in fields(animation)})
 
-    @in_python_words
     def save(
         self,
         path: str | Path,
@@ -110,7 +108,6 @@ class Animation(finished.Animation):
         """
         return Samples([self]).compare(truth, output, labels=labels)
 
-    @in_python_words
     def control(
         self,
         *,
@@ -146,7 +143,6 @@ class Animation(finished.Animation):
         check_controls(controls)
         return Animation.of(apply_controls(self, controls))
 
-    @in_python_words
     def retarget(
         self,
         target_mesh: str | Path,
@@ -171,7 +167,6 @@ class Animation(finished.Animation):
                 raise FaceDiffError(f"{name} {file}: no such file; expected a mesh or a table of its vertices")
         return Animation.of(retarget(self, Path(target_mesh), _path(correspondence), _path(landmarks))[0])
 
-    @in_python_words
     def blendshapes(
         self,
         shapes: str | Path,
@@ -232,7 +227,6 @@ class Animation(finished.Animation):
 class Samples(list[Animation]):
     """Several samples for one recording: a list of animations that are written, shown and compared together."""
 
-    @in_python_words
     def save(
         self,
         path: str | Path,
@@ -307,7 +301,6 @@ class Page:
     def __init__(self, animations: Sequence[finished.Animation], truth: int | None = None) -> None:
         self.animations, self.truth = list(animations), truth
 
-    @in_python_words
     @ranges.checked
     def save(self, path: str | Path, *, max_mb: ranges.Megabytes = 30.0) -> Path:
         """Write the page to a file.
@@ -383,7 +376,6 @@ class Page:
         )
 
 
-@in_python_words
 def view(
     animations: finished.Animation | Sequence[finished.Animation],
     *,
@@ -411,8 +403,8 @@ def view(
     if not shown:
         raise FaceDiffError("animations: there is none to show; give at least one")
     if labels is not None and len(labels) != len(shown):
-        raise FaceDiffError(
-            f"--labels: {len(labels)} names for {len(shown)} panels; give one for each, the truth's first"
+        raise OptionError.naming(
+            f"{{labels}}: {len(labels)} names for {len(shown)} panels; give one for each, the truth's first"
         )
     if labels is not None:
         shown = [replace(animation, name=label) for animation, label in zip(shown, labels, strict=True)]
@@ -426,7 +418,6 @@ def view(
     return Page(shown, number)
 
 
-@in_python_words
 def read(
     path: str | Path,
     *,

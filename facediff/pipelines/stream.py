@@ -97,7 +97,7 @@ def check_stream(options: AnimationOptions, output: Path, export: ExportOptions)
         if name in given:
             raise OptionError(name, "needs the whole animation; stream to .npy, then use `facediff export`")
     if sys.stdin is None:
-        raise FaceDiffError("--stream: standard input is closed; send samples to it")
+        raise OptionError.naming("{stream}: standard input is closed; send samples to it")
     if str(output) != "-":
         check_writable(output)
 

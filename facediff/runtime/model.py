@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.folder import Arrays, Description, read_folder
 from facediff.runtime.sampling import NAME, RuntimeConditions, WindowSpeech, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, read_style
@@ -312,9 +312,9 @@ class RuntimeModel:
         frames = heard.frames if self.clock.rule == "rounded" else max(1, self.clock.frames(len(heard.speech)))
         longest = self.description.longest
         if longest and frames > longest:
-            raise FaceDiffError(
+            raise OptionError.naming(
                 f"speech: {frames / self.frame_rate:.1f} s are {frames} frames, and {self.description.model} was made "
-                f"for {longest} at most ({longest / self.frame_rate:g} s); animate it in windows (--window 4)"
+                f"for {longest} at most ({longest / self.frame_rate:g} s); animate it in windows ({{window}} 4)"
             )
         return frames
 

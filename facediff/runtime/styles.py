@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
 from facediff.animation.style_files import FILES, Stillness, frames_of, normalised, open_style, split_styles, stride_of
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 
 if TYPE_CHECKING:
     from facediff.runtime.model import RuntimeModel
@@ -65,9 +65,9 @@ def single_style(name: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
     if opened.array.ndim == 1:
         vector = np.array(opened.array, np.float32)
         if vector.shape != vectors.shape[1:] or not np.isfinite(vector).all():
-            raise FaceDiffError(
-                f"--style {path}: holds {len(vector)} numbers, but this model's style vectors have {vectors.shape[1]} "
-                f"(no NaN); make one with `facediff style extract` from the same checkpoint"
+            raise OptionError.naming(
+                f"{{style}} {path}: holds {len(vector)} numbers, but this model's style vectors have "
+                f"{vectors.shape[1]} (no NaN); make one with `facediff style extract` from the same checkpoint"
             )
         return RuntimeStyle(path.stem, vector)
     templates, rate, scale = model.arrays["templates"], opened.frame_rate or about.frame_rate, 1.0
@@ -79,8 +79,8 @@ def single_style(name: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
     offsets = (scale * (motion - face)).astype(np.float32)
     if "still" in model.arrays and Stillness(model.arrays["still"], about.stillness).another_face(offsets):
         face_of = f"the neutral face of {whose}" if opened.template is None else "its own template"
-        raise FaceDiffError(
-            f"--style {path}: does not lie on {face_of}, or the head moves; give an animation (.npz) of a head that "
+        raise OptionError.naming(
+            f"{{style}} {path}: does not lie on {face_of}, or the head moves; give an animation (.npz) of a head that "
             f"keeps still, or an array that is named <identity>_<clip>.npy"
         )
     return model.encode_style(offsets, name=path.stem)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError
 from facediff.registry import UnknownComponentError, checks_arguments, voice_gate
 from facediff.speech.filters import RecursiveFilter
 from facediff.utils import SAMPLE_RATE
@@ -131,7 +131,7 @@ def read_gate(text: str) -> VoiceGate | None:
     try:
         name, options = voice_gate.read(text)
     except UnknownComponentError as error:
-        raise FaceDiffError(f"--voice-gate {text}: {error}; or {OFF}") from error
+        raise OptionError.naming(f"{{voice_gate}} {text}: {error}; or {OFF}") from error
     return cast(VoiceGate, voice_gate.get(name)(**options))
 
 

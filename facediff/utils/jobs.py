@@ -106,7 +106,7 @@ class PerWorker(Generic[Task, Result]):
                 with _setting_up:
                     work = self._here.work = self.setup()
             except FaceDiffError as error:
-                raise SetupError(str(error)) from error
+                raise SetupError(error.on_command_line) from error
         return cast(Callable[[Task], Result], work)(task)
 
 

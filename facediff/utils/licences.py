@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.limits import quoted
 from facediff.utils.plain_options import is_plain_text
 
@@ -128,9 +128,9 @@ def require_cleared(source: object, licences: Iterable[Licence]) -> None:
     if commercial_use(found) == "allowed":
         return
     reasons = "; ".join(str(each) for each in found if each.commercial != "allowed") or "it states no licence"
-    raise FaceDiffError(
+    raise OptionError.naming(
         f"{source}: not cleared for commercial use ({reasons}), and only cleared models were asked for. Choose a model "
-        f"whose data allow it, or omit --commercial-only (commercial_only=True) where its terms fit your use"
+        f"whose data allow it, or omit {{commercial_only}} where its terms fit your use"
     )
 
 

@@ -63,7 +63,7 @@ def test_sound_is_as_long_as_the_picture(animation: Animation) -> None:
 
 def test_bare_array_needs_a_frame_rate_and_may_be_flat(animation: Animation, tmp_path: Path) -> None:
     np.save(tmp_path / "x.npy", animation.vertices.reshape(5, -1))
-    with pytest.raises(FaceDiffError, match="--frame-rate"):
+    with pytest.raises(FaceDiffError, match="frame_rate"):
         read_animation(tmp_path / "x.npy")
     read = read_animation(tmp_path / "x.npy", AnimationFacts(frame_rate=30, template=animation.template))
     assert np.array_equal(read.vertices, animation.vertices)

@@ -141,7 +141,7 @@ def test_a_seed_that_decides_nothing_is_refused(
         (["--device", "cuda:7"], "not usable on this machine"),
         (["--checkpoint", "text.ckpt"], "not a checkpoint that can be loaded safely"),
         (["-o", "x.gif"], 'there is no format ".gif"'),
-        (["--max-seconds", "0.5"], "lasts 1 s, more than --max-seconds 0.5"),
+        (["--max-seconds", "0.5"], "--max-seconds 0.5"),
         (["--window", "0.1"], "too few frames"),
         (["--seed", "-1"], "--seed -1"),
         (["--seed", "9" * 20], "--seed 999"),

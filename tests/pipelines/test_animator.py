@@ -17,7 +17,6 @@ import facediff
 from facediff.animation.options import AnimateKeywords, StreamKeywords
 from facediff.cli.app import main
 from facediff.models import Style
-from facediff.pipelines.words import python_words
 from facediff.speech.inputs import speech_of
 
 
@@ -160,12 +159,6 @@ def test_wrong_things_meet_one_sentence_in_the_words_of_python(
     assert named in message
     assert "--" not in message
     assert sorted(speech.parent.rglob("*")) == before
-
-
-def test_python_words_leave_commands_and_files_alone() -> None:
-    said = "--style-template a--b.npy: see `facediff animate --help` and /tmp/--seed; AnimationOptions.samples 0: wrong"
-    assert python_words(said) == said.replace("--style-template", "style_template").replace("AnimationOptions.", "")
-    assert python_words("save.npz: no such file") == "save.npz: no such file"
 
 
 @pytest.mark.parametrize(

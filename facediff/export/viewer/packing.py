@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 
 STEP = 0.05
 """Quantisation of positions in mm. Rounding moves a coordinate by at most half of it, a vertex by √3 / 2 of it."""
@@ -59,9 +59,9 @@ def pack_motion(animation: Animation, blobs: Blobs) -> list[int]:
         steps = np.rint((np.asarray(animation.vertices[start : start + CHUNK_FRAMES], np.float64) - template) * scale)
         furthest = float(np.abs(steps).max(initial=0))
         if furthest > LARGEST_STEP:
-            raise FaceDiffError(
+            raise OptionError.naming(
                 f"{animation.name}: moves {furthest * STEP / 1000:.3g} m away from its template; give the unit of "
-                f"length (--unit) and the template (--mesh) that belong to it"
+                f"length ({{unit}}) and the template ({{mesh}}) that belong to it"
             )
         whole: npt.NDArray[np.int32] = steps.astype(np.int32)
         differences = np.diff(whole, axis=0, prepend=np.zeros_like(whole[:1]))

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, OptionError
 from facediff.models.audio_encoders import StepRule
 from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
@@ -476,8 +476,8 @@ def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts) -> i
             f"is of a variant of the method"
         )
     if period != round(facts.frame_rate):
-        raise FaceDiffError(
-            f"--dataset {facts.dataset}: the positions of {weights.source} repeat every {period} frames, and "
+        raise OptionError.naming(
+            f"{{dataset}} {facts.dataset}: the positions of {weights.source} repeat every {period} frames, and "
             f"{facts.dataset} has {facts.frame_rate:g} a second; give the data set that it was trained on"
         )
     weights.ignore(name, "the table of positions is computed by its formula")

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, OptionError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay, MotionScale
 from facediff.models.evaluation import IdentityPolicy
@@ -148,9 +148,9 @@ class PublishedModel(AnimationModel):
         """
         most, rows = int(frames.max()), self.table_frames
         if rows is not None and most > rows and self.long_speech != "extend":
-            raise FaceDiffError(
+            raise OptionError.naming(
                 f"{source}: {most / self.frame_rate:.1f} s are {most} frames, and {type(self).__name__}'s published "
-                f"tables have {rows} ({rows / self.frame_rate:g} s); animate it in windows (--window 4), or make the "
+                f"tables have {rows} ({rows / self.frame_rate:g} s); animate it in windows ({{window}} 4), or make the "
                 f"model with long_speech=extend or long_speech=windows"
             )
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
@@ -161,9 +161,11 @@ class DiffSpeaker(DiffusionModel):
             FaceDiffError: if there is no such sampler, or so many steps are impossible.
         """
         if name is not None and name not in self.samplers:
-            raise FaceDiffError(f"--sampler {name}: DiffSpeaker has no such sampler: {choices(name, self.samplers)}")
+            raise OptionError.naming(
+                f"{{sampler}} {name}: DiffSpeaker has no such sampler: {choices(name, self.samplers)}"
+            )
         if steps is not None and not 1 <= steps <= TRAINING_STEPS:
-            raise FaceDiffError(f"--steps {steps}: expected a number from 1 to {TRAINING_STEPS}")
+            raise OptionError.naming(f"{{steps}} {steps}: expected a number from 1 to {TRAINING_STEPS}")
         self.scheduler = "ddim" if name == "ddim" else self.scheduler
         self.sampling_steps = steps or self.sampling_steps
 

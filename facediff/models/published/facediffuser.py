@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, OptionError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
@@ -113,9 +113,9 @@ class FaceDiffuser(DiffusionModel):
         Raises:
             FaceDiffError: always.
         """
-        raise FaceDiffError(
-            f"FaceDiffuser samples by the reverse process over all of its {self.steps} steps: omit --sampler and "
-            f"--steps, or make the model with skip_steps or sampling_space=folded"
+        raise OptionError.naming(
+            f"FaceDiffuser samples by the reverse process over all of its {self.steps} steps: omit {{sampler}} and "
+            f"{{steps}}, or make the model with skip_steps or sampling_space=folded"
         )
 
     # Frames.

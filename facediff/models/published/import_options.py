@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from facediff.errors import FaceDiffError
+from facediff.errors import OptionError
 from facediff.utils.option import Option
 
 
@@ -53,6 +53,6 @@ class ImportOptions:
         for text in self.option or []:
             name, equals, value = text.partition("=")
             if not equals or not name:
-                raise FaceDiffError(f"--option {text}: expected a name and a value, such as num_heads=4")
+                raise OptionError.naming(f"{{option}} {text}: expected a name and a value, such as num_heads=4")
             options[name] = [*options.get(name, []), value] if name == "ignore" else value
         return options

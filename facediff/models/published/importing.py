@@ -24,7 +24,7 @@ from facediff import registry
 from facediff.data import Assets
 from facediff.data.batch import ASSETS_KEY
 from facediff.data.corpus import read_templates
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.metrics import Region
 from facediff.models.checkpoint import check_weights
 from facediff.models.published.import_options import ImportOptions
@@ -97,9 +97,9 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     for prefix in [ignore] if isinstance(ignore, str) else ignore:
         weights.ignore(prefix, "left out as asked")
     if left := weights.left():
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{weights.source}: holds tensors that {method.method} has no use for ({listed(left)}); is it a variant "
-            f"of the method? If they may be left out, give --option ignore={left[0]}"
+            f"of the method? If they may be left out, give {{option}} ignore={left[0]}"
         )
     assets, notes = read_assets(facts, options)
     model = build(weights, method, facts, with_options(method.method, converted, facts.model_options))
@@ -203,28 +203,30 @@ def facts_of(
     datasets, count, vertices = dataset_facts(), method.count(weights), method.vertices(weights)
     name: str | None = options.dataset
     if name is not None and name not in datasets:
-        raise FaceDiffError(f"--dataset {name}: there is no such data set: {choices(name, datasets)}")
+        raise OptionError.naming(f"{{dataset}} {name}: there is no such data set: {choices(name, datasets)}")
     by_size = next((dataset for dataset, facts in datasets.items() if facts.n_vertices == vertices), None)
     if name is not None and by_size is not None and name != by_size:
-        raise FaceDiffError(
-            f"--dataset {name}: {weights.source} is of {by_size}, by its {vertices} vertices; omit the option"
+        raise OptionError.naming(
+            f"{{dataset}} {name}: {weights.source} is of {by_size}, by its {vertices} vertices; omit the option"
         )
     name = name or by_size
     if name is None:
-        raise FaceDiffError(
-            f"{weights.source}: its {vertices} vertices are those of no known data set; give --dataset "
+        raise OptionError.naming(
+            f"{weights.source}: its {vertices} vertices are those of no known data set; give {{dataset}} "
             f"{'|'.join(datasets)}, which says at how many frames a second it was trained"
         )
     identities = list(datasets[name].identities if options.identities is None else options.identities)
     if count and len(identities) != count:
         where = "--identities: " if options.identities is not None else f"{weights.source}: "
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{where}the checkpoint has {count} training identities, and "
             f"{len(identities)} {'are given' if options.identities is not None else f'is what {name} usually has'}; "
-            f"give --identities with {count} names in the order of the training command"
+            f"give {{identities}} with {count} names in the order of the training command"
         )
     if not all(map(is_name, identities)) or len(set(identities)) < len(identities):
-        raise FaceDiffError(f"--identities: {quoted(identities)}; expected different names without path separators")
+        raise OptionError.naming(
+            f"{{identities}}: {quoted(identities)}; expected different names without path separators"
+        )
     asked = options.all_model_options()
     return CheckpointFacts(
         dataset=name,
@@ -247,8 +249,8 @@ def rate_of(dataset: DatasetFacts, method: Recogniser, option: object) -> float:
     if rate is None:
         return method.frame_rate or dataset.frame_rate
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate <= FRAME_RATES[1]:
-        raise FaceDiffError(
-            f"--option frame_rate={quoted(rate)}: expected frames a second, such as {method.frame_rate or 0:g}"
+        raise OptionError.naming(
+            f"{{option}} frame_rate={quoted(rate)}: expected frames a second, such as {method.frame_rate or 0:g}"
         )
     return float(rate)
 
@@ -264,7 +266,7 @@ def read_config(config: str | Path | Mapping[str, Any] | None) -> Mapping[str, A
     path, remedy = Path(config), "expected the config.json of the audio encoder"
     content = load_json(path, name=f"--audio-config {path}", remedy=remedy)
     if not isinstance(content, dict):
-        raise FaceDiffError(f"--audio-config {path}: holds no options by name; {remedy}")
+        raise OptionError.naming(f"{{audio_config}} {path}: holds no options by name; {remedy}")
     return content
 
 
@@ -285,10 +287,12 @@ def with_options(method: str, converted: dict[str, Any], chosen: Mapping[str, An
             continue
         hints = own if name in own else encoders
         if name not in hints:
-            raise FaceDiffError(f"--option {name}: {method} has no such option: {choices(name, [*own, *encoders])}")
+            raise OptionError.naming(
+                f"{{option}} {name}: {method} has no such option: {choices(name, [*own, *encoders])}"
+            )
         value = read_value(text)
         if not fits(value, hints[name]):
-            raise FaceDiffError(f"--option {name}={text}: expected {in_words(hints[name])}")
+            raise OptionError.naming(f"{{option}} {name}={text}: expected {in_words(hints[name])}")
         value = as_hinted(value, hints[name])
         if name in own:
             converted = {**converted, name: value}
@@ -337,8 +341,8 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     templates, regions, mesh = options.templates, options.regions, options.mesh
     count, notes = facts.n_vertices, []
     if templates is None:
-        raise FaceDiffError(
-            "--templates: no checkpoint holds the neutral faces; give the data set's templates.pkl, as the projects "
+        raise OptionError.naming(
+            "{templates}: no checkpoint holds the neutral faces; give the data set's templates.pkl, as the projects "
             "take it"
         )
     if isinstance(templates, Mapping):
@@ -349,7 +353,7 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     else:
         faces = read_templates(Path(templates), count)
     if not faces:
-        raise FaceDiffError(f"--templates {templates}: holds no faces; give the data set's templates.pkl")
+        raise OptionError.naming(f"{{templates}} {templates}: holds no faces; give the data set's templates.pkl")
     everything = torch.arange(count)
     indices = {"lips": everything, "upper_face": everything}
     if regions is None:
@@ -366,7 +370,7 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     else:
         drawn = read_mesh(Path(mesh))
         if len(drawn.vertices) != count:
-            raise FaceDiffError(f"--mesh {mesh}: has {len(drawn.vertices)} vertices, the checkpoint {count}")
+            raise OptionError.naming(f"{{mesh}} {mesh}: has {len(drawn.vertices)} vertices, the checkpoint {count}")
         triangles = torch.as_tensor(drawn.faces).long()
     unit = dataset_facts()[facts.dataset].unit
     if count != dataset_facts()[facts.dataset].n_vertices:
@@ -394,7 +398,7 @@ def read_region(path: Path, n_vertices: int) -> Tensor:
     try:
         region = Region.from_file(path, n_vertices=n_vertices)
     except ValueError as error:
-        raise FaceDiffError(f"--regions {path.parent}: {error}") from error
+        raise OptionError.naming(f"{{regions}} {path.parent}: {error}") from error
     return torch.tensor(region.indices)
 
 

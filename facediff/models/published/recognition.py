@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.licences import Commercial
 from facediff.utils.limits import quoted
@@ -212,22 +212,22 @@ def backbone_config(
     config = {name: value for name, value in (stated or {}).items() if isinstance(name, str)}
     for name, value in sizes.items():
         if name in config and config[name] != value and list_of(config[name]) != value:
-            raise FaceDiffError(
-                f"--audio-config: its {name} is {quoted(config[name])}, and the tensors of {weights.source} say "
+            raise OptionError.naming(
+                f"{{audio_config}}: its {name} is {quoted(config[name])}, and the tensors of {weights.source} say "
                 f"{value}; give the config.json of the very network"
             )
     config = {"do_stable_layer_norm": large, "mask_time_prob": 0.05, **config, **sizes, "model_type": kind}
     if "num_attention_heads" not in config:
         if hidden % 64:
-            raise FaceDiffError(
+            raise OptionError.naming(
                 f"{weights.source}: its audio encoder has {hidden} channels, from which the number of its attention "
-                f"heads does not follow; give --audio-config config.json with num_attention_heads"
+                f"heads does not follow; give {{audio_config}} config.json with num_attention_heads"
             )
         config["num_attention_heads"] = hidden // 64
     if "conv_stride" not in config and len(convolutions) != 7:
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{weights.source}: its audio encoder has {len(convolutions)} convolutions, whose strides do not follow "
-            f"from it; give --audio-config config.json with conv_stride"
+            f"from it; give {{audio_config}} config.json with conv_stride"
         )
     if not config["mask_time_prob"] and not config.get("mask_feature_prob"):
         config["mask_time_prob"] = 0.05  # otherwise the network has no place for masked_spec_embed

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Assets, Batch
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, OptionError
 from facediff.models.audio_encoders import (
     AudioEncoderFactory,
     Lengths,
@@ -219,9 +219,9 @@ class SelfTalk(DirectModel):
             FaceDiffError: if the model was made or imported without its lip reader.
         """
         if self.reader is None:
-            raise FaceDiffError(
+            raise OptionError.naming(
                 "lip_reader: the model has none, since animation needs none; train it with lip_reader=text, or import "
-                "the checkpoint with --option lip_reader=text"
+                "the checkpoint with {option} lip_reader=text"
             )
         if frames is None:
             frames = torch.full((len(motion),), motion.shape[1], device=motion.device)
@@ -418,8 +418,8 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     channels, _ = weights.shape("audio_encoder.feature_projection.projection.weight")
     if "alignment" not in facts.model_options and (width == 2 * channels) != (facts.frame_rate == 25.0):
         heard = "pairs of steps of speech, as at 25" if width == 2 * channels else "single steps of speech, as at 30"
-        raise FaceDiffError(
-            f"--dataset {facts.dataset}: {weights.source} takes {heard} frames a second, and {facts.dataset} has "
+        raise OptionError.naming(
+            f"{{dataset}} {facts.dataset}: {weights.source} takes {heard} frames a second, and {facts.dataset} has "
             f"{facts.frame_rate:g}; give the data set that it was trained on"
         )
     hidden, _ = weights.shape("transformer_decoder.layers.0.linear1.weight")
@@ -449,9 +449,10 @@ def convert_reader(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str,
     _, columns = weights.shape("lip_map.weight")
     given = facts.model_options.get("lip_vertices")
     if given is None and columns != 3 * facts.n_vertices:
-        raise FaceDiffError(
-            f"--option lip_reader=text: no file holds the {columns // 3} vertices that the lip reader sees; give them "
-            f"in the authors' order as --option lip_vertices=[0,1,...], or omit the option, since animation needs none"
+        raise OptionError.naming(
+            f"{{option}} lip_reader=text: no file holds the {columns // 3} vertices that the lip reader sees; give "
+            f"them in the authors' order as {{option}} lip_vertices=[0,1,...], or omit the option, which animation "
+            f"does not need"
         )
     prefix = "text_encoder.wav2vec2."
     config = backbone_config(weights, prefix, "wav2vec2", facts.audio_config)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
 from facediff.models.graphs import Spoken
@@ -294,8 +294,8 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> d
             weights.ignore(name, "of the optimiser")
     rate = facts.frame_rate
     if PUBLISHED_RATE % rate:
-        raise FaceDiffError(
-            f"--option frame_rate={rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected a rate that "
+        raise OptionError.naming(
+            f"{{option}} frame_rate={rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected a rate that "
             f"divides it, such as 30, which takes every second frame"
         )
     usual = dataset_facts()[facts.dataset].frame_rate
@@ -305,12 +305,12 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> d
             f"it animates at {rate:g} frames a second, and the corpus {facts.dataset} has {usual:g}{remedy}"
         )
     if facts.graph is None:
-        raise FaceDiffError(
+        raise OptionError.naming(
             f"{weights.source}: holds VOCA without DeepSpeech, through whose logits it hears; give the graph "
-            f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as --option deepspeech=output_graph.pb"
+            f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as {{option}} deepspeech=output_graph.pb"
         )
     if facts.audio_config is not None:
-        raise FaceDiffError("--audio-config: DeepSpeech's graph says all of its sizes by itself; omit the option")
+        raise OptionError.naming("{audio_config}: DeepSpeech's graph says all of its sizes by itself; omit the option")
     state, sizes, left = network_of(read_graph(facts.graph), str(facts.graph))
     weights.renamed.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
     weights.ignored.update({f"{facts.graph.name}: {name}": "a constant of the graph" for name in left})

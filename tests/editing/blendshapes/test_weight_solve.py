@@ -267,7 +267,7 @@ def test_bad_motion_is_refused() -> None:
     animation.vertices[1, 4, 2] = np.nan
     with pytest.raises(FaceDiffError, match="a: frame 1 holds NaN"):
         solve(animation, made)
-    with pytest.raises(FaceDiffError, match="has 40 vertices and the shapes 39.*--carry"):
+    with pytest.raises(FaceDiffError, match="has 40 vertices and the shapes 39.*carry"):
         solve(animation, ShapeSet(made.names, made.neutral[:39], made.deltas[:, :39]))
     with pytest.raises(FaceDiffError, match="no shape moves"):
         solve(animation_of(made, np.zeros((3, 5))), ShapeSet(made.names, made.neutral, 0 * made.deltas))

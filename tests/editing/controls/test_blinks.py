@@ -105,7 +105,7 @@ def test_impossible_rates(rate: float) -> None:
 
 
 def test_eyes_whose_lids_are_not_known(make_animation: Callable[..., Animation]) -> None:
-    with pytest.raises(FaceDiffError, match="flame: does not say how the lids shut; give --eyes FILE"):
+    with pytest.raises(FaceDiffError, match="flame: does not say how the lids shut; give eyes"):
         add_blinks(make_animation(9), Eyes(None, (np.arange(9),), "flame"))
     with pytest.raises(FaceDiffError, match="moves nothing"):
         Eyes(np.zeros((9, 3), np.float32), (), "flame")

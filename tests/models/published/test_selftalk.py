@@ -140,7 +140,7 @@ def test_the_lip_reader_is_left_out_of_an_import_and_reported(tmp_path: Path) ->
 
 @pytest.mark.parametrize(("of", "given"), [("biwi", "vocaset"), ("vocaset", "biwi")])
 def test_another_data_set_than_it_was_trained_on_is_named(of: str, given: str, tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=f"--dataset {given}"):
+    with pytest.raises(FaceDiffError, match=f"dataset {given}"):
         imported(published.selftalk_state(of), tmp_path, given)
 
 
