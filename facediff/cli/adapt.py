@@ -180,8 +180,8 @@ def adapt_audio_encoder(
     quiet: bool,
 ) -> None:
     """Write a checkpoint with a distilled audio encoder; see :func:`adapt`."""
-    from facediff.models.base import PROVENANCE_KEY
     from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.models.checkpoint_content import PROVENANCE_KEY
     from facediff.pipelines.trained import usable_device
     from facediff.utils.licences import require_cleared
 

@@ -185,7 +185,7 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
     from facediff.data import SpeechMotionDataModule
     from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.data.check.layouts import by_name
-    from facediff.models.checkpoint import find_class
+    from facediff.models.checkpoint_reading import find_class
     from facediff.utils.plain_options import is_path
 
     named = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")

@@ -1,6 +1,8 @@
-"""The base of all models: their common options, training, testing, prediction, and what a checkpoint keeps.
+"""The base of all models: their common options, training, testing and prediction.
 
-A model adds its network and three methods: ``__init__`` with its own options, ``losses``, and ``generate_clips``.
+A model adds its network and three methods: ``__init__`` with its own options, ``losses``, and ``generate_clips``. The
+content of checkpoints stands in :mod:`facediff.models.checkpoint_content`, sampling in
+:mod:`facediff.models.inference`.
 """
 
 from __future__ import annotations
@@ -9,46 +11,40 @@ import functools
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
-from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
-from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
-from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
+from facediff.data import Batch, SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.checkpoint_content import MotionScale, StyleSource
+from facediff.models.checkpoint_reading import checked_file
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
-from facediff.models.inference import Inference, Prediction, Style
-from facediff.models.layers import frame_mask
+from facediff.models.inference import Prediction
 from facediff.models.mesh_encoders import MeshEncoder
+from facediff.models.person_styles import PersonStyles
+from facediff.models.pretrained import publish
 from facediff.models.principal import PrincipalComponents
-from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, keeps_arguments, plain
+from facediff.registry import keeps_arguments
 from facediff.speech.windows import WindowPlan
-from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
-from facediff.utils.limits import LIMITS, quoted
-from facediff.utils.plain_options import is_name, is_plain_text
+from facediff.utils.licences import merged, network_licences
 from facediff.utils.ranges import Range, Vertices
 
 Schedule = Literal["constant", "cosine", "exponential", "step"]
-StyleSource = Literal["reference", "person"]
-MotionScale = Literal["unit", "none"]
 Decay = Annotated[float, Range(0, 1000)]
 
 
-PROVENANCE_KEY = "facediff_provenance"
-"""Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
-
-STYLES_KEY = "facediff_styles"
-"""Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
+SIZES = ("n_vertices", "identities", "frame_rate")
+"""Options of a model that follow from its data module, by their name in both."""
 
 DIVERGENCE_INTERVAL = 50
 """Steps between two looks at the loss on an accelerator."""
@@ -87,7 +83,7 @@ def lr_factor(
     return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / max(1, total))))
 
 
-class AnimationModel(LightningModule, Inference, ABC):
+class AnimationModel(PersonStyles, ABC):
     """Base of all models.
 
     A model's own constructor names its own options and hands the others on::
@@ -165,14 +161,22 @@ class AnimationModel(LightningModule, Inference, ABC):
         self.validation_samples = validation_samples
         self.score_by = list(score_by)
         self.windows = WindowPlan()
-        self.data_source: dict[str, str] = {}
-        self.licences: tuple[Licence, ...] = ()
-        self.provenance: dict[str, str] = {}
-        self.data_options: dict[str, Any] = {}
-        self._assets: Assets | None = None
         self.style_source: StyleSource = style_source
-        self.person_styles: dict[str, Style] = {}
-        self._styles_of_step: int | None = None  # the step whose weights gave the vectors
+
+    @classmethod
+    def for_data(cls, data: SpeechMotionDataModule, **options: Any) -> Self:  # noqa: ANN401
+        """A model whose sizes are those of a corpus, as on the command line.
+
+        Args:
+            data: the corpus.
+            options: the model's other options.
+
+        Example:
+            >>> data = Puppet(batch_size=8)  # doctest: +SKIP
+            >>> model = DualPathDiffusion.for_data(data, dim=64)  # doctest: +SKIP
+            >>> Trainer(max_epochs=30).fit(model, data)  # doctest: +SKIP
+        """
+        return cls(**{name: getattr(data, name) for name in SIZES}, **options)
 
     @functools.cached_property
     def evaluation(self) -> Evaluation:
@@ -191,9 +195,9 @@ class AnimationModel(LightningModule, Inference, ABC):
 
     options_path = "model"
 
-    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         """Let every model keep its constructor's arguments."""
-        super().__init_subclass__(**words)
+        super().__init_subclass__(**options)
         if "__init__" in vars(cls):
             cls.__init__ = keeps_arguments(cls.__init__)  # type: ignore[method-assign]
 
@@ -222,31 +226,6 @@ class AnimationModel(LightningModule, Inference, ABC):
     def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
         """A batch's own style vectors, or else those of its references."""
         return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
-
-    def default_style(self, identity: str) -> Reference | Style:
-        """The style of all of an identity's motion if the model keeps it, else its stored reference.
-
-        Raises:
-            FaceDiffError: if it has neither.
-        """
-        return self.person_styles.get(identity) or super().default_style(identity)
-
-    def styled_identities(self) -> list[str]:
-        """The identities that have a style of their own to be conditioned on."""
-        return [*{**self.assets.references, **self.person_styles}]
-
-    def with_person_styles(self, batch: Batch) -> Batch:
-        """The batch with the style of all motion of each clip's speaker, where the model uses it and knows it."""
-        known = [self.person_styles.get(name) for name in batch.identity_names]
-        if not any(known) or batch.style is not None:
-            return batch
-        with torch.no_grad():
-            style = self.style_of(batch).clone()
-        names = list(batch.reference_names)
-        for clip, found in enumerate(known):
-            if found is not None:
-                style[clip], names[clip] = found.vector.to(style), found.name
-        return replace(batch, style=style, reference_names=names)
 
     def personal_modules(self) -> list[nn.Module]:
         """The parts that hold identity and style; ``facediff adapt --train person`` trains them alone."""
@@ -323,50 +302,6 @@ class AnimationModel(LightningModule, Inference, ABC):
                 f"corpus with `facediff data check`"
             )
 
-    def on_validation_epoch_start(self) -> None:
-        """Take the styles of all motion by the weights that are validated; weight averaging has put its own in."""
-        self.encode_people()
-
-    def on_test_epoch_start(self) -> None:
-        """Take the styles of all motion of the speakers that are tested."""
-        self.encode_people()
-
-    def on_predict_epoch_start(self) -> None:
-        """Take the styles of all motion of the speakers that are predicted."""
-        self.encode_people()
-
-    def encode_people(self, weights: Mapping[str, Tensor] | None = None) -> None:
-        """Take every speaker's style from all of their motion, if that is what the model uses.
-
-        The motion is cut into stretches as long as a style reference; a speaker's style is the mean of the stretches'
-        vectors, weighted by their frames. Clips of the evaluated splits are never among them.
-
-        Args:
-            weights: the weights to encode with, by the names of the state dict; the present ones if None.
-        """
-        step = int(self.trainer.global_step)
-        if self.style_source != "person" or self._styles_of_step == step:
-            return
-        data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        encoder, given = StyleEncoding(self), {f"model.{name}": value for name, value in (weights or {}).items()}
-        modes = [(module, module.training) for module in self.modules()]
-        self.eval()
-        styles: dict[str, Style] = {}
-        with torch.no_grad():
-            for name, clips in data.known_clips().items():
-                total, frames = torch.zeros(()), 0
-                for clip in clips if name in data.corpus.templates else []:
-                    parts = torch.split(data.corpus.read_motion(clip).to(self.device), data.reference_frames)
-                    lengths = torch.tensor([len(part) for part in parts], device=self.device)
-                    mask = frame_mask(lengths, int(lengths.max()))
-                    vectors = torch.func.functional_call(encoder, given, (pad(parts), mask)).float()
-                    total, frames = total + (vectors * lengths[:, None]).sum(0).cpu(), frames + int(lengths.sum())
-                if frames and total.numel():
-                    styles[name] = Style(f"all motion of {name} ({len(clips)} clips)", total / frames)
-        for module, mode in modes:
-            module.training = mode
-        self.person_styles, self._styles_of_step = styles, step
-
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed random numbers, so that epochs compare, and the protocol's metrics of generated motion."""
         # The same steps and noise in every epoch; otherwise the curve would show their chance.
@@ -407,61 +342,6 @@ class AnimationModel(LightningModule, Inference, ABC):
             Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
             for i, name in enumerate(batch.names)
         ]
-
-    # What the model knows of its corpus.
-
-    @property
-    def assets(self) -> Assets:
-        """Templates, faces, regions, references and scale of the training corpus.
-
-        Raises:
-            FaceDiffError: if neither a corpus nor a checkpoint has been seen yet.
-        """
-        if self._assets is None:
-            raise FaceDiffError("the model has no templates yet; train it with a data module or load a checkpoint")
-        return self._assets
-
-    @property
-    def scale(self) -> float:
-        """Factor from offsets in the corpus's unit to the motion that the networks see.
-
-        Raises:
-            FaceDiffError: if it has not been measured, because the model was never trained.
-        """
-        if self.motion_scaling == "none":
-            return 1.0
-        if self.assets.motion_scale is None:
-            raise OptionError.naming("the model has never been trained: give a checkpoint (--ckpt_path, {checkpoint})")
-        return self.assets.motion_scale
-
-    def adopt(self, assets: Assets) -> None:
-        """Take over a corpus's assets after checking that they fit the model's sizes.
-
-        Raises:
-            FaceDiffError: naming what differs.
-        """
-        sizes = {template.shape[0] for template in assets.templates.values()}
-        for what, mine, theirs in (
-            ("vertices", {self.n_vertices}, sizes),
-            ("identities", self.identities, assets.identities),
-            ("frames a second", self.frame_rate, assets.frame_rate),
-        ):
-            if mine != theirs:
-                raise FaceDiffError(
-                    f"the model and the corpus {assets.corpus} do not fit: {what} are {mine} in the model and {theirs} "
-                    f"in the corpus; use a checkpoint that was trained on this topology and these identities"
-                )
-        self._assets = assets
-        self.make_parts(assets)
-
-    def make_parts(self, assets: Assets) -> None:
-        """Make modules whose size only the corpus knows; by itself a model has none.
-
-        Called when assets are adopted, also a second time, and before that by what copies the model for a training.
-
-        Args:
-            assets: those of the corpus.
-        """
 
     def check_training(self, *, resumed: bool) -> None:
         """Refuse, before a run writes anything, what cannot be trained; by itself a model refuses nothing.
@@ -550,35 +430,7 @@ class AnimationModel(LightningModule, Inference, ABC):
         """What motion is multiplied by before its principal components are taken."""
         return torch.ones(self.n_vertices, 3)
 
-    # Checkpoints.
-
-    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
-        """Save the constructor's arguments as plain data, in the form that Lightning rebuilds a module from."""
-        options = {**defaults(type(self)), **given}
-        for kind in COMPONENTS.keys() & options.keys():
-            made = [m for m in self.modules() if isinstance(m, component_class(options[kind]))]
-            options[kind] = describe(options[kind], made[0] if made else None)
-        self.save_hyperparameters(
-            {
-                "_class_path": f"{type(self).__module__}.{type(self).__qualname__}",
-                "_instantiator": "lightning.pytorch.cli.instantiate_module",
-                **plain(options),
-            }
-        )
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the assets, so that the checkpoint animates without the corpus."""
-        checkpoint[FORMAT_KEY] = FORMAT
-        checkpoint[ASSETS_KEY] = self.assets.state()
-        checkpoint[DATA_SOURCE_KEY] = self.data_source
-        checkpoint[LICENCES_KEY] = [licence.state() for licence in self.licences]
-        if self.provenance:
-            checkpoint[PROVENANCE_KEY] = dict(self.provenance)
-        if self.style_source == "person":
-            # Of the weights that are saved: weight averaging has replaced the present ones in the checkpoint by now.
-            if self._trainer is not None and isinstance(self.trainer.datamodule, SpeechMotionDataModule):  # type: ignore[attr-defined]
-                self.encode_people(checkpoint["state_dict"])
-            checkpoint[STYLES_KEY] = {name: (style.name, style.vector) for name, style in self.person_styles.items()}
+    # Checkpoints and publishing.
 
     def save_pretrained(
         self,
@@ -612,31 +464,8 @@ class AnimationModel(LightningModule, Inference, ABC):
         Example:
             >>> model.save_pretrained("talking-face", license="apache-2.0")  # doctest: +SKIP
         """
-        from facediff.models.pretrained import publish
-
         table = None if scores is None else Path(scores)
         return publish(self, Path(folder), half=half, licence=license, name=name, scores=table, languages=languages)
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take the assets from the checkpoint."""
-        if ASSETS_KEY in checkpoint:
-            self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
-            self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
-            self.licences = merged(self.licences, self._stated_licences(checkpoint))
-            self.provenance = read_provenance(checkpoint)
-            self.data_options = dict(checkpoint.get("datamodule_hyper_parameters") or {})
-            self.person_styles = read_person_styles(checkpoint.get(STYLES_KEY, {}))
-
-    def _stated_licences(self, checkpoint: dict[str, Any]) -> tuple[Licence, ...]:
-        """A checkpoint's labels; of one without, written before there were labels, those of its corpus by name."""
-        if LICENCES_KEY in checkpoint:
-            return read_licences("its labels", checkpoint[LICENCES_KEY])
-        known: list[type[Any]] = [entry.implementation for entry in corpus]
-        named = next((each for each in known if getattr(each, "corpus_name", None) == self.assets.corpus), None)
-        own = Licence(f"corpus {self.assets.corpus}") if named is None else named.corpus_licence()
-        options = checkpoint.get("datamodule_hyper_parameters") or {}
-        people = [Licence(f"speaker {Path(str(folder)).name}") for folder in options.get("people") or []]
-        return merged([own], people, network_licences(dict(self.hparams)))
 
     @classmethod
     def load_from_checkpoint(
@@ -650,63 +479,6 @@ class AnimationModel(LightningModule, Inference, ABC):
         Raises:
             FaceDiffError: as :func:`facediff.models.checkpoint.read_checkpoint`.
         """
-        from facediff.models.checkpoint import checked_file
-
-        with checked_file(checkpoint_path) as stream:
-            made: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
-        return made
-
-
-class StyleEncoding(nn.Module):
-    """A model's style encoder as a module, so that it can be called with other weights than the model has.
-
-    Args:
-        model: the model.
-    """
-
-    def __init__(self, model: AnimationModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, reference: Tensor, mask: Tensor) -> Tensor:
-        """Style vectors, as :meth:`AnimationModel.encode_style` gives them."""
-        return self.model.encode_style(reference, mask)
-
-
-def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
-    """What a checkpoint was made from; the epochs and steps of one that says nothing else.
-
-    Raises:
-        FaceDiffError: if it is anything but short texts by name.
-    """
-    found = checkpoint.get(PROVENANCE_KEY, {})
-    if not isinstance(found, dict) or not all(
-        isinstance(text, str) and is_plain_text(text) for item in found.items() for text in item
-    ):
-        raise FaceDiffError(f"its provenance is {quoted(found)}; expected texts by name. The file is damaged")
-    counted = {"epochs": checkpoint.get("epoch"), "steps": checkpoint.get("global_step")}
-    return {**found, **{name: str(count) for name, count in counted.items() if isinstance(count, int)}}
-
-
-def read_person_styles(state: object) -> dict[str, Style]:
-    """The styles of all motion of each speaker, from a checkpoint.
-
-    Raises:
-        FaceDiffError: if they are anything but finite vectors of one length, by speaker.
-    """
-    if not isinstance(state, dict):
-        raise FaceDiffError(f"its styles are {quoted(state)}; expected vectors by speaker. The file is damaged")
-    styles: dict[str, Style] = {}
-    for name, value in state.items():
-        fits = is_name(name) and isinstance(value, list | tuple) and len(value) == 2 and isinstance(value[0], str)
-        vector = value[1] if fits and is_plain_text(value[0]) else None
-        if not isinstance(vector, Tensor) or vector.ndim != 1 or not bool(vector.isfinite().all()):
-            raise FaceDiffError(
-                f"its style of {quoted(name)} is {quoted(value)}; expected a name and a finite vector. The file is "
-                f"damaged"
-            )
-        styles[name] = Style(value[0], vector.float())
-    LIMITS.check("identities", len(styles), STYLES_KEY)
-    if len({len(style.vector) for style in styles.values()}) > 1:
-        raise FaceDiffError("its styles of speakers differ in length; expected one length. The file is damaged")
-    return styles
+        with checked_file(checkpoint_path, AnimationModel) as stream:
+            model: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
+        return model

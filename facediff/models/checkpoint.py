@@ -1,56 +1,29 @@
-"""The one door into a checkpoint: an untrusted file becomes a model that is ready for inference.
+"""The one door into a checkpoint: loading models, their assets and their corpora.
 
-A model folder (:mod:`facediff.models.pretrained`), also of the Hugging Face hub, is read into the same content as a
-checkpoint, and goes the same way from there on.
-
-Every command and every method that loads a checkpoint comes through here, before Lightning or jsonargparse see any of
-it. In this order, and before anything is imported or allocated because the file asks for it:
-
-1. The archive's directory and the sizes of all tensors agree and stay within the budget
-   (:mod:`facediff.utils.torch_files`); the content is tensors and plain data (``weights_only=True``).
-2. The model, its components and the data module are classes that are registered, or imported already.
-3. Their options are plain values of the types that the constructors ask for
-   (:mod:`facediff.utils.plain_options`): nothing that could be imported, opened as a config, fetched from another
-   machine or resolved as ``${…}``.
-4. The assets are what :meth:`Assets.from_state` accepts.
-5. The model is built within a budget that follows from its weights, and the weights fit it.
-
-What a checkpoint may make facediff read are the folders of the corpus that it was trained on, when it is scored on that
-corpus or adapted; see SECURITY.md.
+What is checked, and in which order, stands in :mod:`facediff.models.checkpoint_reading`.
 """
 
 from __future__ import annotations
 
-import io
 import os
-import sys
-import types
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
-import torch
-
-from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
-from facediff.errors import FaceDiffError
-from facediff.models.allocation import allocation_budget
-from facediff.models.pretrained import read_model
-from facediff.registry import COMPONENTS, Kind, corpus, model
-from facediff.utils.hub import model_path
+from facediff.data import SpeechMotionDataModule
+from facediff.data.batch import DATA_SOURCE_KEY, Assets
+from facediff.models.base import AnimationModel
+from facediff.models.checkpoint_reading import (
+    assets_of,
+    build,
+    component_finders,
+    find_class,
+    open_content,
+    read_content,
+)
+from facediff.registry import corpus
 from facediff.utils.licences import require_cleared
-from facediff.utils.limits import LIMITS, quoted
-from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
-from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
-
-if TYPE_CHECKING:
-    from facediff.data import SpeechMotionDataModule
-    from facediff.models.base import AnimationModel
-
-INSTANTIATOR = "lightning.pytorch.cli.instantiate_module"
-"""What Lightning imports and calls to rebuild a module; no checkpoint of facediff's names anything else."""
+from facediff.utils.plain_options import read_options, unknown_class
 
 
 def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool = False) -> AnimationModel:
@@ -70,54 +43,10 @@ def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool =
         >>> model.animate(speech, identity="F1").vertices.shape  # doctest: +SKIP
         torch.Size([75, 1008, 3])
     """
-    found = build_model(path, read_checkpoint(path))
+    model = build_model(path, read_checkpoint(path))
     if commercial_only:
-        require_cleared(path, found.licences)
-    return found.to(device)
-
-
-def read_assets(path: Path | str) -> Assets:
-    """The assets alone: templates, faces, frame rate …; no class that the checkpoint names is looked at.
-
-    Raises:
-        FaceDiffError: if the file is missing, or no checkpoint of this version of facediff.
-    """
-    with open_content(path, weights=False) as (content, name):
-        return assets_of(name, content)
-
-
-@contextmanager
-def open_content(
-    path: str | os.PathLike[str] | IO[bytes], *, weights: bool = True
-) -> Iterator[tuple[dict[str, Any], str]]:
-    """The content of a checkpoint or of a model folder, of which only the outer form is checked, and its name.
-
-    Args:
-        path: a checkpoint, which may be open; a model folder; or a name of the Hugging Face hub.
-        weights: whether the weights of a model folder are wanted too.
-
-    Raises:
-        FaceDiffError: if there is none, or it is damaged.
-    """
-    if isinstance(path, str | os.PathLike) and (found := model_path(path)).is_dir():
-        content = read_model(found, weights=weights)
-        check_content(content, path)
-        yield content, str(path)
-        return
-    with open_checkpoint(path) as (stream, name):
-        yield read_file(stream, name), name
-
-
-def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
-    """The assets of a checkpoint's content.
-
-    Raises:
-        FaceDiffError: naming the file and what is wrong with them.
-    """
-    try:
-        return Assets.from_state(checkpoint[ASSETS_KEY])
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{path}: {error}") from error
+        require_cleared(path, model.licences)
+    return model.to(device)
 
 
 def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:
@@ -130,105 +59,7 @@ def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:
         FaceDiffError: if the file is missing, or no checkpoint of this version of facediff, or names a model, a
             component or a value that is not known.
     """
-    with open_content(path) as (checkpoint, name):
-        pass
-    model_of(name, checkpoint["hyper_parameters"])
-    assets = assets_of(name, checkpoint)
-    if checkpoint["hyper_parameters"].get("identities") != assets.identities:
-        raise FaceDiffError(f"{name}: its model and its assets do not have the same identities; {EXPECTED}")
-    return checkpoint
-
-
-@contextmanager
-def checked_file(path: str | os.PathLike[str] | IO[bytes]) -> Iterator[IO[bytes]]:
-    """An open checkpoint at its beginning, after all checks, for those who must read it themselves.
-
-    Raises:
-        FaceDiffError: as :func:`read_checkpoint` and :func:`build_model`.
-    """
-    if isinstance(path, str | os.PathLike) and model_path(path).is_dir():
-        content = read_checkpoint(path)
-        build_model(str(path), content)
-        made = io.BytesIO()
-        torch.save(content, made)
-        made.seek(0)
-        yield made
-        return
-    with open_checkpoint(path) as (stream, name):
-        build_model(name, read_checkpoint(stream))
-        stream.seek(0)
-        yield stream
-
-
-def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
-    """The plain data and tensors of a checkpoint of facediff's; only its outer form is checked."""
-    checkpoint = load_tensors(stream, path)
-    check_content(checkpoint, path)
-    return checkpoint
-
-
-def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
-    """Refuse a content that has not the outer form of a checkpoint of facediff's.
-
-    Raises:
-        FaceDiffError: naming the file and the part.
-    """
-    if not isinstance(checkpoint, dict) or not {ASSETS_KEY, "hyper_parameters", "state_dict"} <= checkpoint.keys():
-        raise FaceDiffError(
-            f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
-            f"{EXPECTED}"
-        )
-    found = checkpoint.get(FORMAT_KEY)
-    if type(found) is not int or found != FORMAT:
-        raise FaceDiffError(
-            f"{path}: written by another version of facediff, whose checkpoints this one cannot read; train the model "
-            f"again with `facediff fit`, or use the version that wrote it"
-        )
-    for key in ("hyper_parameters", "state_dict", ASSETS_KEY, DATA_SOURCE_KEY, "datamodule_hyper_parameters"):
-        value = checkpoint.get(key)
-        if not (isinstance(value, dict) and all(isinstance(name, str) for name in value)) and (
-            value is not None or key in ("hyper_parameters", "state_dict", ASSETS_KEY)
-        ):
-            raise FaceDiffError(f"{path}: its {key} is {quoted(value)}; expected values by name. The file is damaged")
-    for name, value in (checkpoint.get(DATA_SOURCE_KEY) or {}).items():
-        if not isinstance(value, str) or not is_plain_text(value):
-            raise FaceDiffError(
-                f"{path}: its corpus has the {quoted(name)} {quoted(value)}; expected a path. {EXPECTED}"
-            )
-    for name, value in checkpoint["state_dict"].items():
-        if not isinstance(value, torch.Tensor):
-            raise FaceDiffError(f"{path}: its weight {quoted(name)} is {quoted(value)}; expected a tensor")
-
-
-def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[AnimationModel], dict[str, Any]]:
-    """The model's class and its constructor's arguments.
-
-    Raises:
-        FaceDiffError: if the hyper-parameters name anything but a model, components and plain values.
-    """
-    from facediff.models.base import AnimationModel
-
-    named = hparams.get("_class_path")
-    found: type[AnimationModel] | None = find_class(model, named, AnimationModel)
-    if found is None:
-        raise unknown_class(path, "model", named)
-    if hparams.get("_instantiator", INSTANTIATOR) != INSTANTIATOR:
-        raise FaceDiffError(
-            f"{path}: it names {quoted(hparams['_instantiator'])} to rebuild it; expected {INSTANTIATOR}"
-        )
-    identities = hparams.get("identities")
-    if not isinstance(identities, list) or not all(map(is_name, identities)):
-        raise FaceDiffError(f"{path}: its identities are {quoted(identities)}; expected names without path separators")
-    LIMITS.check("identities", len(identities), path)
-    kept = ("_class_path", "_instantiator", "identities")
-    arguments = read_options(
-        str(path), found, {name: value for name, value in hparams.items() if name not in kept}, component_finders()
-    )
-    for name in ("n_vertices", "frame_rate"):
-        if not arguments.get(name, 0) > 0:
-            raise FaceDiffError(f"{path}: its {name} is {quoted(hparams.get(name))}; expected a number above zero")
-    LIMITS.check("vertices", arguments["n_vertices"], path)
-    return found, {**arguments, "identities": list(identities)}
+    return read_content(path, AnimationModel)
 
 
 def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
@@ -241,65 +72,17 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
     Raises:
         FaceDiffError: if a component cannot be made here, or the weights do not fit.
     """
-    weights = checkpoint["state_dict"]
-    # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
-    # before the weights, since tables of mesh encoders are among these.
-    found, arguments = model_of(path, checkpoint["hyper_parameters"])
-    try:
-        with warnings.catch_warnings(), allocation_budget(path, weights.values()):
-            warnings.simplefilter("ignore")  # of sizes that are 0, for example
-            made = found(**arguments)
-        made.on_load_checkpoint(checkpoint)
-        check_weights(path, weights, made.state_dict())
-        try:
-            made.load_state_dict(weights)
-        except RuntimeError as error:
-            raise FaceDiffError(f"{path}: {misfit(weights, made.state_dict())}") from error
-    except FaceDiffError as error:
-        raise FaceDiffError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
-    except Exception as error:
-        # Components have their own exceptions for what cannot be rebuilt, and PyTorch lists every weight.
-        lines = str(error).strip().splitlines() or [repr(error)]
-        reason = " ".join(" ".join(lines[:2]).split())[:200]
-        raise FaceDiffError(
-            f"{path}: cannot be rebuilt as {found.__name__} ({reason}); install the packages that its components come "
-            f"from, in the versions that wrote it"
-        ) from error
-    for name, parameter in made.named_parameters():
-        if not parameter.isfinite().all():
-            raise FaceDiffError(
-                f"{path}: its weights {name} hold NaN or infinity, so the training has diverged; use an earlier "
-                f"checkpoint, or train again with a lower learning rate"
-            )
-    return made.eval()
+    return build(path, checkpoint, AnimationModel)  # type: ignore[type-abstract]
 
 
-def check_weights(path: Path | str, weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> None:
-    """Refuse weights whose numbers are of another sort than the model's: copying would change them in silence.
+def read_assets(path: Path | str) -> Assets:
+    """The assets alone: templates, faces, frame rate …; no class that the checkpoint names is looked at.
 
     Raises:
-        FaceDiffError: naming the weights.
+        FaceDiffError: if the file is missing, or no checkpoint of this version of facediff.
     """
-    for name, value in weights.items():
-        mine = own.get(name)
-        if isinstance(mine, torch.Tensor) and mine.is_floating_point() != value.is_floating_point():
-            raise FaceDiffError(
-                f"{path}: its weights {quoted(name)} are of the type {value.dtype}, and {mine.dtype} in the model; the "
-                f"file is damaged"
-            )
-
-
-def misfit(weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> str:
-    """What is wrong with weights that do not fit a model, in a sentence."""
-    missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
-    other = sorted(name for name in own.keys() & weights.keys() if own[name].shape != weights[name].shape)
-    found = "they do not fit"
-    for names, what in ((missing, "are missing"), (extra, "are too many"), (other, "are of another shape")):
-        if names:
-            shapes = f" {tuple(weights[names[0]].shape)} in place of {tuple(own[names[0]].shape)}" * (names is other)
-            found = f"{len(names)} {what}, the first is {quoted(names[0])}{shapes}"
-            break
-    return f"its weights are not those of its model ({found}); the file is damaged, or its options were changed"
+    with open_content(path, weights=False) as (content, name):
+        return assets_of(name, content)
 
 
 def corpus_class(path: Path | str, source: Mapping[str, Any]) -> type[SpeechMotionDataModule]:
@@ -312,12 +95,10 @@ def corpus_class(path: Path | str, source: Mapping[str, Any]) -> type[SpeechMoti
     Raises:
         FaceDiffError: if the class is neither registered nor imported.
     """
-    from facediff.data import SpeechMotionDataModule
-
-    found: type[SpeechMotionDataModule] | None = find_class(corpus, source.get("class_path"), SpeechMotionDataModule)
-    if found is None:
+    module: type[SpeechMotionDataModule] | None = find_class(corpus, source.get("class_path"), SpeechMotionDataModule)
+    if module is None:
         raise unknown_class(path, "data module", source.get("class_path"))
-    return found
+    return module
 
 
 def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[SpeechMotionDataModule], dict[str, Any]]:
@@ -327,56 +108,9 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
         FaceDiffError: if the class is not known, or an option is no plain value of the type that the class asks for.
     """
     source = checkpoint.get(DATA_SOURCE_KEY) or {}
-    found = corpus_class(path, source)
+    module = corpus_class(path, source)
     # An imported model knows its corpus, but not where its folder is.
-    given = checkpoint.get("datamodule_hyper_parameters") or {name: source[name] for name in source.keys() & {"root"}}
-    options = {name: value for name, value in given.items() if not name.startswith("_")}
-    read_options(str(path), found, options, component_finders())
-    return found, options
-
-
-def component_finders() -> Components:
-    """What finds the classes of components, by kind; those that are not registered must be of the kind's base class."""
-    from facediff.models import (
-        audio_encoders,
-        decoders,
-        fusions,
-        mesh_encoders,
-        motion_space,
-        samplers,
-        speaker_encoders,
-    )
-
-    bases: dict[str, type] = {
-        "motion_space": motion_space.MotionSpace,
-        "audio_encoder": audio_encoders.AudioEncoder,
-        "identity_encoder": speaker_encoders.IdentityEncoder,
-        "style_encoder": speaker_encoders.StyleEncoder,
-        "mesh_encoder": mesh_encoders.MeshEncoder,
-        "fusion": fusions.Fusion,
-        "decoder": decoders.Decoder,
-        "sampler": samplers.Sampler,
-    }
-    return {name: partial(find_class, kind, base=bases.get(name, torch.nn.Module)) for name, kind in COMPONENTS.items()}
-
-
-def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
-    """The class of an import path, if it is registered or its module is imported already; else None.
-
-    Args:
-        kind: where it may be registered; its entries are imported first, so that a plug-in is found.
-        path: the import path.
-        base: what the class must be a subclass of.
-    """
-    if not isinstance(path, str) or not is_path(path):
-        return None
-    module, _, name = path.rpartition(".")
-    if module == f"facediff.registry.{kind.kind}":
-        return kind.get(name) if name in kind.names() else None
-    kind.load()
-    # Not getattr, which may make a lazily loaded package import the module that the file asks for.
-    place = sys.modules.get(module)
-    found = vars(place).get(name) if isinstance(place, types.ModuleType) else None
-    if not isinstance(found, type):
-        return None
-    return found if issubclass(found, base) or found in [entry.implementation for entry in kind] else None
+    stored = checkpoint.get("datamodule_hyper_parameters") or {name: source[name] for name in source.keys() & {"root"}}
+    options = {name: value for name, value in stored.items() if not name.startswith("_")}
+    read_options(str(path), module, options, component_finders())
+    return module, options

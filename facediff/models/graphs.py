@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,13 +21,10 @@ from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.errors import FaceDiffError
-from facediff.models.audio_encoders import Lengths, Waves
+from facediff.models.audio_encoders import AudioEncoder, Lengths, Waves
 from facediff.models.layers import of_frames
+from facediff.models.samplers import Sampler
 from facediff.speech.frame_clock import FrameClock
-
-if TYPE_CHECKING:
-    from facediff.models.base import AnimationModel
-    from facediff.models.samplers import Sampler
 
 Axes = dict[int, str]
 """Which axes of an input have any length: ``batch``, ``samples``, ``frames``."""
@@ -177,6 +174,31 @@ Hear = Callable[[Speech, Int[Tensor, " batch"], int], Tensor]
 """Features of speech for a number of frames of each clip, and the largest of these numbers."""
 
 
+class GraphedModel(Protocol):
+    """What graphs that all models share need of a model."""
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of the topology."""
+        ...
+
+    @property
+    def clock(self) -> FrameClock:
+        """How the model counts its frames."""
+        ...
+
+    @property
+    def speech_encoder(self) -> AudioEncoder:
+        """The audio encoder."""
+        ...
+
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vectors of reference motions."""
+        ...
+
+
 class SpeechGraph(nn.Module):
     """Speech to one feature per frame of motion.
 
@@ -186,7 +208,7 @@ class SpeechGraph(nn.Module):
         steps_of: from a number of frames to the audio encoder's steps.
     """
 
-    def __init__(self, model: AnimationModel, hear: Hear, steps_of: Callable[[int], int]) -> None:
+    def __init__(self, model: GraphedModel, hear: Hear, steps_of: Callable[[int], int]) -> None:
         super().__init__()
         self.model = model
         self.hear = hear
@@ -219,7 +241,7 @@ def one_each(frames: int) -> int:
     return frames
 
 
-def speech_graph(model: AnimationModel, hear: Hear, steps_of: Callable[[int], int] = one_each) -> Graph:
+def speech_graph(model: GraphedModel, hear: Hear, steps_of: Callable[[int], int] = one_each) -> Graph:
     """The graph that hears; see :class:`SpeechGraph` for the arguments."""
     batch, samples = 2, 32_000
     frames = model.clock.frames(samples)
@@ -245,7 +267,7 @@ def speech_graph(model: AnimationModel, hear: Hear, steps_of: Callable[[int], in
 class StyleGraph(nn.Module):
     """Reference motion to a style vector."""
 
-    def __init__(self, model: AnimationModel) -> None:
+    def __init__(self, model: GraphedModel) -> None:
         super().__init__()
         self.model = model
 
@@ -257,7 +279,7 @@ class StyleGraph(nn.Module):
             return self.model.encode_style(motion, mask)
 
 
-def style_graphs(model: AnimationModel, width: int) -> list[Graph]:
+def style_graphs(model: GraphedModel, width: int) -> list[Graph]:
     """The graph that takes a style from motion, if styles have any width."""
     batch, frames = 2, 50
     motion = torch.randn(batch, frames, model.n_vertices, 3, generator=torch.Generator().manual_seed(0))

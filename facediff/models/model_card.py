@@ -10,17 +10,15 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from facediff.errors import FaceDiffError
+from facediff.models.checkpoint_content import CheckpointContent
 from facediff.registry import COMPONENTS, corpus
 from facediff.utils.hub import ASSETS, CONFIG, WEIGHTS
 from facediff.utils.licences import KNOWN, Licence, commercial_use
 from facediff.utils.limits import quoted
 from facediff.utils.plain_files import read_rows
-
-if TYPE_CHECKING:
-    from facediff.models.base import AnimationModel
 
 SCORES = "test_scores.csv"
 """What ``facediff test`` calls its table of scores."""
@@ -98,7 +96,7 @@ def check_languages(languages: Iterable[str]) -> None:
             raise FaceDiffError(f"--languages {quoted(code)}: expected codes such as en or zh-CN, separated by commas")
 
 
-def card(model: AnimationModel, licences: Sequence[Licence], facts: Facts) -> str:
+def card(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) -> str:
     """The text of a model card: metadata in YAML, then Markdown."""
     import yaml
 
@@ -116,7 +114,7 @@ def card(model: AnimationModel, licences: Sequence[Licence], facts: Facts) -> st
     return f"---\n{head}---\n\n" + "\n\n".join(parts) + "\n"
 
 
-def metadata(model: AnimationModel, licences: Sequence[Licence], facts: Facts) -> dict[str, Any]:
+def metadata(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) -> dict[str, Any]:
     """The metadata of the card, by the hub's names; ``commercial_use`` and ``corpus`` are ours."""
     weights = next((each for each in licences if each.of == "weights"), Licence("weights"))
     identifier = weights.name.lower()
@@ -143,7 +141,7 @@ def metadata(model: AnimationModel, licences: Sequence[Licence], facts: Facts) -
     return found
 
 
-def model_index(model: AnimationModel, facts: Facts) -> list[dict[str, Any]]:
+def model_index(model: CheckpointContent, facts: Facts) -> list[dict[str, Any]]:
     """The model's own scores in the form in which the hub shows them."""
     results = []
     for row in facts.scores:
@@ -172,7 +170,7 @@ def conditions(row: Mapping[str, str]) -> dict[str, str]:
 # The sections.
 
 
-def introduction(model: AnimationModel, facts: Facts) -> str:
+def introduction(model: CheckpointContent, facts: Facts) -> str:
     """What the model is, in a few lines."""
     assets = model.assets
     count = sum(parameter.numel() for parameter in model.parameters())
@@ -198,7 +196,7 @@ def introduction(model: AnimationModel, facts: Facts) -> str:
     return "\n".join([*lines, "", table(("", ""), rows)])
 
 
-def components(model: AnimationModel) -> dict[str, str]:
+def components(model: CheckpointContent) -> dict[str, str]:
     """The names of the model's components by kind."""
     options = {kind: model.hparams.get(kind) for kind in COMPONENTS}
     return {
@@ -208,7 +206,7 @@ def components(model: AnimationModel) -> dict[str, str]:
     }
 
 
-def how_to_use(model: AnimationModel, facts: Facts) -> str:
+def how_to_use(model: CheckpointContent, facts: Facts) -> str:
     """The two ways to use it."""
     identity = model.identities[0]
     return f"""## How to use it
@@ -242,7 +240,7 @@ def licence_section(licences: Sequence[Licence]) -> str:
     return f"## Licences\n\n{verdict} {advice}\n\n{shown}"
 
 
-def data_section(model: AnimationModel, facts: Facts) -> str:
+def data_section(model: CheckpointContent, facts: Facts) -> str:
     """What it was trained on."""
     assets = model.assets
     languages = ", ".join(languages_of(model, facts)) or "not stated"
@@ -256,7 +254,7 @@ def data_section(model: AnimationModel, facts: Facts) -> str:
     return f"## Data\n\n{table(('', ''), rows)}"
 
 
-def training_section(model: AnimationModel) -> str:
+def training_section(model: CheckpointContent) -> str:
     """How it was trained."""
     known = model.provenance
     options = dict(model.hparams)
@@ -275,7 +273,7 @@ def training_section(model: AnimationModel) -> str:
     return f"## Training\n\n{table(('', ''), rows)}\n\nEvery option is in `{CONFIG}`."
 
 
-def score_section(model: AnimationModel, facts: Facts) -> str:
+def score_section(model: CheckpointContent, facts: Facts) -> str:
     """The scores with everything that decides them."""
     if not facts.scores:
         return (
@@ -310,7 +308,7 @@ def score_section(model: AnimationModel, facts: Facts) -> str:
     return "## Scores\n\n" + table(header, rows) + "\n\n" + "\n".join(note for note in notes if note)
 
 
-def limits_section(model: AnimationModel) -> str:
+def limits_section(model: CheckpointContent) -> str:
     """What it is for, and what it cannot do."""
     synthetic = (
         "- It has learnt from a program's motion: it shows how such a model works, not how people move.\n"
@@ -344,7 +342,7 @@ def files_section(facts: Facts) -> str:
 # Helpers.
 
 
-def languages_of(model: AnimationModel, facts: Facts) -> Sequence[str]:
+def languages_of(model: CheckpointContent, facts: Facts) -> Sequence[str]:
     """The languages that were stated, else those of the corpus."""
     if facts.languages is not None:
         return facts.languages

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError, OptionError
+from facediff.models.checkpoint_content import CheckpointContent
 from facediff.models.model_card import Facts, card, check_languages, read_scores
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
@@ -37,9 +38,6 @@ from facediff.utils.plain_files import json_text, load_json
 from facediff.utils.plain_options import is_plain_text
 from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
 from facediff.version import __version__
-
-if TYPE_CHECKING:
-    from facediff.models.base import AnimationModel
 
 FORMAT = "facediff model 1"
 """Mark of the format of model folders; those of another mark are refused."""
@@ -63,7 +61,7 @@ NUMBERS = {name: size for name, size in TYPES.values()}
 
 
 def publish(
-    model: AnimationModel,
+    model: CheckpointContent,
     folder: Path,
     *,
     half: bool = False,
@@ -120,7 +118,7 @@ def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:
     return Licence("weights", origin.name, strictest, f"as {origin.of}" if found else "")
 
 
-def write_model(model: AnimationModel, folder: Path, *, half: bool = False) -> dict[str, Any]:
+def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -> dict[str, Any]:
     """Write a model's files into a folder that exists; not atomic.
 
     Args:
@@ -155,7 +153,7 @@ def write_model(model: AnimationModel, folder: Path, *, half: bool = False) -> d
     return config
 
 
-def content_of(model: AnimationModel) -> dict[str, Any]:
+def content_of(model: CheckpointContent) -> dict[str, Any]:
     """What a checkpoint of the model holds for inference; no folder of this machine is named in it."""
     content: dict[str, Any] = {"hyper_parameters": dict(model.hparams), "state_dict": model.state_dict()}
     model.on_save_checkpoint(content)

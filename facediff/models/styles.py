@@ -277,7 +277,7 @@ def face_of_array(
     """
     from facediff.data import SpeechMotionDataModule
     from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-    from facediff.models.checkpoint import find_class
+    from facediff.models.checkpoint_reading import find_class
     from facediff.registry import corpus
 
     path, assets, source = opened.path, model.assets, model.data_source

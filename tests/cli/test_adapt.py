@@ -18,8 +18,8 @@ from facediff.data.prepare.runner import write_templates
 from facediff.models import load_model
 from facediff.models.adaptation import grow
 from facediff.models.audio_distillation import encoder_weights
-from facediff.models.base import PROVENANCE_KEY
 from facediff.models.checkpoint import read_checkpoint
+from facediff.models.checkpoint_content import PROVENANCE_KEY
 from facediff.utils.pickles import load_pickle
 from tests.fakes.tiny import Tiny
 

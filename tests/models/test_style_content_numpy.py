@@ -1,6 +1,6 @@
 """The second method against NumPy (float64): content, style, speech branch, and every term of its objective.
 
-The spiral convolutions and the decoder have theirs in test_mesh_encoder and test_style_content.
+The spiral convolutions and the decoder have theirs in test_mesh_encoders and test_style_content_model.
 """
 
 from __future__ import annotations

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from contextlib import AbstractContextManager
+from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
-from facediff.models.dual_path.network import Conditions
-from facediff.models.folding import unchanged
+from facediff.models.dual_path.network import Conditions, DualPathNetwork
+from facediff.models.folding import Blend, ConditionalDenoiser, SamplingSpace, unchanged
 from facediff.models.graphs import (
     BATCH,
     FRAMES,
     Graph,
+    GraphedModel,
     Graphs,
     SamplingLoop,
     results_of,
@@ -22,15 +24,45 @@ from facediff.models.graphs import (
     style_graphs,
     update_table,
 )
+from facediff.models.motion_space import MotionSpace
+from facediff.models.samplers import NoiseProcess, Sampler
 
-if TYPE_CHECKING:
-    from facediff.models.dual_path.model import DualPathDiffusion
+
+class DualPathModel(GraphedModel, Protocol):
+    """What the graphs need of a dual-path model."""
+
+    network: DualPathNetwork
+    motion_space: MotionSpace
+    process: NoiseProcess
+    sampler: Sampler
+    sampling_space: SamplingSpace
+
+    @property
+    def scale(self) -> float:
+        """Factor from offsets to the motion that the network sees."""
+        ...
+
+    def denoiser(self, conditions: Conditions, blend: Blend) -> ConditionalDenoiser:
+        """The network under some conditions."""
+        ...
+
+    def views(self) -> dict[tuple[str, ...], float]:
+        """The predictions that guidance combines."""
+        ...
+
+    def choosing(self) -> AbstractContextManager[None]:
+        """Within it, chosen settings are temporary."""
+        ...
+
+    def choose_low_latency(self) -> None:
+        """Sample in few steps."""
+        ...
 
 
 class StepGraph(nn.Module):
     """Noisy motion to clean motion at one step, under speech, identity and style."""
 
-    def __init__(self, model: DualPathDiffusion) -> None:
+    def __init__(self, model: DualPathModel) -> None:
         super().__init__()
         self.model = model
 
@@ -68,10 +100,10 @@ class StepGraph(nn.Module):
         return denoiser.denoise(state, step), kept[0]
 
 
-class MotionGraph(nn.Module):
+class SampleGraph(nn.Module):
     """The end of sampling to offsets from the template."""
 
-    def __init__(self, model: DualPathDiffusion, decoded: Literal["sample", "kept"]) -> None:
+    def __init__(self, model: DualPathModel, decoded: Literal["sample", "kept"]) -> None:
         super().__init__()
         self.model = model
         self.decoded = decoded
@@ -83,7 +115,7 @@ class MotionGraph(nn.Module):
         return model.motion_space.decode(scaled) / model.scale
 
 
-def graphs_of(model: DualPathDiffusion) -> Graphs:
+def graphs_of(model: DualPathModel) -> Graphs:
     """A dual-path model with its present sampler as graphs and numbers.
 
     Raises:
@@ -132,7 +164,7 @@ def graphs_of(model: DualPathDiffusion) -> Graphs:
     decoded: Literal["sample", "kept"] = "kept" if folded else "sample"
     last = Graph(
         "motion",
-        MotionGraph(model, decoded),
+        SampleGraph(model, decoded),
         {"sample": torch.zeros(batch, frames, kept if folded else state)},
         {"sample": FRAMES},
         ("offsets",),

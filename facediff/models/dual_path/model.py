@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,6 +21,7 @@ from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import DecoderFactory, StyleTransformer
+from facediff.models.dual_path.graphs import graphs_of
 from facediff.models.dual_path.network import Conditions, DualPathNetwork, Hidden, TokenForm
 from facediff.models.folding import (
     Blend,
@@ -29,6 +30,7 @@ from facediff.models.folding import (
     unchanged,
 )
 from facediff.models.fusions import BidirectionalCrossAttention, FusionFactory
+from facediff.models.graphs import Graphs
 from facediff.models.inference import ClipNoise, Expressivity, Progress, WindowNoise, WindowOverlap
 from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.layers import Share, Weight, Width
@@ -53,9 +55,6 @@ from facediff.models.speaker_encoders import (
 from facediff.speech.windows import LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
-
-if TYPE_CHECKING:
-    from facediff.models.graphs import Graphs
 
 NumericScale = Annotated[float, Range(1e-6, 1e6)]
 NoiseScale = NumericScale | Literal["auto"]
@@ -475,8 +474,6 @@ class DualPathDiffusion(AnimationModel):
 
     def graphs(self) -> Graphs:
         """Audio encoder, denoising step and last map; the sampler as numbers."""
-        from facediff.models.dual_path.graphs import graphs_of
-
         return graphs_of(self)
 
     @torch.no_grad()

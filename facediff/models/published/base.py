@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from facediff.data import Batch
 from facediff.errors import ArgumentError, OptionError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
-from facediff.models.base import AnimationModel, Decay, MotionScale
+from facediff.models.base import AnimationModel, Decay
+from facediff.models.checkpoint_content import MotionScale
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.graphs import (
     BATCH,

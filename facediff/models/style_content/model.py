@@ -1,6 +1,6 @@
 """The style-content model: its options, its objectives and inference.
 
-E_C and E_S split motion into content (what is said, per frame) and style (how somebody moves, one vector); the decoder
+E_C and E_S split motion into content (articulation, per frame) and style (how a person moves, one vector); the decoder
 D turns both into motion again, whether the content comes from motion or from speech. The networks are in
 ``network.py``, the distances and the alignment of two recordings of a sentence in ``losses.py``.
 """
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from fractions import Fraction
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +21,7 @@ from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel, Decay
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, results_of, speech_graph, style_graphs
 from facediff.models.inference import Progress
 from facediff.models.layers import Heads, Weight, Width, frame_mask
 from facediff.models.losses import style_contrast
@@ -37,9 +39,6 @@ from facediff.models.style_content.losses import (
 )
 from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
 from facediff.utils.ranges import Range
-
-if TYPE_CHECKING:
-    from facediff.models.graphs import Graphs
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""
@@ -385,8 +384,6 @@ class StyleContentDisentanglement(AnimationModel):
 
     def graphs(self) -> Graphs:
         """Speech to content, and content with a style to motion."""
-        from facediff.models.style_content.graphs import graphs_of
-
         return graphs_of(self)
 
     def generate_clips(
@@ -394,3 +391,56 @@ class StyleContentDisentanglement(AnimationModel):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """Content from the speech, style from the reference; nothing is random, so the seed does not matter."""
         return self.decode(self.network.content_of_speech(batch), self.style_of(batch), batch.mask)
+
+
+# The model as computation graphs.
+
+
+class ContentMotionGraph(nn.Module):
+    """Content and style to offsets from the template."""
+
+    def __init__(self, model: StyleContentDisentanglement) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames content_dim"],
+        mask: Bool[Tensor, "batch frames"],
+        style: Float[Tensor, "batch style_dim"],
+    ) -> Float[Tensor, "batch frames vertices 3"]:
+        """In the unit of the corpus."""
+        return self.model.decode(features, style, mask)
+
+
+def graphs_of(model: StyleContentDisentanglement) -> Graphs:
+    """The model as graphs: speech to content, content and style to motion (:mod:`facediff.models.graphs`)."""
+    network = model.network
+    ratio = Fraction(network.ratio).limit_denominator(1000)
+
+    def steps_of(frames: int) -> int:
+        # A step more where the ratio is no whole number: it lies beyond what is valid, and is zero.
+        return frames * ratio.numerator // ratio.denominator + (ratio.denominator > 1)
+
+    speech = speech_graph(model, network.content_of, steps_of)
+    features = results_of(speech)
+    batch, frames = features.shape[:2]
+    width = sum(network.style_encoder.token_dims)
+    motion = Graph(
+        "motion",
+        ContentMotionGraph(model),
+        {
+            "features": features,
+            "mask": torch.ones(batch, frames, dtype=torch.bool),
+            "style": torch.zeros(batch, width),
+        },
+        {"features": FRAMES, "mask": FRAMES, "style": BATCH},
+        ("offsets",),
+    )
+    return Graphs(
+        parts=[speech, motion, *style_graphs(model, width)],
+        equal_lengths=not network.audio_encoder.takes_padding,
+        blending="motion",
+        clock=model.clock,
+        style="reference",
+    )

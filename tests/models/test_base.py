@@ -375,3 +375,16 @@ def test_training_stops_when_the_loss_is_no_number(
 ) -> None:
     with pytest.raises(FaceDiffError, match=r"model\.learning_rate"):
         make_trainer(max_epochs=50).fit(make_model(learning_rate=1e3, weight_decay=900.0), datamodule=tiny)
+
+
+def test_sizes_follow_from_the_data_and_a_plain_trainer_trains(tiny_root: Path) -> None:
+    """``for_data`` is what the command line links; one step of Lightning's own Trainer changes the weights."""
+    data = Tiny(root=str(tiny_root), batch_size=4)
+    model = DualPathDiffusion.for_data(data, dim=16, diffusion_steps=20)
+    assert (model.n_vertices, model.identities, model.frame_rate) == (24, ["A", "B"], 25.0)
+    assert model.hparams["dim"] == 16
+    before = model.network.embed.weight.detach().clone()
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
+    trainer = pl.Trainer(accelerator="cpu", max_steps=1, limit_val_batches=0, enable_model_summary=False, **quiet)
+    trainer.fit(model, data)
+    assert not torch.equal(model.network.embed.weight, before)

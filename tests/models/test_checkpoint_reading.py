@@ -200,6 +200,14 @@ def test_every_leaf_of_a_checkpoint_may_be_anything(content: Tree, evil: None) -
     assert not broken, "\n".join(broken)
 
 
+def test_a_model_much_larger_than_its_weights_is_refused(content: Tree) -> None:
+    """Neither more channels nor more layers than the weights have are built."""
+    small = {key: value for key, value in content.items() if key in (*CHECKED, "state_dict")}
+    for path, value in ((("dim",), 16_384), (("decoder", "init_args", "num_layers"), 256)):
+        tree = replaced(small, ("hyper_parameters", *path), value)
+        assert "larger than its weights" in law(lambda tree=tree: load_everything(tree)), path
+
+
 def test_keys_of_a_checkpoint_may_be_missing(content: Tree) -> None:
     small = {key: value for key, value in content.items() if key in (*CHECKED, "state_dict")}
     for path in leaves(small):

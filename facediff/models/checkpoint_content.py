@@ -1,0 +1,206 @@
+"""What a checkpoint keeps in addition to the weights: assets of the corpus, licences, provenance, speakers' styles.
+
+:class:`CheckpointContent` is the part of a model that writes and reads it. How an untrusted file is read stands in
+:mod:`facediff.models.checkpoint_reading`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from lightning.pytorch import LightningModule
+from torch import Tensor
+
+from facediff.data import Assets, SpeechMotionDataModule
+from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY
+from facediff.errors import FaceDiffError, OptionError
+from facediff.models.inference import Inference, Style
+from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, plain
+from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
+from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.plain_options import is_name, is_plain_text
+
+PROVENANCE_KEY = "facediff_provenance"
+"""Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
+
+STYLES_KEY = "facediff_styles"
+"""Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
+
+StyleSource = Literal["reference", "person"]
+MotionScale = Literal["unit", "none"]
+
+
+class CheckpointContent(LightningModule, Inference):
+    """The part of a model that a checkpoint keeps besides its weights.
+
+    Attributes:
+        n_vertices: vertices of the topology.
+        identities: training identities in the order of the identity index.
+        motion_scaling: as :class:`facediff.models.AnimationModel` takes ``motion_scale``.
+        data_source: class and place of the corpus.
+        data_options: options of its data module.
+        licences: labels of everything that the model has learnt from.
+        provenance: texts by name, see :data:`PROVENANCE_KEY`.
+        style_source: whether speakers' styles are kept.
+        person_styles: the styles by speaker.
+    """
+
+    n_vertices: int
+    identities: list[str]
+    motion_scaling: MotionScale
+    style_source: StyleSource
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.data_source: dict[str, str] = {}
+        self.data_options: dict[str, Any] = {}
+        self.licences: tuple[Licence, ...] = ()
+        self.provenance: dict[str, str] = {}
+        self.person_styles: dict[str, Style] = {}
+        self._assets: Assets | None = None
+
+    @property
+    def assets(self) -> Assets:
+        """Templates, faces, regions, references and scale of the training corpus.
+
+        Raises:
+            FaceDiffError: if neither a corpus nor a checkpoint has been seen yet.
+        """
+        if self._assets is None:
+            raise FaceDiffError("the model has no templates yet; train it with a data module or load a checkpoint")
+        return self._assets
+
+    @property
+    def scale(self) -> float:
+        """Factor from offsets in the corpus's unit to the motion that the networks see.
+
+        Raises:
+            FaceDiffError: if it has not been measured, because the model was never trained.
+        """
+        if self.motion_scaling == "none":
+            return 1.0
+        if self.assets.motion_scale is None:
+            raise OptionError.naming("the model has never been trained: give a checkpoint (--ckpt_path, {checkpoint})")
+        return self.assets.motion_scale
+
+    def adopt(self, assets: Assets) -> None:
+        """Take over a corpus's assets after checking that they fit the model's sizes.
+
+        Raises:
+            FaceDiffError: naming what differs.
+        """
+        sizes = {template.shape[0] for template in assets.templates.values()}
+        for what, mine, theirs in (
+            ("vertices", {self.n_vertices}, sizes),
+            ("identities", self.identities, assets.identities),
+            ("frames a second", self.frame_rate, assets.frame_rate),
+        ):
+            if mine != theirs:
+                raise FaceDiffError(
+                    f"the model and the corpus {assets.corpus} do not fit: {what} are {mine} in the model and {theirs} "
+                    f"in the corpus; use a checkpoint that was trained on this topology and these identities"
+                )
+        self._assets = assets
+        self.make_parts(assets)
+
+    def make_parts(self, assets: Assets) -> None:
+        """Make modules whose size only the corpus determines; the base class has none.
+
+        Called by :meth:`adopt` (possibly more than once) and when a model is cloned for training.
+
+        Args:
+            assets: those of the corpus.
+        """
+
+    def encode_people(self, weights: Mapping[str, Tensor] | None = None) -> None:
+        """Compute :attr:`person_styles`; see :class:`facediff.models.person_styles.PersonStyles`."""
+
+    def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
+        """Save the constructor's arguments as plain data, in the form that Lightning rebuilds a module from."""
+        options = {**defaults(type(self)), **arguments}
+        for kind in COMPONENTS.keys() & options.keys():
+            modules = [m for m in self.modules() if isinstance(m, component_class(options[kind]))]
+            options[kind] = describe(options[kind], modules[0] if modules else None)
+        self.save_hyperparameters(
+            {
+                "_class_path": f"{type(self).__module__}.{type(self).__qualname__}",
+                "_instantiator": "lightning.pytorch.cli.instantiate_module",
+                **plain(options),
+            }
+        )
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the assets, so that the checkpoint animates without the corpus."""
+        checkpoint[FORMAT_KEY] = FORMAT
+        checkpoint[ASSETS_KEY] = self.assets.state()
+        checkpoint[DATA_SOURCE_KEY] = self.data_source
+        checkpoint[LICENCES_KEY] = [licence.state() for licence in self.licences]
+        if self.provenance:
+            checkpoint[PROVENANCE_KEY] = dict(self.provenance)
+        if self.style_source == "person":
+            # By the weights that are saved: weight averaging has replaced the present ones in the checkpoint by now.
+            if self._trainer is not None and isinstance(self.trainer.datamodule, SpeechMotionDataModule):  # type: ignore[attr-defined]
+                self.encode_people(checkpoint["state_dict"])
+            checkpoint[STYLES_KEY] = {name: (style.name, style.vector) for name, style in self.person_styles.items()}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take the assets from the checkpoint."""
+        if ASSETS_KEY in checkpoint:
+            self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
+            self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
+            self.licences = merged(self.licences, self._stated_licences(checkpoint))
+            self.provenance = read_provenance(checkpoint)
+            self.data_options = dict(checkpoint.get("datamodule_hyper_parameters") or {})
+            self.person_styles = read_person_styles(checkpoint.get(STYLES_KEY, {}))
+
+    def _stated_licences(self, checkpoint: dict[str, Any]) -> tuple[Licence, ...]:
+        """A checkpoint's labels; of one without, written before there were labels, those of its corpus by name."""
+        if LICENCES_KEY in checkpoint:
+            return read_licences("its labels", checkpoint[LICENCES_KEY])
+        corpora: list[type[Any]] = [entry.implementation for entry in corpus]
+        module = next((m for m in corpora if getattr(m, "corpus_name", None) == self.assets.corpus), None)
+        own = Licence(f"corpus {self.assets.corpus}") if module is None else module.corpus_licence()
+        options = checkpoint.get("datamodule_hyper_parameters") or {}
+        people = [Licence(f"speaker {Path(str(folder)).name}") for folder in options.get("people") or []]
+        return merged([own], people, network_licences(dict(self.hparams)))
+
+
+def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
+    """What a checkpoint was made from; the epochs and steps of one that says nothing else.
+
+    Raises:
+        FaceDiffError: if it is anything but short texts by name.
+    """
+    texts = checkpoint.get(PROVENANCE_KEY, {})
+    if not isinstance(texts, dict) or not all(
+        isinstance(text, str) and is_plain_text(text) for pair in texts.items() for text in pair
+    ):
+        raise FaceDiffError(f"its provenance is {quoted(texts)}; expected texts by name. The file is damaged")
+    counted = {"epochs": checkpoint.get("epoch"), "steps": checkpoint.get("global_step")}
+    return {**texts, **{name: str(count) for name, count in counted.items() if isinstance(count, int)}}
+
+
+def read_person_styles(state: object) -> dict[str, Style]:
+    """The styles of all motion of each speaker, from a checkpoint.
+
+    Raises:
+        FaceDiffError: if they are anything but finite vectors of one length, by speaker.
+    """
+    if not isinstance(state, dict):
+        raise FaceDiffError(f"its styles are {quoted(state)}; expected vectors by speaker. The file is damaged")
+    styles: dict[str, Style] = {}
+    for name, value in state.items():
+        fits = is_name(name) and isinstance(value, list | tuple) and len(value) == 2 and isinstance(value[0], str)
+        vector = value[1] if fits and is_plain_text(value[0]) else None
+        if not isinstance(vector, Tensor) or vector.ndim != 1 or not bool(vector.isfinite().all()):
+            raise FaceDiffError(
+                f"its style of {quoted(name)} is {quoted(value)}; expected a name and a finite vector. The file is "
+                f"damaged"
+            )
+        styles[name] = Style(value[0], vector.float())
+    LIMITS.check("identities", len(styles), STYLES_KEY)
+    if len({len(style.vector) for style in styles.values()}) > 1:
+        raise FaceDiffError("its styles of speakers differ in length; expected one length. The file is damaged")
+    return styles

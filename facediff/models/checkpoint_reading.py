@@ -1,0 +1,360 @@
+"""How an untrusted checkpoint becomes a model: what is checked, and in which order.
+
+A model folder (:mod:`facediff.models.pretrained`), also of the Hugging Face hub, is read into the same content as a
+checkpoint, and goes the same way from there on.
+
+Every command and every method that loads a checkpoint comes through here (:mod:`facediff.models.checkpoint`), before
+Lightning or jsonargparse see any of it. In this order, and before anything is imported or allocated because the file
+asks for it:
+
+1. The archive's directory and the sizes of all tensors agree and stay within the budget
+   (:mod:`facediff.utils.torch_files`); the content is tensors and plain data (``weights_only=True``).
+2. The model, its components and the data module are classes that are registered, or imported already.
+3. Their options are plain values of the types that the constructors ask for
+   (:mod:`facediff.utils.plain_options`): nothing that could be imported, opened as a config, fetched from another
+   machine or resolved as ``${…}``.
+4. The assets are what :meth:`Assets.from_state` accepts.
+5. The model is built within a budget that follows from its weights, and the weights fit it.
+
+What a checkpoint may make facediff read are the folders of the corpus that it was trained on, when it is scored on that
+corpus or adapted; see SECURITY.md.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import threading
+import types
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import torch
+from lightning.pytorch import LightningModule
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_parameter_registration_hook,
+)
+
+from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
+from facediff.errors import FaceDiffError
+from facediff.models.pretrained import read_model
+from facediff.registry import COMPONENTS, Kind, model
+from facediff.utils.hub import model_path
+from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
+from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
+
+M = TypeVar("M", bound=LightningModule)
+"""A model: the base class of all models is given by the caller, since it reads checkpoints itself."""
+
+INSTANTIATOR = "lightning.pytorch.cli.instantiate_module"
+"""What Lightning imports and calls to rebuild a module; no checkpoint of facediff's names anything else."""
+
+
+SPARE_NUMBERS, SPARE_TENSORS = 2**25, 1000
+"""What a model may register in addition to four times its weights."""
+
+
+@contextmanager
+def open_content(
+    path: str | os.PathLike[str] | IO[bytes], *, weights: bool = True
+) -> Iterator[tuple[dict[str, Any], str]]:
+    """The content of a checkpoint or of a model folder, of which only the outer form is checked, and its name.
+
+    Args:
+        path: a checkpoint, which may be open; a model folder; or a name of the Hugging Face hub.
+        weights: whether the weights of a model folder are wanted too.
+
+    Raises:
+        FaceDiffError: if there is none, or it is damaged.
+    """
+    if isinstance(path, str | os.PathLike) and (folder := model_path(path)).is_dir():
+        content = read_model(folder, weights=weights)
+        check_content(content, path)
+        yield content, str(path)
+        return
+    with open_checkpoint(path) as (stream, name):
+        yield read_file(stream, name), name
+
+
+def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
+    """The assets of a checkpoint's content.
+
+    Raises:
+        FaceDiffError: naming the file and what is wrong with them.
+    """
+    try:
+        return Assets.from_state(checkpoint[ASSETS_KEY])
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{path}: {error}") from error
+
+
+def read_content(path: str | os.PathLike[str] | IO[bytes], base: type[LightningModule]) -> dict[str, Any]:
+    """Read a checkpoint without running any code from it, and check all that it names.
+
+    Args:
+        path: the file, which may be open; a model folder; or a name of the Hugging Face hub.
+        base: the base class of all models.
+
+    Raises:
+        FaceDiffError: if the file is missing, or no checkpoint of this version of facediff, or names a model, a
+            component or a value that is not known.
+    """
+    with open_content(path) as (checkpoint, name):
+        pass
+    model_of(name, checkpoint["hyper_parameters"], base)
+    assets = assets_of(name, checkpoint)
+    if checkpoint["hyper_parameters"].get("identities") != assets.identities:
+        raise FaceDiffError(f"{name}: its model and its assets do not have the same identities; {EXPECTED}")
+    return checkpoint
+
+
+@contextmanager
+def checked_file(path: str | os.PathLike[str] | IO[bytes], base: type[LightningModule]) -> Iterator[IO[bytes]]:
+    """An open checkpoint at its beginning, after all checks, for Lightning, which must read it itself."""
+    if isinstance(path, str | os.PathLike) and model_path(path).is_dir():
+        content = read_content(path, base)
+        build(str(path), content, base)
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        buffer.seek(0)
+        yield buffer
+        return
+    with open_checkpoint(path) as (stream, name):
+        build(name, read_content(stream, base), base)
+        stream.seek(0)
+        yield stream
+
+
+def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
+    """The plain data and tensors of a checkpoint of facediff's; only its outer form is checked."""
+    checkpoint = load_tensors(stream, path)
+    check_content(checkpoint, path)
+    return checkpoint
+
+
+def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
+    """Refuse a content that has not the outer form of a checkpoint of facediff's.
+
+    Raises:
+        FaceDiffError: naming the file and the part.
+    """
+    if not isinstance(checkpoint, dict) or not {ASSETS_KEY, "hyper_parameters", "state_dict"} <= checkpoint.keys():
+        raise FaceDiffError(
+            f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
+            f"{EXPECTED}"
+        )
+    version = checkpoint.get(FORMAT_KEY)
+    if type(version) is not int or version != FORMAT:
+        raise FaceDiffError(
+            f"{path}: written by another version of facediff, whose checkpoints this one cannot read; train the model "
+            f"again with `facediff fit`, or use the version that wrote it"
+        )
+    for key in ("hyper_parameters", "state_dict", ASSETS_KEY, DATA_SOURCE_KEY, "datamodule_hyper_parameters"):
+        value = checkpoint.get(key)
+        if not (isinstance(value, dict) and all(isinstance(name, str) for name in value)) and (
+            value is not None or key in ("hyper_parameters", "state_dict", ASSETS_KEY)
+        ):
+            raise FaceDiffError(f"{path}: its {key} is {quoted(value)}; expected values by name. The file is damaged")
+    for name, value in (checkpoint.get(DATA_SOURCE_KEY) or {}).items():
+        if not isinstance(value, str) or not is_plain_text(value):
+            raise FaceDiffError(
+                f"{path}: its corpus has the {quoted(name)} {quoted(value)}; expected a path. {EXPECTED}"
+            )
+    for name, value in checkpoint["state_dict"].items():
+        if not isinstance(value, torch.Tensor):
+            raise FaceDiffError(f"{path}: its weight {quoted(name)} is {quoted(value)}; expected a tensor")
+
+
+def model_of(path: Path | str, hparams: Mapping[str, Any], base: type[M]) -> tuple[type[M], dict[str, Any]]:
+    """The model's class and its constructor's arguments.
+
+    Raises:
+        FaceDiffError: if the hyper-parameters name anything but a model, components and plain values.
+    """
+    named = hparams.get("_class_path")
+    implementation: type[M] | None = find_class(model, named, base)
+    if implementation is None:
+        raise unknown_class(path, "model", named)
+    if hparams.get("_instantiator", INSTANTIATOR) != INSTANTIATOR:
+        raise FaceDiffError(
+            f"{path}: it names {quoted(hparams['_instantiator'])} to rebuild it; expected {INSTANTIATOR}"
+        )
+    identities = hparams.get("identities")
+    if not isinstance(identities, list) or not all(map(is_name, identities)):
+        raise FaceDiffError(f"{path}: its identities are {quoted(identities)}; expected names without path separators")
+    LIMITS.check("identities", len(identities), path)
+    kept = ("_class_path", "_instantiator", "identities")
+    arguments = read_options(
+        str(path),
+        implementation,
+        {name: value for name, value in hparams.items() if name not in kept},
+        component_finders(),
+    )
+    for name in ("n_vertices", "frame_rate"):
+        if not arguments.get(name, 0) > 0:
+            raise FaceDiffError(f"{path}: its {name} is {quoted(hparams.get(name))}; expected a number above zero")
+    LIMITS.check("vertices", arguments["n_vertices"], path)
+    return implementation, {**arguments, "identities": list(identities)}
+
+
+def build(path: Path | str, checkpoint: dict[str, Any], base: type[M]) -> M:
+    """The model of a checkpoint that :func:`read_content` has read, ready for inference on the CPU.
+
+    Args:
+        path: the file, for messages.
+        checkpoint: its content.
+        base: the base class of all models.
+
+    Raises:
+        FaceDiffError: if a component cannot be built here, or the weights do not fit.
+    """
+    weights = checkpoint["state_dict"]
+    # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
+    # before the weights, since tables of mesh encoders are among these.
+    implementation, arguments = model_of(path, checkpoint["hyper_parameters"], base)
+    try:
+        with warnings.catch_warnings(), weight_budget(path, weights.values()):
+            warnings.simplefilter("ignore")  # of sizes that are 0, for example
+            built = implementation(**arguments)
+        built.on_load_checkpoint(checkpoint)
+        check_weights(path, weights, built.state_dict())
+        try:
+            built.load_state_dict(weights)
+        except RuntimeError as error:
+            raise FaceDiffError(f"{path}: {misfit(weights, built.state_dict())}") from error
+    except FaceDiffError as error:
+        raise FaceDiffError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    except Exception as error:
+        # Components have their own exceptions for what cannot be rebuilt, and PyTorch lists every weight.
+        lines = str(error).strip().splitlines() or [repr(error)]
+        reason = " ".join(" ".join(lines[:2]).split())[:200]
+        raise FaceDiffError(
+            f"{path}: cannot be rebuilt as {implementation.__name__} ({reason}); install the packages that its "
+            f"components come from, in the versions that wrote it"
+        ) from error
+    for name, parameter in built.named_parameters():
+        if not parameter.isfinite().all():
+            raise FaceDiffError(
+                f"{path}: its weights {name} hold NaN or infinity, so the training has diverged; use an earlier "
+                f"checkpoint, or train again with a lower learning rate"
+            )
+    return built.eval()
+
+
+@contextmanager
+def weight_budget(path: Path | str, weights: Iterable[torch.Tensor]) -> Iterator[None]:
+    """Within it, this thread can build no model that is much larger than the weights that belong to it.
+
+    A model of 10⁶ layers, or of 10⁹ channels, is one number in a file. The weights in the same file say how large the
+    model can be.
+
+    Raises:
+        FaceDiffError: naming the file, as soon as a parameter or a buffer is too much.
+    """
+    kept, thread = list(weights), threading.get_ident()
+    # Generously more than the weights: a constructor may make parts that it replaces, and buffers that are not saved.
+    numbers, tensors = 4 * sum(weight.numel() for weight in kept) + SPARE_NUMBERS, 4 * len(kept) + SPARE_TENSORS
+
+    def spend(module: torch.nn.Module, name: str, value: torch.Tensor | None) -> None:
+        nonlocal numbers, tensors
+        if value is None or threading.get_ident() != thread:
+            return
+        numbers, tensors = numbers - value.numel(), tensors - 1
+        if numbers < 0 or tensors < 0:
+            raise FaceDiffError(
+                f"{path}: its options ask for a model that is much larger than its weights; the file is damaged"
+            )
+
+    # PyTorch's layers register their weights before they fill them, so that the memory has not been touched yet.
+    hooks = register_module_parameter_registration_hook(spend), register_module_buffer_registration_hook(spend)
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def check_weights(path: Path | str, weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> None:
+    """Refuse weights whose numbers are of another sort than the model's: copying would change them in silence.
+
+    Raises:
+        FaceDiffError: naming the weights.
+    """
+    for name, value in weights.items():
+        mine = own.get(name)
+        if isinstance(mine, torch.Tensor) and mine.is_floating_point() != value.is_floating_point():
+            raise FaceDiffError(
+                f"{path}: its weights {quoted(name)} are of the type {value.dtype}, and {mine.dtype} in the model; the "
+                f"file is damaged"
+            )
+
+
+def misfit(weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> str:
+    """What is wrong with weights that do not fit a model, in a sentence."""
+    missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
+    other = sorted(name for name in own.keys() & weights.keys() if own[name].shape != weights[name].shape)
+    difference = "they do not fit"
+    for names, what in ((missing, "are missing"), (extra, "are too many"), (other, "are of another shape")):
+        if names:
+            shapes = f" {tuple(weights[names[0]].shape)} in place of {tuple(own[names[0]].shape)}" * (names is other)
+            difference = f"{len(names)} {what}, the first is {quoted(names[0])}{shapes}"
+            break
+    return f"its weights are not those of its model ({difference}); the file is damaged, or its options were changed"
+
+
+def component_finders() -> Components:
+    """What finds the classes of components, by kind; those that are not registered must be of the kind's base class."""
+    from facediff.models import (
+        audio_encoders,
+        decoders,
+        fusions,
+        mesh_encoders,
+        motion_space,
+        samplers,
+        speaker_encoders,
+    )
+
+    bases: dict[str, type] = {
+        "motion_space": motion_space.MotionSpace,
+        "audio_encoder": audio_encoders.AudioEncoder,
+        "identity_encoder": speaker_encoders.IdentityEncoder,
+        "style_encoder": speaker_encoders.StyleEncoder,
+        "mesh_encoder": mesh_encoders.MeshEncoder,
+        "fusion": fusions.Fusion,
+        "decoder": decoders.Decoder,
+        "sampler": samplers.Sampler,
+    }
+    return {name: partial(find_class, kind, base=bases.get(name, torch.nn.Module)) for name, kind in COMPONENTS.items()}
+
+
+def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
+    """The class of an import path, if it is registered or its module is imported already; else None.
+
+    Args:
+        kind: where it may be registered; its entries are imported first, so that a plug-in is found.
+        path: the import path.
+        base: what the class must be a subclass of.
+    """
+    if not isinstance(path, str) or not is_path(path):
+        return None
+    module, _, name = path.rpartition(".")
+    if module == f"facediff.registry.{kind.kind}":
+        return kind.get(name) if name in kind.names() else None
+    kind.load()
+    # Not getattr, which may make a lazily loaded package import the module that the file asks for.
+    place = sys.modules.get(module)
+    implementation = vars(place).get(name) if isinstance(place, types.ModuleType) else None
+    if not isinstance(implementation, type):
+        return None
+    return (
+        implementation
+        if issubclass(implementation, base) or implementation in [entry.implementation for entry in kind]
+        else None
+    )
