@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -26,7 +27,7 @@ from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from facediff.evaluation.figures import FigureData, Paper
 
@@ -36,7 +37,6 @@ NOTES = 3
 Predictions = Annotated[str, Option(metavar="PREDICTIONS", reads=True)]
 Truth = Annotated[Path, Option(metavar="TRUTH", reads=True)]
 Clip = Annotated[str | None, Option(metavar="CLIP")]
-Clips = Annotated[list[str] | None, Option(metavar="CLIP", many=True)]
 Highest = Annotated[ranges.Factor | None, Option(metavar="VALUE")]
 
 
@@ -186,16 +186,31 @@ def frames(
     report(page.output)
 
 
+@dataclass(frozen=True)
+class MapOptions:
+    """Maps of vertices.
+
+    Attributes:
+        clips: clips to count (default: all that truth and methods have)
+        highest_mean: end of the mean's scale in the unit shown
+        view: camera
+        workers: clips read at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+    """
+
+    clips: Annotated[list[str] | None, Option(metavar="CLIP", many=True)] = None
+    highest_mean: Highest = None
+    view: View = "front"
+    workers: Workers = None
+    scheduler: Scheduler = None
+
+
 def heatmap(
     predictions: Predictions,
     truth: Truth,
     *,
-    clips: Clips = None,
-    highest_mean: Highest = None,
     highest_std: Highest = None,
-    view: View = "front",
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    maps: MapOptions,
     files: FileOptions,
     page: PageOptions,
 ) -> None:
@@ -204,43 +219,25 @@ def heatmap(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
-        clips: clips to count (default: all that truth and methods have)
-        highest_mean: end of the mean's scale in the unit shown
         highest_std: end of the standard deviation's scale
-        view: camera
-        workers: clips read at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        maps: which clips, and how they are shown.
         files: what is drawn.
         page: how it is printed.
     """
-    check_scheduler(scheduler)
+    check_scheduler(maps.scheduler)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_heatmap
 
-    notes = draw_heatmap(
-        material,
-        material.choose(clips),
-        page.output,
-        paper=paper,
-        view=view,
-        highest=(highest_mean, highest_std),
-        workers=workers,
-        scheduler=scheduler,
-    )
-    report(page.output, notes)
+    draw_maps(draw_heatmap, material, paper, page, maps, highest_std)
 
 
 def error(
     predictions: Predictions,
     truth: Truth,
     *,
-    clips: Clips = None,
     statistic: Literal["mean", "max", "both"] = "mean",
-    highest_mean: Highest = None,
     highest_max: Highest = None,
-    view: View = "front",
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    maps: MapOptions,
     files: FileOptions,
     page: PageOptions,
 ) -> None:
@@ -249,35 +246,42 @@ def error(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
-        clips: clips to count (default: all that truth and methods have)
         statistic: over frames
-        highest_mean: end of the mean's scale in the unit shown
         highest_max: end of the maximum's scale
-        view: camera
-        workers: clips read at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        maps: which clips, and how they are shown.
         files: what is drawn.
         page: how it is printed.
     """
     refuse_idle(
         f"has no effect on --statistic {statistic}",
-        highest_mean=statistic == "max" and highest_mean is not None,
+        highest_mean=statistic == "max" and maps.highest_mean is not None,
         highest_max=statistic == "mean" and highest_max is not None,
     )
-    check_scheduler(scheduler)
+    check_scheduler(maps.scheduler)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_error
 
-    notes = draw_error(
+    draw_maps(partial(draw_error, statistic=statistic), material, paper, page, maps, highest_max)
+
+
+def draw_maps(
+    draw: Callable[..., list[str]],
+    material: FigureData,
+    paper: Paper,
+    page: PageOptions,
+    maps: MapOptions,
+    highest: float | None,
+) -> None:
+    """Draw maps of vertices, whose second row has the scale that ends at ``highest``, and report the file."""
+    notes = draw(
         material,
-        material.choose(clips),
+        material.choose(maps.clips),
         page.output,
         paper=paper,
-        view=view,
-        statistic=statistic,
-        highest=(highest_mean, highest_max),
-        workers=workers,
-        scheduler=scheduler,
+        view=maps.view,
+        highest=(maps.highest_mean, highest),
+        workers=maps.workers,
+        scheduler=maps.scheduler,
     )
     report(page.output, notes)
 

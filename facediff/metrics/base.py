@@ -279,7 +279,7 @@ class UpdateOptions(TypedDict, total=False):
     clip_names: Sequence[str] | None
 
 
-_PACKED = {each.__name__: each for each in (ProcessOptions, FiniteOptions, SequenceOptions, UpdateOptions)}
+_PACKED = {options.__name__: options for options in (ProcessOptions, FiniteOptions, SequenceOptions, UpdateOptions)}
 
 
 def _full_signature(cls: type, name: str) -> inspect.Signature:
