@@ -168,46 +168,18 @@ class Chromium:
         self._profile.cleanup()
 
 
-class Page:
-    """A page in a tab of its own. What it logs, throws and asks for is kept from its first moment on."""
+class Frame:
+    """A document in which scripts are evaluated: that of a page, or of a frame within one.
 
-    def __init__(self, browser: Chromium, url: str, width: int, height: int, dark: bool, scale: float) -> None:
-        self._browser = browser
-        self.problems: list[str] = []
-        self.requests: list[str] = []
-        self._target = browser.send("Target.createTarget", url="about:blank")["targetId"]
-        self._session = browser.send("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
-        browser.listeners[self._session] = self._hear
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.send(f"{domain}.enable")
-        self.resize(width, height, scale)
-        self.send(
-            "Emulation.setEmulatedMedia",
-            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
-        )
-        self.send("Page.navigate", url=url)
+    Args:
+        browser: it runs in.
+        session: of the process that shows it.
+        world: number of the context that scripts run in; None for the document's own.
+        problems: what went wrong in it so far, for errors.
+    """
 
-    def _hear(self, message: dict[str, Any]) -> None:
-        method, told = message["method"], message["params"]
-        if method == "Runtime.exceptionThrown":
-            details = told["exceptionDetails"]
-            self.problems.append(str(details.get("exception", {}).get("description", details["text"])))
-        elif method == "Log.entryAdded" and told["entry"]["level"] == "error":
-            self.problems.append(told["entry"]["text"])
-        elif method == "Runtime.consoleAPICalled" and told["type"] in ("error", "assert"):
-            self.problems.append(" ".join(str(each.get("value")) for each in told["args"]))
-        elif method == "Network.requestWillBeSent":
-            self.requests.append(told["request"]["url"])
-
-    def send(self, method: str, **parameters: object) -> Result:
-        """Send a command of the protocol to this page."""
-        return self._browser.send(method, self._session, **parameters)
-
-    def resize(self, width: int, height: int, scale: float = 1) -> None:
-        """Give the window another size."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
-        )
+    def __init__(self, browser: Chromium, session: str, world: int | None, problems: list[str]) -> None:
+        self._browser, self._session, self._world, self.problems = browser, session, world, problems
 
     def evaluate(self, script: str) -> Result:
         """Value of a JavaScript expression, awaited if it is a promise.
@@ -215,7 +187,10 @@ class Page:
         Raises:
             BrowserError: with what it throws.
         """
-        result = self.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        context = {} if self._world is None else {"contextId": self._world}
+        result = self._browser.send(
+            "Runtime.evaluate", self._session, expression=script, awaitPromise=True, returnByValue=True, **context
+        )
         if "exceptionDetails" in result:
             raise BrowserError(json.dumps(result["exceptionDetails"])[:2000])
         return result["result"].get("value")
@@ -231,6 +206,74 @@ class Page:
             if time.monotonic() > end:
                 raise BrowserError(f"not in {timeout:g} s: {condition}; {self.problems[:3]}")
             time.sleep(0.03)
+
+
+class Page(Frame):
+    """A page in a tab of its own. What it logs, throws and asks for is kept from its first moment on."""
+
+    def __init__(self, browser: Chromium, url: str, width: int, height: int, dark: bool, scale: float) -> None:
+        self.requests: list[str] = []
+        self._frame_sessions: list[str] = []  # of frames that live in processes of their own
+        self._target = browser.send("Target.createTarget", url="about:blank")["targetId"]
+        session = browser.send("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
+        super().__init__(browser, session, None, [])
+        browser.listeners[self._session] = self._receive
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.send(f"{domain}.enable")
+        self.resize(width, height, scale)
+        self.send(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
+        )
+        self.send("Page.navigate", url=url)
+
+    def _receive(self, message: dict[str, Any]) -> None:
+        method, told = message["method"], message["params"]
+        if method == "Runtime.exceptionThrown":
+            details = told["exceptionDetails"]
+            self.problems.append(str(details.get("exception", {}).get("description", details["text"])))
+        elif method == "Log.entryAdded" and told["entry"]["level"] == "error":
+            self.problems.append(told["entry"]["text"])
+        elif method == "Runtime.consoleAPICalled" and told["type"] in ("error", "assert"):
+            self.problems.append(" ".join(str(each.get("value")) for each in told["args"]))
+        elif method == "Network.requestWillBeSent":
+            self.requests.append(told["request"]["url"])
+        elif method == "Target.attachedToTarget" and told["targetInfo"]["type"] == "iframe":
+            self._browser.listeners[told["sessionId"]] = self._receive
+            self._frame_sessions.append(told["sessionId"])
+
+    def send(self, method: str, **parameters: object) -> Result:
+        """Send a command of the protocol to this page."""
+        return self._browser.send(method, self._session, **parameters)
+
+    def resize(self, width: int, height: int, scale: float = 1) -> None:
+        """Give the window another size."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
+        )
+
+    def frame(self) -> Frame:
+        """The page's only frame, as soon as it is there.
+
+        Raises:
+            BrowserError: if there is none in time.
+        """
+        # Until its document has loaded, a frame may still move to another process.
+        self.wait_for("document.readyState === 'complete' && document.querySelector('iframe')")
+        # Newer browsers run frames of other origins in processes of their own, which are attached one by one; in older
+        # ones, and for the page's own origin, frames stand in the page's tree.
+        self.send("Target.setAutoAttach", autoAttach=True, waitForDebuggerOnStart=False, flatten=True)
+        end = time.monotonic() + 30.0
+        while time.monotonic() < end:
+            if self._frame_sessions:
+                for domain in ("Runtime", "Log", "Network"):
+                    self._browser.send(f"{domain}.enable", self._frame_sessions[-1])
+                return Frame(self._browser, self._frame_sessions[-1], None, self.problems)
+            if children := self.send("Page.getFrameTree")["frameTree"].get("childFrames"):
+                world = self.send("Page.createIsolatedWorld", frameId=children[0]["frame"]["id"])
+                return Frame(self._browser, self._session, world["executionContextId"], self.problems)
+            time.sleep(0.03)
+        raise BrowserError("the page's frame did not appear in 30 s")
 
     def press(self, key: str) -> None:
         """Press a key on what has the focus."""

@@ -2,37 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
 
 import facediff
 from tests.fakes.clicks import FRAMES, RATE, clicks
-from tools.browser.chromium import Chromium, Page
-
-
-class Frame:
-    """The frame of a notebook's output: a world of its own, to which the notebook's scripts have no access."""
-
-    def __init__(self, page: Page) -> None:
-        self.page = page
-        page.wait_for("document.querySelector('iframe')")
-        time.sleep(0.2)
-        (child,) = page.send("Page.getFrameTree")["frameTree"]["childFrames"]
-        made = page.send("Page.createIsolatedWorld", frameId=child["frame"]["id"])
-        self.world = made["executionContextId"]
-
-    def evaluate(self, script: str) -> object:
-        found = self.page.send("Runtime.evaluate", expression=script, contextId=self.world, returnByValue=True)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
-
-    def wait_for(self, condition: str) -> None:
-        end = time.monotonic() + 30
-        while not self.evaluate(condition):
-            assert time.monotonic() < end, f"{condition}; {self.page.problems}"
-            time.sleep(0.03)
+from tools.browser.chromium import Chromium
 
 
 @pytest.mark.parametrize("kind", ["animation", "comparison"])
@@ -42,16 +18,16 @@ def test_output_of_a_notebook_plays_by_itself(kind: str, browser: Chromium, tmp_
     notebook = tmp_path / "notebook.html"
     notebook.write_text(f"<!doctype html><title>notebook</title><body>{shown._repr_html_()}", encoding="utf-8")
     page = browser.open(notebook.as_uri(), width=900, height=640)
-    frame = Frame(page)
+    frame = page.frame()
     frame.wait_for(f"document.getElementById('frame')?.textContent === 'frame 0 / {FRAMES - 1}'")
     frame.wait_for("sound.readyState >= 3")
-    assert abs(float(str(frame.evaluate("sound.duration"))) - FRAMES / RATE) < 0.01
+    assert abs(frame.evaluate("sound.duration") - FRAMES / RATE) < 0.01
     assert frame.evaluate("document.querySelectorAll('.panel').length") == (1 if kind == "animation" else 2)
     assert frame.evaluate("document.getElementById('heat').hidden") is (kind == "animation")
     frame.evaluate("document.getElementById('play').click()")
     frame.wait_for("sound.currentTime > 0.5 && !sound.paused")
     frame.wait_for("parseInt(document.getElementById('frame').textContent.slice(6)) > 12")
-    # The page is a stranger to the notebook, and asks nobody for anything.
+    # The frame has no access to the notebook, and loads nothing.
     assert page.evaluate("document.querySelector('iframe').contentDocument") is None
     assert page.problems == []
     assert {url.partition(":")[0] for url in page.requests} <= {"file", "blob"}
