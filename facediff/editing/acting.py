@@ -40,9 +40,9 @@ class Acting(ABC):
 
     look_ahead: float = 0.0
 
-    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         """Let every constructor refuse options that are out of range."""
-        super().__init_subclass__(**words)
+        super().__init_subclass__(**options)
         if "__init__" in vars(cls):
             cls.__init__ = checks_arguments(cls.__init__, "acting")  # type: ignore[method-assign]
 
@@ -232,14 +232,14 @@ class _ProsodyPerformer(Performer):
 
     def _up_to(self, frames: int) -> Acted:
         """The values of frames up to a number, and forget what no later frame depends on."""
-        found = [self._of(frame / self.frame_rate) for frame in range(self._frames, frames)]
+        values = [self._of(frame / self.frame_rate) for frame in range(self._frames, frames)]
         self._frames = max(frames, self._frames)
         over = self._frames / self.frame_rate - LONGEST
         for gestures in self._planned:
             # The latest one stays: the next one keeps a distance from it.
             while len(gestures) > 1 and gestures[0][0] < over:
                 gestures.pop(0)
-        return np.array(found, np.float64).reshape(-1, 5)
+        return np.array(values, np.float64).reshape(-1, 5)
 
     def _of(self, now: float) -> list[float]:
         """The values at a time."""
@@ -249,7 +249,7 @@ class _ProsodyPerformer(Performer):
             share * sum(math.sin(2 * math.pi * rate * now + phase) for rate, phase in zip(WAVES, phases, strict=True))
             for share, phases in zip(DRIFTS, self._phases, strict=True)
         ]
-        pitch, yaw, roll = (drift * each / len(WAVES) for each in wander)
+        pitch, yaw, roll = (drift * angle / len(WAVES) for angle in wander)
         pitch += options.nods * self._together(self._nods, NOD, now)
         for time, turn, tilt in self._turns:
             far = TURN_SHARE * options.nods * gesture(now - time, TURN)

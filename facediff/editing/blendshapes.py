@@ -129,30 +129,30 @@ class Weights:
             >>> curve.at_rate(60.0).values.ravel().tolist()
             [0.0, 0.5, 1.0]
         """
-        at = np.arange(len(self.values)) / self.frame_rate
+        old_times = np.arange(len(self.values)) / self.frame_rate
         # The small share keeps a frame that rounding puts just after the end.
-        wanted = np.arange(int(at[-1] * frame_rate + 1e-6) + 1) / frame_rate
+        new_times = np.arange(int(old_times[-1] * frame_rate + 1e-6) + 1) / frame_rate
 
-        def interpolated(of: Array) -> Array:
-            return np.interp(wanted, at, of).astype(np.float64)
+        def interpolated(values: Array) -> Array:
+            return np.interp(new_times, old_times, values).astype(np.float64)
 
         return replace(
             self,
-            values=np.stack([interpolated(of) for of in self.values.T], axis=1),
+            values=np.stack([interpolated(values) for values in self.values.T], axis=1),
             residual_rms_mm=interpolated(self.residual_rms_mm),
             residual_max_mm=interpolated(self.residual_max_mm),
             frame_rate=frame_rate,
-            head=None if self.head is None else np.stack([interpolated(of) for of in self.head.T], axis=1),
+            head=None if self.head is None else np.stack([interpolated(values) for values in self.head.T], axis=1),
         )
 
     def curves(self, tolerance: float) -> dict[str, tuple[list[float], list[float]]]:
         """Times in seconds and weights of the keys that are enough for each curve by itself, see :func:`key_frames`."""
-        found = {}
+        curves = {}
         for name, curve in zip(self.names, self.values.T, strict=True):
             keys = key_frames(curve[:, None], tolerance)
             times, weights = keys / self.frame_rate, curve[keys]
-            found[name] = ([round(float(time), 6) for time in times], [round(float(one), 6) for one in weights])
-        return found
+            curves[name] = ([round(float(time), 6) for time in times], [round(float(one), 6) for one in weights])
+        return curves
 
     @ranges.checked
     def save(self, path: str | Path, *, plain: bool = False, key_tolerance: ranges.KeyTolerance = 0.0) -> Path:
@@ -228,14 +228,14 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     tolerance = options.tolerance * scale
     if options.sparsity > 0:
         around = max(1, round(AROUND * animation.frame_rate))
-        found, converged = minimise_sparse(
+        scaled_weights, converged = minimise_sparse(
             problem, options.sparsity * scale, tolerance, options.max_iterations, frames_around=around
         )
     else:
-        found, converged = minimise(problem, tolerance, options.max_iterations)
+        scaled_weights, converged = minimise(problem, tolerance, options.max_iterations)
     values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
     # Division may lead past a bound by a rounding error.
-    values[:, moving.places] = np.clip(found / scale, options.lower, options.upper)
+    values[:, moving.places] = np.clip(scaled_weights / scale, options.lower, options.upper)
     rms, most = _residuals(animation, moving, values[:, moving.places])
     millimetres = 1000.0 * metres_per_unit(animation.unit)
     remaining = float(np.sqrt(np.square(rms).mean()))
@@ -461,11 +461,11 @@ def live_link_rotations(weights: Weights) -> Array:
     Epic's plug-in for ARKit fills these columns with yaw, pitch and roll in degrees over 180; yaw and roll are positive
     to the face's own left, pitch upwards.
     """
-    found = np.zeros((len(weights.values), len(ROTATIONS)))
+    rotations = np.zeros((len(weights.values), len(ROTATIONS)))
     if weights.head is not None:
         pitch, yaw, roll = np.rad2deg(weights.head).T
-        found[:, :3] = np.stack([yaw, -pitch, -roll], axis=1) / 180
-    return found
+        rotations[:, :3] = np.stack([yaw, -pitch, -roll], axis=1) / 180
+    return rotations
 
 
 def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:

@@ -94,8 +94,8 @@ def minimise_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations
         np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
         np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
     )
-    found, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
-    positive, negative = np.split(found, 2, axis=1)
+    both_parts, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
+    positive, negative = np.split(both_parts, 2, axis=1)
     return positive - negative
 
 
@@ -137,8 +137,8 @@ def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask
     while length > SHORTEST:
         following = problem.clip(x + length * direction)
         moved = following - x
-        wanted = length * promise - float((slope * moved)[held].sum())
-        if problem.change(slope, moved) <= -SUFFICIENT * wanted:
+        promised_decrease = length * promise - float((slope * moved)[held].sum())
+        if problem.change(slope, moved) <= -SUFFICIENT * promised_decrease:
             return following if moved.any() else None
         length /= 2
     return None
@@ -253,12 +253,12 @@ class Pivoting:
                 self._inverses.popitem(last=False)
         else:
             self._inverses.move_to_end(key)
-        found = inverse @ goal
-        x[free] = found + inverse @ (goal - block @ found)  # once more for what rounding left
+        solution = inverse @ goal
+        x[free] = solution + inverse @ (goal - block @ solution)  # once more for what rounding left
         return x
 
     def _carefully(self, right: Array, lower: Array, upper: Array) -> Array:
         problem = Problem(self.matrix, right[None], 0.0, lower, upper)
-        found = minimise(problem, np.full(len(right), MISSED), self.max_iterations)[0][0]
-        self._side = np.where(found <= lower, -1, np.where(found >= upper, 1, 0)).astype(np.int8)
-        return found
+        solution = minimise(problem, np.full(len(right), MISSED), self.max_iterations)[0][0]
+        self._side = np.where(solution <= lower, -1, np.where(solution >= upper, 1, 0)).astype(np.int8)
+        return solution

@@ -83,11 +83,15 @@ def _carried(
     from facediff.synthetic.face import build_face
 
     if faces is not None and len(faces):
-        found = correspond(neutral, build_face().faces, template, faces)
-        laid = found.similarity.inverse().apply(found.target_vertices)
-        seen = find_features(laid, found.target_faces, find_features(found.source_vertices, found.source_faces))
-        if seen is not None and not found.fits_badly:
-            return carry_displacements(found, fields)
+        correspondence = correspond(neutral, build_face().faces, template, faces)
+        laid = correspondence.similarity.inverse().apply(correspondence.target_vertices)
+        features = find_features(
+            laid,
+            correspondence.target_faces,
+            find_features(correspondence.source_vertices, correspondence.source_faces),
+        )
+        if features is not None and not correspondence.fits_badly:
+            return carry_displacements(correspondence, fields)
     raise OptionError.naming(
         'brows: where they are is not known for this face; list their vertices as "brows" in the file of {eyes}, or '
         "give a mesh with triangles whose mouth can open"

@@ -65,9 +65,9 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     reach = float(np.linalg.norm(shape, axis=-1).max()) or 1.0
     amounts = np.zeros(len(excess))
     for bump in bumps:
-        wanted = bump * excess
-        most = wanted.max(initial=0) * reach
-        amounts = np.maximum(amounts, wanted * min(1.0, budget / 1000 * metre / most) if most else 0)
+        amount = bump * excess
+        most = amount.max(initial=0) * reach
+        amounts = np.maximum(amounts, amount * min(1.0, budget / 1000 * metre / most) if most else 0)
     changed = np.flatnonzero(amounts)
     if not len(changed):
         return animation

@@ -158,7 +158,7 @@ class ControlledFace:
         """
         controls = self.controls
         times = (start + np.arange(frames)) / frame_rate
-        found = (
+        curves = (
             {}
             if self.direction is None
             else {
@@ -168,14 +168,14 @@ class ControlledFace:
             }
         )
         factors: dict[str, Amount] = dict(self.factors)
-        factors |= {name.partition(".")[2] or "all": found[name] for name in self._keys("expressiveness")}
+        factors |= {name.partition(".")[2] or "all": curves[name] for name in self._keys("expressiveness")}
 
         def of_option(name: str, number: float | None) -> Amount | None:
-            return found.get(name, number)
+            return curves.get(name, number)
 
-        poses: dict[str, Array] = {name: found[name] for name in ACTED if name in found}
+        poses: dict[str, Array] = {name: curves[name] for name in ACTED if name in curves}
         if acted is not None:
-            strength = found.get("acting", np.ones(frames))
+            strength = curves.get("acting", np.ones(frames))
             for name, values in zip(ACTED, acted.T, strict=True):
                 # A blink is whole or not at all: its strength is how often it happens.
                 values = values * (strength > 0 if name == "lids" else strength)
@@ -229,8 +229,8 @@ class ControlledFace:
         animation = self._with_lids(animation, amounts, seed)
         animation = self._with_head(animation, amounts, seed)
         if acted is not None:
-            words = f"brow and head acting ({self.controls.acting}, seed {seed})"
-            animation = noted(animation, animation.vertices, PROCEDURAL, words)
+            note = f"brow and head acting ({self.controls.acting}, seed {seed})"
+            animation = noted(animation, animation.vertices, PROCEDURAL, note)
         return self._with_direction(animation)
 
     def _with_lids(self, animation: Animation, amounts: Amounts, seed: int) -> Animation:
@@ -264,19 +264,19 @@ class ControlledFace:
         """The direction in the metadata, next to what the animation was made with; that a model follows is there."""
         if self.direction is None:
             return animation
-        name, made = METADATA, self.direction
+        name, direction = METADATA, self.direction
         if METADATA in animation.metadata:
             try:
                 before = Direction.parse(animation.metadata[METADATA], METADATA)
             except FaceDiffError:  # of a file from elsewhere
                 return animation
-            if set(made.keys) <= set(before.keys):
+            if set(direction.keys) <= set(before.keys):
                 return animation
-            if set(made.channels) & set(before.channels):  # both have changed it, one after the other
+            if set(direction.channels) & set(before.channels):  # both have changed it, one after the other
                 name = f"{METADATA}, afterwards"
             else:
-                made = Direction((*before.keys, *made.keys), METADATA)
-        return replace(animation, metadata={**animation.metadata, name: made.text()})
+                direction = Direction((*before.keys, *direction.keys), METADATA)
+        return replace(animation, metadata={**animation.metadata, name: direction.text()})
 
 
 def apply_controls(animation: Animation, controls: AnimationControls, *, seed: int = 0) -> Animation:

@@ -102,23 +102,23 @@ def correspond(
     target = run_alike(source, target)
     face = target if shown is None else Surface(target.vertices, target.faces[np.asarray(shown, np.int64)])
     back, features, seen = placed(source, face, marks)
-    both = known = None if features is None or seen is None else (features, seen)
+    both = bending = None if features is None or seen is None else (features, seen)
     laid = Surface(back.apply(target.vertices), target.faces)
-    if known is not None and _one_surface(source, Surface(laid.vertices, face.faces)):
-        known = None  # what lies on the other mesh already need not be bent, and is exact to rounding
-    places = partners(source, laid, known)
-    bent = _bent(source, laid, places, marks, known)
-    found = places.nearest(bent.vertices, bent.normals)
+    if bending is not None and _one_surface(source, Surface(laid.vertices, face.faces)):
+        bending = None  # what lies on the other mesh already need not be bent, and is exact to rounding
+    places = partners(source, laid, bending)
+    bent = _bent(source, laid, places, marks, bending)
+    nearest_points = places.nearest(bent.vertices, bent.normals)
     # Bending decides which place belongs to a vertex. The distance of the meshes is measured before bending, and the
     # trust in a place by the distance that is left after it.
-    away = np.linalg.norm(laid.vertices - found.points, axis=1) / source.size
-    left = found.distances / source.size
-    trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((found.cosines + 0.3) / 0.6, 0.0, 1.0)
+    away = np.linalg.norm(laid.vertices - nearest_points.points, axis=1) / source.size
+    left = nearest_points.distances / source.size
+    trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((nearest_points.cosines + 0.3) / 0.6, 0.0, 1.0)
     share = np.clip((FAR - left) / (FAR - CLOSE), 0.0, 1.0)
-    corners, weights = found.corners, found.weights
-    if known is not None:
+    corners, weights = nearest_points.corners, nearest_points.weights
+    if bending is not None:
         # Which side of an opening a vertex belongs to is known there: no neighbour on the other side is asked.
-        sided = (known[1].codes > 0) & (left < FAR)
+        sided = (bending[1].codes > 0) & (left < FAR)
         trust[sided] = np.maximum(trust[sided], 1.0 - left[sided] / FAR)
     if both is not None:
         loose = loose_pieces(source, laid, *both, places.alone)
@@ -285,13 +285,13 @@ class Partners:
 
     def nearest(self, points: Array, normals: Array) -> Nearest:
         """The nearest point of each target vertex (Vt, 3) on its part of the source."""
-        found = [nearest(surface, points[some], normals[some], self.size) for some, surface in self.parts]
+        by_part = [nearest(surface, points[some], normals[some], self.size) for some, surface in self.parts]
         order = np.argsort(np.concatenate([some for some, _ in self.parts]))
         names = (field.name for field in fields(Nearest))
-        return Nearest(**{name: np.concatenate([getattr(part, name) for part in found])[order] for name in names})
+        return Nearest(**{name: np.concatenate([getattr(part, name) for part in by_part])[order] for name in names})
 
 
-def partners(source: Surface, laid: Surface, known: tuple[Features, Features] | None = None) -> Partners:
+def partners(source: Surface, laid: Surface, features: tuple[Features, Features] | None = None) -> Partners:
     """Pair the pieces of a target that is aligned with a source with the source's.
 
     Partners are about as large and lie about in one place; of all pairings, the one with the least sum of distances
@@ -310,14 +310,13 @@ def partners(source: Surface, laid: Surface, known: tuple[Features, Features] | 
     limit = NEAR * np.minimum(extents[:, None], sizes[None])
     cost = np.where(alike & (away < limit), away / limit, 1e6)
     rest = source
-    if known is not None:
+    if features is not None:
         is_skin = [
-            np.isin(names, label[features.skin])
-            for names, label, features in zip((kept, others), labels, known, strict=True)
+            np.isin(names, label[own.skin]) for names, label, own in zip((kept, others), labels, features, strict=True)
         ]
         cost[is_skin[1]] = 1e6
         cost[:, is_skin[0]] = 1e6
-        rest = Surface(source.vertices, source.faces[known[0].skin[source.faces[:, 0]]])
+        rest = Surface(source.vertices, source.faces[features[0].skin[source.faces[:, 0]]])
     # Every piece may also stay without a partner, which costs as much as a partner at the limit.
     cost = np.concatenate([cost, np.ones((len(goals),) * 2)], axis=1)
     parts, left = [], np.ones(len(laid.vertices), bool)
@@ -329,8 +328,8 @@ def partners(source: Surface, laid: Surface, known: tuple[Features, Features] | 
     alone = np.flatnonzero(left)
     alone = alone[np.argsort(labels[1][alone], kind="stable")]
     cuts = np.flatnonzero(np.diff(labels[1][alone])) + 1
-    if known is not None:
-        codes, sides = known[1].codes, known[0].codes[rest.faces]
+    if features is not None:
+        codes, sides = features[1].codes, features[0].codes[rest.faces]
         for code in np.unique(codes[left & (codes > 0)]):
             some = np.flatnonzero(left & (codes == code))
             faces = rest.faces[(sides != OPPOSITE[code]).all(axis=1)]
@@ -383,12 +382,14 @@ def _bent(
     laid: Surface,
     places: Partners,
     marks: Landmarks | None,
-    known: tuple[Features, Features] | None,
+    features: tuple[Features, Features] | None,
 ) -> Surface:
     """The target, bent onto the source."""
     edges = edges_of(laid.faces)
-    base = laid if known is None else Surface(laid.vertices + _warp(laid.vertices, *known), laid.faces)
-    rim, rim_pull = (np.zeros(0, np.int64), np.zeros((0, 3))) if known is None else _rims(base.vertices, laid, *known)
+    base = laid if features is None else Surface(laid.vertices + _warp(laid.vertices, *features), laid.faces)
+    rim, rim_pull = (
+        (np.zeros(0, np.int64), np.zeros((0, 3))) if features is None else _rims(base.vertices, laid, *features)
+    )
     held, held_pull, held_trust = _held(source, base, marks)
     bent = base
     for stiffness in STIFFNESSES:
@@ -422,10 +423,10 @@ def _held(source: Surface, base: Surface, marks: Landmarks | None) -> tuple[Indi
     return held[some], pull[some] / total[some, None], LANDMARK_TRUST * np.minimum(total[some], 1.0)
 
 
-def _sides(known: tuple[Features, Features]) -> list[tuple[int, Array, Array, Indices, float]]:
+def _sides(features: tuple[Features, Features]) -> list[tuple[int, Array, Array, Indices, float]]:
     """Per side of an opening of both: code, where the target's curve belongs, the curve, vertices along it, width."""
-    found = []
-    for index, (one, two) in enumerate(zip(known[0].openings, known[1].openings, strict=True)):
+    sides = []
+    for index, (one, two) in enumerate(zip(features[0].openings, features[1].openings, strict=True)):
         if one is None or two is None:
             continue
         for side, goal, own, seeds in (
@@ -435,8 +436,8 @@ def _sides(known: tuple[Features, Features]) -> list[tuple[int, Array, Array, In
             # Curves are known to a pixel or two: what lies nearer is left to the nearest points.
             apart = np.linalg.norm(goal - own, axis=1, keepdims=True)
             step = (goal - own) * np.clip(1.0 - KNOWN_TO * two.width / np.maximum(apart, 1e-12), 0.0, None)
-            found.append((2 * index + side, own + step, own, seeds, two.width))
-    return found
+            sides.append((2 * index + side, own + step, own, seeds, two.width))
+    return sides
 
 
 def _warp(points: Array, features: Features, seen: Features) -> Array:

@@ -86,11 +86,11 @@ def channel_of(name: str) -> Channel:
     """
     first, dot, part = name.partition(".")
     channel = CHANNELS.get(first)
-    known = [each for each in CHANNELS if not CHANNELS[each].parts]
-    known += [f"{each}.{part}" for each in CHANNELS for part in CHANNELS[each].parts]
+    known_names = [channel_name for channel_name in CHANNELS if not CHANNELS[channel_name].parts]
+    known_names += [f"{channel_name}.{part}" for channel_name in CHANNELS for part in CHANNELS[channel_name].parts]
     fits = channel is not None and (part in channel.parts if channel.parts else not dot or (channel.regions and part))
     if channel is None or not fits:
-        raise FaceDiffError(f"channel {shown(name)}: {choices(name, known)}")
+        raise FaceDiffError(f"channel {shown(name)}: {choices(name, known_names)}")
     return channel
 
 
@@ -130,17 +130,17 @@ class Key:
         elif not isinstance(self.value, str) or not self.value.strip():
             raise FaceDiffError(f"value {shown(self.value)}: expected a text, as --{self.channel} takes it")
         if self.interpolation not in get_args(Interpolation):
-            known = choices(str(self.interpolation), get_args(Interpolation))
-            raise FaceDiffError(f"interpolation {shown(self.interpolation)}: {known}")
+            remedy = choices(str(self.interpolation), get_args(Interpolation))
+            raise FaceDiffError(f"interpolation {shown(self.interpolation)}: {remedy}")
         if self.slope is not None:
             _number("slope", self.slope, SLOPES)
             if limits is None:
                 raise FaceDiffError(f"slope {shown(self.slope)}: {self.channel} is no number; omit it")
         # Numbers are floats from here on, also where a whole number or one of NumPy's was given.
         for name in ("time", "value", "slope"):
-            given = getattr(self, name)
-            if given is not None and not isinstance(given, str):
-                object.__setattr__(self, name, float(given))
+            number = getattr(self, name)
+            if number is not None and not isinstance(number, str):
+                object.__setattr__(self, name, float(number))
 
 
 def _number(name: str, value: object, limits: Range) -> None:
@@ -176,22 +176,22 @@ class Direction:
         if len(self.keys) > MOST_KEYS:
             raise FaceDiffError(f"{self.source}: holds {len(self.keys)} keys; expected at most {MOST_KEYS}")
         ordered = sorted(self.keys, key=lambda key: key.time)
-        found: set[tuple[str, float]] = set()
+        taken: set[tuple[str, float]] = set()
         for key in ordered:
-            if (key.channel, key.time) in found:
+            if (key.channel, key.time) in taken:
                 raise FaceDiffError(
                     f"{self.source}: time {key.time:g}: {key.channel} has two keys then; keep one of them"
                 )
-            found.add((key.channel, key.time))
+            taken.add((key.channel, key.time))
         object.__setattr__(self, "keys", tuple(ordered))
 
     @cached_property
     def channels(self) -> dict[str, tuple[Key, ...]]:
         """The keys of each channel in their order in time; channels in the order of their first keys."""
-        found: dict[str, list[Key]] = {}
+        by_channel: dict[str, list[Key]] = {}
         for key in self.keys:
-            found.setdefault(key.channel, []).append(key)
-        return {name: tuple(keys) for name, keys in found.items()}
+            by_channel.setdefault(key.channel, []).append(key)
+        return {name: tuple(keys) for name, keys in by_channel.items()}
 
     def under(self, name: str) -> dict[str, tuple[Key, ...]]:
         """The channels of one name, whatever follows the dot."""
@@ -292,10 +292,10 @@ class Direction:
             content = {"keys": content}
         if not isinstance(content, dict) or not isinstance(content.get("keys"), list):
             raise FaceDiffError(f'{source}: keys: expected an object with a list of rows called "keys"')
-        known = ("format", "version", "frame_rate", "keys")
+        fields = ("format", "version", "frame_rate", "keys")
         for name in content:
-            if name not in known:
-                raise FaceDiffError(f"{source}: {shown(name)}: {choices(str(name), known)}")
+            if name not in fields:
+                raise FaceDiffError(f"{source}: {shown(name)}: {choices(str(name), fields)}")
         if content.get("format", FORMAT) != FORMAT:
             raise FaceDiffError(f'{source}: format {shown(content["format"])}: expected "{FORMAT}"')
         if content.get("version", VERSION) != VERSION:
@@ -407,18 +407,18 @@ def _time(time: object, frame_rate: float | None) -> float:
     if not isinstance(time, str):
         _number("time", time, TIMES)
         return cast(float, time)
-    if not (found := _TIMECODE.fullmatch(time)):
+    if not (timecode := _TIMECODE.fullmatch(time)):
         try:
             return TIMES.read("time", time)
         except FaceDiffError as error:
             raise FaceDiffError(f"{error}, or a timecode such as 00:00:01:12") from error
-    hours, minutes, seconds = (int(number) for number in found.groups()[:3])
+    hours, minutes, seconds = (int(number) for number in timecode.groups()[:3])
     whole = 3600 * hours + 60 * minutes + seconds
-    if found[4] in ".,":
-        return whole + int(found[5]) / 10 ** len(found[5])
-    if frame_rate is not None and int(found[5]) >= math.ceil(frame_rate):
-        raise FaceDiffError(f"time {time}: has frame {found[5]} of {frame_rate:g} a second; expected a smaller one")
-    return whole + _seconds("time", int(found[5]), frame_rate)
+    if timecode[4] in ".,":
+        return whole + int(timecode[5]) / 10 ** len(timecode[5])
+    if frame_rate is not None and int(timecode[5]) >= math.ceil(frame_rate):
+        raise FaceDiffError(f"time {time}: has frame {timecode[5]} of {frame_rate:g} a second; expected a smaller one")
+    return whole + _seconds("time", int(timecode[5]), frame_rate)
 
 
 def _seconds(name: str, frame: object, frame_rate: float | None) -> float:
@@ -455,23 +455,23 @@ def curve(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = False) -> 
     span = np.maximum(when[following] - when[place], 1e-12)
     t = np.clip((now - when[place]) / span, 0.0, 1.0)
     kinds = np.array([key.interpolation for key in keys])[place]
-    found = np.array(first)
+    values_at = np.array(first)
     linear = kinds == "linear"
-    found[linear] = (first + t * (last - first))[linear]
+    values_at[linear] = (first + t * (last - first))[linear]
     smooth = kinds == "smooth"
     if smooth.any():
         tangents = slopes(keys)
         t, span, first, last = t[smooth], span[smooth], first[smooth], last[smooth]
         leaving, arriving = span * tangents[place[smooth]], span * tangents[following[smooth]]
         # Written as a distance from the first value, so that equal values give that value to the last bit.
-        found[smooth] = (
+        values_at[smooth] = (
             first + (3 * t**2 - 2 * t**3) * (last - first) + (t**3 - 2 * t**2 + t) * leaving + (t**3 - t**2) * arriving
         )
     if eased:
         step = kinds == "step"
-        found[step] += ((values[following] - values[place]) * _arriving(now, when, place, following))[step]
+        values_at[step] += ((values[following] - values[place]) * _arriving(now, when, place, following))[step]
     limits = channel_of(keys[0].channel).range
-    return found if limits is None else np.clip(found, limits.least, limits.most)
+    return values_at if limits is None else np.clip(values_at, limits.least, limits.most)
 
 
 def slopes(keys: Sequence[Key]) -> Array:
@@ -484,17 +484,17 @@ def slopes(keys: Sequence[Key]) -> Array:
     """
     when = np.asarray([key.time for key in keys], np.float64)
     values = np.asarray([float(key.value) for key in keys], np.float64)
-    found = np.zeros(len(keys))
+    key_slopes = np.zeros(len(keys))
     if len(keys) > 2:
         lines = np.diff(values) / np.diff(when)
         before, after = lines[:-1], lines[1:]
         middle = (values[2:] - values[:-2]) / (when[2:] - when[:-2])
         most = 3 * np.minimum(np.abs(before), np.abs(after))
-        found[1:-1] = np.where(before * after > 0, np.sign(middle) * np.minimum(np.abs(middle), most), 0.0)
-    given = [(index, key.slope) for index, key in enumerate(keys) if key.slope is not None]
-    for index, slope in given:
-        found[index] = slope
-    return found
+        key_slopes[1:-1] = np.where(before * after > 0, np.sign(middle) * np.minimum(np.abs(middle), most), 0.0)
+    own_slopes = [(index, key.slope) for index, key in enumerate(keys) if key.slope is not None]
+    for index, slope in own_slopes:
+        key_slopes[index] = slope
+    return key_slopes
 
 
 def text_shares(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = False) -> dict[str, Array]:
@@ -511,11 +511,11 @@ def text_shares(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = Fals
     share = np.where(kinds == "step", steps, np.where(kinds == "linear", t, 3 * t**2 - 2 * t**3))
     texts = list(dict.fromkeys(str(key.value) for key in keys))
     number = np.array([texts.index(str(key.value)) for key in keys])
-    found = {text: np.zeros(len(now)) for text in texts}
+    shares = {text: np.zeros(len(now)) for text in texts}
     for index, text in enumerate(texts):
         leaving, arriving = number[place] == index, number[following] == index
-        found[text] = np.where(leaving & arriving, 1.0, np.where(leaving, 1 - share, np.where(arriving, share, 0.0)))
-    return found
+        shares[text] = np.where(leaving & arriving, 1.0, np.where(leaving, 1 - share, np.where(arriving, share, 0.0)))
+    return shares
 
 
 def _places(when: Array, times: npt.ArrayLike) -> tuple[npt.NDArray[np.int64], Array]:

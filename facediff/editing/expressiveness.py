@@ -99,8 +99,8 @@ def scale_regions(
             share = np.clip((offsets[lids] * closing).sum(-1) / (closing**2).sum(-1), 0.0, 1.0)
             scaled[lids] += ((1.0 - factor[lids]) * share)[:, None] * closing
         vertices[index] = animation.template + scaled
-    words = ", ".join(f"{name} {in_words(value)}" for name, value in factors.items())
-    return noted(animation, vertices, EDITED, f"expressiveness ({words})")
+    scales = ", ".join(f"{name} {in_words(value)}" for name, value in factors.items())
+    return noted(animation, vertices, EDITED, f"expressiveness ({scales})")
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,11 +136,11 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
             f"{{eyes}} {path}: no such file; expected .json or .npz that says where lids and eyeballs are"
         )
     if path.suffix.lower() == ".npz":
-        found = read_arrays(path, name=f"eyes {path}")
-        names = sorted(name for name in found if name.startswith("eyeball"))
-        balls = tuple(_checked(path, found[name], len(template)) for name in names)
-        closing, neutral = found.get("closing"), found.get("neutral")
-        brows = _checked(path, found["brows"], len(template)) if "brows" in found else None
+        arrays = read_arrays(path, name=f"eyes {path}")
+        names = sorted(name for name in arrays if name.startswith("eyeball"))
+        balls = tuple(_checked(path, arrays[name], len(template)) for name in names)
+        closing, neutral = arrays.get("closing"), arrays.get("neutral")
+        brows = _checked(path, arrays["brows"], len(template)) if "brows" in arrays else None
     elif path.suffix.lower() == ".json":
         closing, neutral, balls, brows = _read_json(path, template)
     else:
@@ -181,8 +181,8 @@ def _read_json(
     neutral = _read_shape(path, content["neutral"]) if "neutral" in content else None
     brows = None
     if listed := content.get("brows"):
-        whole = listed if any(isinstance(each, str | list) for each in listed) else [listed]
-        brows = np.unique(np.concatenate([_indices(path, each, count) for each in whole]))
+        entries = listed if any(isinstance(entry, str | list) for entry in listed) else [listed]
+        brows = np.unique(np.concatenate([_indices(path, entry, count) for entry in entries]))
     if content.get("blinks"):
         total: Vertices = np.zeros((count, 3))
         for name in content["blinks"]:

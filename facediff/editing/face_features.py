@@ -127,29 +127,29 @@ class Seen:
         from scipy.sparse.csgraph import connected_components
 
         count = len(self.vertices)
-        made = np.arange(count)
+        welded = np.arange(count)
         border = border_edges(self.faces)
         if not len(border):
-            return made
+            return welded
         extent = max(float(np.ptp(self.vertices, axis=0).max()), np.finfo(float).tiny)
         rim = np.unique(border)
         _, first, names = np.unique(
             np.rint(self.vertices[rim] / (WELD * extent)), axis=0, return_index=True, return_inverse=True
         )
-        made[rim] = rim[first[names.reshape(-1)]]
-        if (made == np.arange(count)).all():
-            return made
+        welded[rim] = rim[first[names.reshape(-1)]]
+        if (welded == np.arange(count)).all():
+            return welded
         joined = coo_array((np.ones(len(border)), (border[:, 0], border[:, 1])), shape=(count, count))
         loops = connected_components(joined, directed=False)[1][rim]
         for name in np.flatnonzero(np.bincount(loops) >= 6):
             loop = rim[loops == name]
-            places, counts = np.unique(made[loop], return_counts=True)
+            places, counts = np.unique(welded[loop], return_counts=True)
             paired = np.count_nonzero(counts == 2)
             span = np.ptp(self.vertices[loop], axis=0)
             # Nearly all of its places occur twice, but for its two ends; and it is short and lies across.
             if paired >= 2 and len(places) - paired <= 4 and span.max() < 0.4 * extent and span[0] > 2 * span[1]:
-                made[loop] = loop
-        return made
+                welded[loop] = loop
+        return welded
 
     @cached_property
     def corners(self) -> Indices:
@@ -180,10 +180,10 @@ class Seen:
         both = both[both[:, 0] != both[:, 1]]
         lengths = np.linalg.norm(self.vertices[used[both[:, 0]]] - self.vertices[used[both[:, 1]]], axis=1)
         lengths = np.maximum(lengths, 1e-12)
-        made = csr_array((lengths, (both[:, 0], both[:, 1])), shape=(len(used),) * 2)
+        lengths_of_edges = csr_array((lengths, (both[:, 0], both[:, 1])), shape=(len(used),) * 2)
         rows = np.full(len(self.vertices), -1)
         rows[used] = np.arange(len(used))
-        return made, rows[self.welded]
+        return lengths_of_edges, rows[self.welded]
 
     def raster(
         self, kept: Indices, low: Array, step: float, columns: int, rows: int
@@ -313,7 +313,7 @@ class Seen:
         ]
         starts, row = np.unique(place[corners[0]], return_inverse=True)
         row = row.reshape(-1, 3)
-        found = np.full(len(limit), np.inf)
+        shortest = np.full(len(limit), np.inf)
         for begin in range(0, len(starts), 256):
             inside = (row >= begin) & (row < begin + 256)
             some = np.flatnonzero(inside.any(axis=1))
@@ -321,8 +321,8 @@ class Seen:
             for i in range(3):
                 own = some[inside[some, i]]
                 between = ways[(row[own, i] - begin)[:, None], place[corners[1][own]]]
-                found[own] = np.minimum(found[own], offsets[0][own, i] + (between + offsets[1][own]).min(axis=1))
-        return found
+                shortest[own] = np.minimum(shortest[own], offsets[0][own, i] + (between + offsets[1][own]).min(axis=1))
+        return shortest
 
     def _opening(self, pairs: Indices, first: Array, second: Array, above: Indices, below: Indices) -> Opening | None:
         """Both sides as curves: per column the highest upper and the lowest lower point, smoothed and resampled."""
@@ -339,11 +339,11 @@ class Seen:
         margin = limit + opening.width
         middle = opening.centre[:2]
         graph, place = self.graph(self.within(middle - margin, middle + margin))
-        found = []
+        ways = []
         for side, seeds in ((opening.upper, opening.upper_seeds), (opening.lower, opening.lower_seeds)):
             way = _ways_from(graph, place[seeds], _away(self.vertices[seeds], side), limit)
-            found.append(np.where(place >= 0, way[np.maximum(place, 0)], np.inf))
-        return found[0], found[1]
+            ways.append(np.where(place >= 0, way[np.maximum(place, 0)], np.inf))
+        return ways[0], ways[1]
 
     def completed(self, opening: Opening, expected: float) -> Opening:
         """The same with its corners: where the ways to both sides, which grow beyond the ends, become equal."""
@@ -490,13 +490,13 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
         expected: features of a face that lies in the same place, or its mouth; searched for everywhere if None.
     """
     seen = Seen(vertices, faces)
-    known = expected.mouth if isinstance(expected, Features) else expected
-    if known is None:
-        known = _anywhere(seen)
-        if known is None:
+    expected_mouth = expected.mouth if isinstance(expected, Features) else expected
+    if expected_mouth is None:
+        expected_mouth = _anywhere(seen)
+        if expected_mouth is None:
             return None
-    width = known.width
-    x, y, _ = known.centre
+    width = expected_mouth.width
+    x, y, _ = expected_mouth.centre
     skin, mouth = None, None
     for grown in (1.0, 1.6):
         window = SearchWindow(x, y, 1.1 * width * grown, 0.55 * width * grown, width)
@@ -508,7 +508,7 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
         return None
     mouth = seen.completed(mouth, width)
     if isinstance(expected, Features):
-        away = np.abs(mouth.centre - known.centre)[:2] / width
+        away = np.abs(mouth.centre - expected_mouth.centre)[:2] / width
         if (away > ASIDE).any():
             return None
     width = mouth.width
@@ -537,8 +537,8 @@ def _anywhere(seen: Seen) -> Opening | None:
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     window = SearchWindow(middle[0], middle[1], half[0], half[1], 0.3 * float(min(2 * half[0], 2 * half[1])))
     skin = seen.skin_at(window)
-    found = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
-    return None if found is None else seen.completed(found, window.expected)
+    mouth = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
+    return None if mouth is None else seen.completed(mouth, window.expected)
 
 
 def sides_of_pairs(vertices: Array, faces: Indices, pairs: Indices) -> Array:

@@ -60,12 +60,12 @@ class FitReport:
     @property
     def summary(self) -> str:
         """The figures on one line."""
-        words = []
+        figures = []
         if self.lip_ratio is not None and self.opened is not None:
-            words.append(f"lips {self.lip_ratio:.2f} of their widest gap at rest, {self.opened:.0%} as open")
-        words.append(f"{self.folded:.1%} of the triangles fold over")
-        words.append(f"{self.covered:.0%} of the motion is carried")
-        return ", ".join(words)
+            figures.append(f"lips {self.lip_ratio:.2f} of their widest gap at rest, {self.opened:.0%} as open")
+        figures.append(f"{self.folded:.1%} of the triangles fold over")
+        figures.append(f"{self.covered:.0%} of the motion is carried")
+        return ", ".join(figures)
 
 
 def refuse_poor(source: object, report: FitReport) -> None:
@@ -81,30 +81,30 @@ def refuse_poor(source: object, report: FitReport) -> None:
         )
 
 
-def check_fit(animation: Animation, made: Animation, found: Correspondence) -> FitReport:
+def check_fit(animation: Animation, carried: Animation, correspondence: Correspondence) -> FitReport:
     """Measure an animation that was carried to another mesh against the original.
 
     Args:
         animation: on the source mesh; with triangles.
-        made: the same on the target mesh.
-        found: the correspondence that carried it.
+        carried: the same on the target mesh.
+        correspondence: the correspondence that carried it.
     """
-    scale = found.similarity.scale
-    up = found.similarity.rotation @ np.array([0.0, 1.0, 0.0])
+    scale = correspondence.similarity.scale
+    up = correspondence.similarity.rotation @ np.array([0.0, 1.0, 0.0])
     frames = np.unique(np.linspace(0, len(animation.vertices) - 1, min(FRAMES, len(animation.vertices))).astype(int))
     lip_ratio = opened = torn = crossed = None
     faults = []
-    source = find_features(found.source_vertices, found.source_faces)
+    source = find_features(correspondence.source_vertices, correspondence.source_faces)
     if source is not None:
-        pairs = source.lips(found.source_vertices, LIPS)
+        pairs = source.lips(correspondence.source_vertices, LIPS)
         own = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
         mean = own.mean(axis=1)
         widest = int(mean[1:].argmax())
         frames = np.unique(np.append(frames, widest))
         opening = float(mean[1 + widest] - mean[0])
         if opening * metres_per_unit(animation.unit) > SPEAKS:
-            laid = found.similarity.inverse().apply(found.target_vertices)
-            target = find_features(laid, found.target_faces, source)
+            laid = correspondence.similarity.inverse().apply(correspondence.target_vertices)
+            target = find_features(laid, correspondence.target_faces, source)
             if target is None:
                 faults.append(
                     "no line between its lips was found: triangles close its mouth, or it lies elsewhere; cut a closed "
@@ -112,18 +112,26 @@ def check_fit(animation: Animation, made: Animation, found: Correspondence) -> F
                 )
             else:
                 facing = target.lips(laid, LIPS)
-                gaps = _gaps(np.stack([made.template, made.vertices[widest]]), facing)
+                gaps = _gaps(np.stack([carried.template, carried.vertices[widest]]), facing)
                 lip_ratio = float(gaps[0].mean() / max(gaps.mean(axis=1).max(), 1e-12))
                 opened = _opened(gaps[1] - gaps[0], scale * (own[1 + widest] - own[0]))
-                torn = _torn(animation, made, pairs, facing, widest, scale * found.similarity.rotation, scale * opening)
-                crossed = _crossed(animation, made, pairs, facing, frames, up, scale)
+                torn = _torn(
+                    animation,
+                    carried,
+                    pairs,
+                    facing,
+                    widest,
+                    scale * correspondence.similarity.rotation,
+                    scale * opening,
+                )
+                crossed = _crossed(animation, carried, pairs, facing, frames, up, scale)
                 faults += _lip_faults(
                     lip_ratio, max(LIP_RATIO, 1.3 * float(mean[0] / mean.max())), opened, torn, crossed
                 )
-    folded = _folded(made, found.target_faces, frames)
+    folded = _folded(carried, correspondence.target_faces, frames)
     if folded > FOLDED + _folded(animation, animation.triangles.astype(np.int64), frames):
         faults.append(f"{folded:.0%} of its moving triangles fold over")
-    covered = _covered(animation, found, frames)
+    covered = _covered(animation, correspondence, frames)
     if covered < COVERED:
         faults.append(f"it has a place for {covered:.0%} of the animation's motion only")
     return FitReport(lip_ratio, opened, torn, folded, crossed, covered, tuple(faults))
@@ -154,7 +162,7 @@ def _opened(grown: Array, expected: Array) -> float:
 
 def _torn(
     animation: Animation,
-    made: Animation,
+    carried: Animation,
     pairs: npt.NDArray[np.integer],
     facing: npt.NDArray[np.integer],
     frame: int,
@@ -163,7 +171,7 @@ def _torn(
 ) -> float:
     """Share of the lips' edges whose motion differs by half of the mouth's opening from what is expected there."""
     own = (np.float64(animation.vertices[frame][pairs]) - animation.template[pairs]) @ matrix.T
-    new = np.float64(made.vertices[frame][facing]) - made.template[facing]
+    new = np.float64(carried.vertices[frame][facing]) - carried.template[facing]
     return float(np.mean(np.linalg.norm(new - own, axis=2) > 0.5 * opening))
 
 
@@ -174,7 +182,7 @@ def _gaps(frames: npt.NDArray[np.floating], pairs: npt.NDArray[np.integer]) -> A
 
 def _crossed(
     animation: Animation,
-    made: Animation,
+    carried: Animation,
     pairs: npt.NDArray[np.integer],
     facing: npt.NDArray[np.integer],
     frames: npt.NDArray[np.integer],
@@ -189,7 +197,7 @@ def _crossed(
         return moved @ axis, np.minimum(rest @ axis, 0.0)
 
     own, own_rest = heights(animation, pairs, np.array([0.0, 1.0, 0.0]))
-    new, new_rest = heights(made, facing, up)
+    new, new_rest = heights(carried, facing, up)
     slack = 0.001 / metres_per_unit(animation.unit)
     return float(((new < new_rest - scale * slack) & (own > own_rest - 0.5 * slack)).mean())
 
@@ -211,7 +219,7 @@ def _normals(points: Array, faces: npt.NDArray[np.integer]) -> Array:
     return np.asarray(np.cross(b - a, c - a))
 
 
-def _covered(animation: Animation, found: Correspondence, frames: npt.NDArray[np.integer]) -> float:
+def _covered(animation: Animation, correspondence: Correspondence, frames: npt.NDArray[np.integer]) -> float:
     """Share of the animation's motion, summed over its vertices, that has the target's surface nearby."""
     motion = np.max(
         [np.linalg.norm(animation.vertices[frame] - animation.template, axis=1) for frame in frames], axis=0
@@ -221,8 +229,10 @@ def _covered(animation: Animation, found: Correspondence, frames: npt.NDArray[np
     some = np.flatnonzero(motion > 0.05 * motion.max())
     if len(some) > 400:
         some = np.sort(np.random.default_rng(0).choice(some, 400, replace=False))
-    laid = Surface(found.similarity.inverse().apply(found.target_vertices), found.target_faces)
-    size = Surface(found.source_vertices, found.source_faces).size
-    points = np.asarray(found.source_vertices[some], np.float64)
+    laid = Surface(
+        correspondence.similarity.inverse().apply(correspondence.target_vertices), correspondence.target_faces
+    )
+    size = Surface(correspondence.source_vertices, correspondence.source_faces).size
+    points = np.asarray(correspondence.source_vertices[some], np.float64)
     away = nearest(laid, points, np.zeros_like(points), 0.0).distances
     return float(motion[some][away < NEAR * size].sum() / motion[some].sum())

@@ -43,7 +43,7 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
         FaceDiffError: if it is larger than the budget.
     """
     counts = [
-        max((len(glb.entries("targets", each)) for each in glb.primitives(index)), default=0)
+        max((len(glb.entries("targets", primitive)) for primitive in glb.primitives(index)), default=0)
         for index in range(len(glb.entries("meshes")))
     ]
     if not max(counts, default=0):
@@ -53,7 +53,7 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
     moving = [part for part in placed if glb.entries("targets", part.primitive)]
     if vertices is None and moving:
         return _joined(glb, moving)
-    if vertices is not None and vertices != sum(len(glb.positions(each)) for each in glb.primitives(best)):
+    if vertices is not None and vertices != sum(len(glb.positions(primitive)) for primitive in glb.primitives(best)):
         for parts in (moving, placed):
             if moving and vertices == sum(len(part.local) for part in parts):
                 return _joined(glb, parts)
@@ -63,8 +63,8 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
 def _of_mesh(glb: Glb, index: int) -> Targets:
     """The targets of one mesh, its primitives one after the other, as they are stored: no node acts on them."""
     parts = [
-        Placed(index, -1, each, (), local := glb.positions(each), None, glb.triangles(each, len(local)))
-        for each in glb.primitives(index)
+        Placed(index, -1, primitive, (), local := glb.positions(primitive), None, glb.triangles(primitive, len(local)))
+        for primitive in glb.primitives(index)
     ]
     count = len(glb.entries("targets", parts[0].primitive))
     if any(

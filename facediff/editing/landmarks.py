@@ -88,7 +88,7 @@ def puppet_landmarks() -> dict[str, int]:
     lowest, level = face.vertices[border[-1], 1], face.vertices[eye[0], 1]
     nose = face.groups["nose"][np.isin(face.groups["nose"], middle)]
     left = {"mouth_corner": border[7], "eye_outer": eye[8], "eye_inner": eye[0]}
-    found = {
+    vertices = {
         "nose_tip": middle[depth.argmax()],
         "chin": middle[np.where(height < lowest - 0.01, depth, -1.0).argmax()],
         "nose_bridge": nose[np.abs(face.vertices[nose, 1] - level).argmin()],
@@ -100,7 +100,7 @@ def puppet_landmarks() -> dict[str, int]:
         **{name + LEFT: vertex for name, vertex in left.items()},
         **{name + RIGHT: face.mirror[vertex] for name, vertex in left.items()},
     }
-    return {name: int(found[name]) for name in NAMES}
+    return {name: int(vertices[name]) for name in NAMES}
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,9 @@ def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.in
         >>> known_landmarks(1000 * face.vertices, face.faces).topology
         'puppet'
     """
-    found = known_topology(vertices)
-    if found is not None:
-        return found
+    by_topology = known_topology(vertices)
+    if by_topology is not None:
+        return by_topology
     return Known(None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)))
 
 
@@ -147,8 +147,8 @@ def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
     """The named places of a mesh of a known topology; None of another one."""
     points = np.asarray(vertices, np.float64)
     for topology, count, table in (("puppet", N_VERTICES, puppet_landmarks), ("FLAME", FLAME_VERTICES, FLAME.copy)):
-        if len(points) == count and _lie_as_on_a_face(points, found := table()):
-            return Known(topology, found)
+        if len(points) == count and _lie_as_on_a_face(points, landmarks := table()):
+            return Known(topology, landmarks)
     return None
 
 
@@ -156,10 +156,10 @@ PARALLEL = 0.95  # Cosine of the angle between the ways from right to left, of m
 MIDDLE = 0.12  # So far from the middle, as a share of the distance of the eyes, the others may lie
 
 
-def _lie_as_on_a_face(points: Array, found: Mapping[str, int]) -> bool:
+def _lie_as_on_a_face(points: Array, landmarks: Mapping[str, int]) -> bool:
     """Whether the places of all names lie as they do on a face, in whatever unit and orientation."""
-    at = {name: points[vertex] for name, vertex in found.items()}
-    bases = [name.removesuffix(LEFT) for name in found if name.endswith(LEFT)]
+    at = {name: points[vertex] for name, vertex in landmarks.items()}
+    bases = [name.removesuffix(LEFT) for name in landmarks if name.endswith(LEFT)]
     across = np.stack([at[base + LEFT] - at[base + RIGHT] for base in bases])
     lengths = np.linalg.norm(across, axis=1)
     if not (lengths > 0).all():
@@ -168,7 +168,7 @@ def _lie_as_on_a_face(points: Array, found: Mapping[str, int]) -> bool:
     if (across @ axis < PARALLEL * lengths).any():
         return False
     centres = np.stack([0.5 * (at[base + LEFT] + at[base + RIGHT]) for base in bases])
-    middle = np.concatenate([centres, [at[name] for name in found if not name.endswith((LEFT, RIGHT))]])
+    middle = np.concatenate([centres, [at[name] for name in landmarks if not name.endswith((LEFT, RIGHT))]])
     size = float(np.linalg.norm(at["eye_outer_left"] - at["eye_outer_right"]))
     if np.ptp(middle @ axis) > 2 * MIDDLE * size:
         return False
@@ -189,7 +189,7 @@ def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | Non
     features = features or find_features(vertices, faces)
     if features is None:
         return {}
-    found: dict[str, int] = {}
+    landmarks: dict[str, int] = {}
 
     def nearest(points: Array, to: Array, allowed: Indices) -> int:
         return int(allowed[np.linalg.norm(points[allowed] - to, axis=1).argmin()])
@@ -198,15 +198,15 @@ def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | Non
     mouth = features.mouth
     middle = len(mouth.upper) // 2
     # The larger x is the face's left.
-    found["mouth_corner_right"], found["mouth_corner_left"] = (
+    landmarks["mouth_corner_right"], landmarks["mouth_corner_left"] = (
         nearest(vertices, 0.5 * (mouth.upper[end] + mouth.lower[end]), skin) for end in (0, -1)
     )
-    found["upper_lip_middle"] = nearest(vertices, mouth.upper[middle], mouth.upper_seeds)
-    found["lower_lip_middle"] = nearest(vertices, mouth.lower[middle], mouth.lower_seeds)
+    landmarks["upper_lip_middle"] = nearest(vertices, mouth.upper[middle], mouth.upper_seeds)
+    landmarks["lower_lip_middle"] = nearest(vertices, mouth.lower[middle], mouth.lower_seeds)
     for side, eye, inner in ((RIGHT, features.eyes[0], -1), (LEFT, features.eyes[1], 0)):
         if eye is not None:
-            found["eye_inner" + side] = nearest(vertices, _end(eye, inner), skin)
-            found["eye_outer" + side] = nearest(vertices, _end(eye, -1 - inner), skin)
+            landmarks["eye_inner" + side] = nearest(vertices, _end(eye, inner), skin)
+            landmarks["eye_outer" + side] = nearest(vertices, _end(eye, -1 - inner), skin)
     eyes = [eye for eye in features.eyes if eye is not None]
     if len(eyes) == 2:
         x, y = mouth.centre[:2]
@@ -217,8 +217,8 @@ def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | Non
             np.abs(points[:, 1] - 0.5 * (y + level)) < 0.35 * (level - y)
         )
         if between.any():
-            found["nose_tip"] = int(skin[np.where(between, points[:, 2], -np.inf).argmax()])
-    return {name: found[name] for name in NAMES if name in found}
+            landmarks["nose_tip"] = int(skin[np.where(between, points[:, 2], -np.inf).argmax()])
+    return {name: landmarks[name] for name in NAMES if name in landmarks}
 
 
 def _end(opening: Opening, end: int) -> Array:
@@ -295,7 +295,9 @@ def common_landmarks(source: npt.NDArray[np.floating], target: npt.NDArray[np.fl
     if both[0] is None or both[1] is None:
         return None
     names = [name for name in both[0].vertices if name in both[1].vertices]
-    pairs = np.array([[known.vertices[name] for known in both if known is not None] for name in names])
+    pairs = np.array(
+        [[named_places.vertices[name] for named_places in both if named_places is not None] for name in names]
+    )
     return Landmarks.of_vertices(pairs, names)
 
 
@@ -325,39 +327,39 @@ def read_landmarks(
             path, remedy=f"expected landmarks, as `facediff retarget --pick` saves them, or CSV lines {EXAMPLE}"
         )
         return parse_landmarks(content, path, source, target, counts)
-    names, found = [], []
+    names, pairs = [], []
     for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
-        words = [word.strip() for word in line if word.strip()]
-        named = any(word in NAMES for word in words)
-        if not words or (number == 1 and not named and not any(word.isdecimal() for word in words)):
+        cells = [cell.strip() for cell in line if cell.strip()]
+        named = any(cell in NAMES for cell in cells)
+        if not cells or (number == 1 and not named and not any(cell.isdecimal() for cell in cells)):
             continue
-        if len(words) == 1 and named:
-            words = words * 2
-        if len(words) != 2 or not all(word in NAMES or _whole(word) for word in words):
-            wrong = next((word for word in words if word.isidentifier() and word not in NAMES), None)
+        if len(cells) == 1 and named:
+            cells = cells * 2
+        if len(cells) != 2 or not all(cell in NAMES or _whole(cell) for cell in cells):
+            wrong = next((cell for cell in cells if cell.isidentifier() and cell not in NAMES), None)
             remedy = f'there is no name "{wrong}": {choices(wrong, NAMES)}' if wrong else f"expected {EXAMPLE}"
             raise FaceDiffError(f"{path}: line {number} is {','.join(line)}; {remedy}")
         row = [
-            int(word) if _whole(word) else _vertex_of(word, known, side, path)
-            for word, known, side in zip(words, (source, target), ("source", "target"), strict=True)
+            int(cell) if _whole(cell) else _vertex_of(cell, named_places, side, path)
+            for cell, named_places, side in zip(cells, (source, target), ("source", "target"), strict=True)
         ]
-        found.append(row)
-        names.append(next((word for word in words if word in NAMES), ""))
-    if not found:
+        pairs.append(row)
+        names.append(next((cell for cell in cells if cell in NAMES), ""))
+    if not pairs:
         raise FaceDiffError(f"{path}: holds no pairs; expected lines {EXAMPLE}")
-    return Landmarks.of_vertices(np.array(found, np.int64), names)
+    return Landmarks.of_vertices(np.array(pairs, np.int64), names)
 
 
 def _whole(word: str) -> bool:
     return word.isascii() and word.isdecimal() and len(word) <= DIGITS
 
 
-def _vertex_of(name: str, known: Known | None, side: str, where: object) -> int:
-    if known is None or name not in known.vertices:
-        have = list(known.vertices) if known is not None else []
+def _vertex_of(name: str, named_places: Known | None, side: str, where: object) -> int:
+    if named_places is None or name not in named_places.vertices:
+        have = list(named_places.vertices) if named_places is not None else []
         remedy = f"{choices(name, have)}, or a vertex" if have else "give its vertex"
         raise FaceDiffError(f"{where}: {name} is not known on the {side} mesh; {remedy}")
-    return known.vertices[name]
+    return named_places.vertices[name]
 
 
 def parse_landmarks(
@@ -393,13 +395,16 @@ def parse_landmarks(
                 f"{where}: landmark {number} has no name; expected a text of up to {LONGEST_NAME} letters"
             )
         names.append(name)
-        for key, known, made in zip(("source", "target"), (source, target), sides, strict=True):
-            made.append(_place(row.get(key), f"{where}: landmark {number}, {key}", name, known, key))
+        for key, named_places, side in zip(("source", "target"), (source, target), sides, strict=True):
+            side.append(_place(row.get(key), f"{where}: landmark {number}, {key}", name, named_places, key))
     places = [
-        Places(np.array([corners for corners, _ in made], np.int64), np.array([weights for _, weights in made]))
-        for made in sides
+        Places(
+            np.array([corners for corners, _ in places_of_side], np.int64),
+            np.array([weights for _, weights in places_of_side]),
+        )
+        for places_of_side in sides
     ]
-    found = Landmarks(tuple(names), places[0], places[1])
+    landmarks = Landmarks(tuple(names), places[0], places[1])
     for key, places_of, position in (("source", places[0], 0), ("target", places[1], 1)):
         count = content.get(f"{key}_vertices")
         expected = None if counts is None else counts[position]
@@ -409,13 +414,15 @@ def parse_landmarks(
             )
         if places_of.corners.min() < 0 or (expected is not None and places_of.corners.max() >= expected):
             raise FaceDiffError(f"{where}: names {key} vertices that do not exist; pick the landmarks again")
-    return found
+    return landmarks
 
 
-def _place(value: object, where: str, name: str, known: Known | None, side: str) -> tuple[list[int], list[float]]:
+def _place(
+    value: object, where: str, name: str, named_places: Known | None, side: str
+) -> tuple[list[int], list[float]]:
     """Corners and weights of one place."""
     if value is None and name in NAMES:
-        value = _vertex_of(name, known, side, where)
+        value = _vertex_of(name, named_places, side, where)
     if _is_index(value):
         return [int(value)] * 3, [1.0, 0.0, 0.0]  # type: ignore[call-overload]
     if isinstance(value, dict):

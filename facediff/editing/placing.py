@@ -46,10 +46,10 @@ def place(
     random = np.random.default_rng(0)
     used = np.unique(moved.faces)
     used = used if len(used) <= samples else np.sort(random.choice(used, samples, replace=False))
-    points, normals, found = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
+    points, normals, similarity = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
     for _ in range(rounds):  # Gauss-Newton on the distances to the planes, with Tukey's biweight
-        laid = found.apply(points)
-        there = nearest(goal, laid, normals @ found.rotation.T, size=0.0)
+        laid = similarity.apply(points)
+        there = nearest(goal, laid, normals @ similarity.rotation.T, size=0.0)
         # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
         # rest comes closer.
         spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
@@ -58,10 +58,10 @@ def place(
         if np.count_nonzero(weights) < 20:
             break
         step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
-        found = found.then(step)
+        similarity = similarity.then(step)
         if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
             break
-    return found
+    return similarity
 
 
 def _start(moved: Surface, goal: Surface) -> Similarity:
@@ -84,10 +84,10 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
     own, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
     # Faces are nearly symmetric, so that a mirrored start fits almost as well: the meshes' own axes win unless another
     # start is clearly better.
-    found = best if least < CLEARLY * own[0] else own[1]
+    best_start = best if least < CLEARLY * own[0] else own[1]
     for _ in range(COARSE_ROUNDS):
-        found, _ = _by_vertices(source, target, found)
-    return found
+        best_start, _ = _by_vertices(source, target, best_start)
+    return best_start
 
 
 def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Similarity, float]:
@@ -99,8 +99,8 @@ def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Sim
     pairs = np.concatenate([np.stack([np.arange(len(source)), to]), np.stack([back, np.arange(len(target))])], axis=1)
     apart = away[pairs[0], pairs[1]]
     counted = apart <= np.quantile(apart, TRIMMED)
-    found = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
-    return found, float(apart[counted].mean() / face_size(target))
+    similarity = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
+    return similarity, float(apart[counted].mean() / face_size(target))
 
 
 def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array, size: float) -> Similarity:
@@ -151,9 +151,9 @@ def place_face(
     tried: list[tuple[float, Similarity, Features | None]] = []
     own = np.eye(3)[None]
     for turns in (Rotation.create_group("O").as_matrix(), Rotation.create_group("I").as_matrix()):
-        found = _candidates_for(moved, goal, points, normals, np.concatenate([own, turns]), features.mouth.width)
-        least = found[0][0]
-        for apart, start in found[:LOOKED_AT]:
+        candidates = _candidates_for(moved, goal, points, normals, np.concatenate([own, turns]), features.mouth.width)
+        least = candidates[0][0]
+        for apart, start in candidates[:LOOKED_AT]:
             if apart > 2.0 * least:
                 break
             back = start.inverse()
@@ -166,7 +166,7 @@ def place_face(
                 break
         if any(seen is not None for _, _, seen in tried):
             break
-    _, back, seen = min(tried, key=lambda each: each[0])
+    _, back, seen = min(tried, key=lambda trial: trial[0])
     fine = place(_near(moved, back, points, features), goal, back, samples=700, rounds=30)
     if seen is not None:
         seen = find_features(fine.apply(moved.vertices), moved.faces, features) or seen
@@ -226,14 +226,14 @@ def _candidates_for(
     for _ in range(25):
         state, apart = _round(points[many], normals[many], tree, facing, state, 0.15 * width)
     apart = np.where(own, CLEARLY * apart, apart)
-    made: list[tuple[float, Similarity]] = []
+    candidates: list[tuple[float, Similarity]] = []
     for k in np.argsort(apart):
         similar = Similarity(state[0][k], state[1][k], float(state[2][k]))
         laid = similar.apply(points[many])
         # Several starts end in one place.
-        if all(np.abs(laid - other.apply(points[many])).max() > 0.1 * width * other.scale for _, other in made):
-            made.append((float(apart[k]), similar))
-    return made
+        if all(np.abs(laid - other.apply(points[many])).max() > 0.1 * width * other.scale for _, other in candidates):
+            candidates.append((float(apart[k]), similar))
+    return candidates
 
 
 def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple[Array, Array, Array]:
@@ -256,7 +256,7 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
                 end = part[along > along.max() - share * extent[axis]]
                 if len(end) >= LEAST_GROUP:
                     groups.append((end, sign * np.eye(3)[axis], (1.0,)))
-    found = []
+    starts = []
     for end, up, factors in groups:
         low, high = end.min(axis=0), end.max(axis=0)
         size = face_size(end)
@@ -265,13 +265,13 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
                 continue
             for factor in factors:
                 scale = factor * size / face_size(whole)
-                found.append((turn, end.mean(axis=0) - scale * turn @ whole.mean(axis=0), scale))
+                starts.append((turn, end.mean(axis=0) - scale * turn @ whole.mean(axis=0), scale))
             scale = size / face_size(points)  # a mask shows no more than the face
-            found.append((turn, 0.5 * (low + high) - scale * turn @ (0.5 * (points.min(0) + points.max(0))), scale))
+            starts.append((turn, 0.5 * (low + high) - scale * turn @ (0.5 * (points.min(0) + points.max(0))), scale))
     return (
-        np.stack([each[0] for each in found]),
-        np.stack([each[1] for each in found]),
-        np.array([each[2] for each in found]),
+        np.stack([start[0] for start in starts]),
+        np.stack([start[1] for start in starts]),
+        np.array([start[2] for start in starts]),
     )
 
 

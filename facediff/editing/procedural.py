@@ -383,24 +383,24 @@ def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     name = f".facediff-{secrets.token_hex(8)}.partial"
     try:
         path = folder / name
-        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+        room = np.memmap(path, np.float32, "w+", shape=vertices.shape)
     except OSError:
         path = temporary / name
-        made = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+        room = np.memmap(path, np.float32, "w+", shape=vertices.shape)
     with suppress(OSError):  # Windows keeps a file that is in use
         path.unlink()
-    return made
+    return room
 
 
 def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """A copy to work on, see :func:`room_for`."""
-    made = room_for(vertices)
-    made[:] = vertices
-    return made
+    copy = room_for(vertices)
+    copy[:] = vertices
+    return copy
 
 
-def noted(animation: Animation, vertices: npt.NDArray[np.float32], key: str, words: str) -> Animation:
+def noted(animation: Animation, vertices: npt.NDArray[np.float32], key: str, note: str) -> Animation:
     """The animation with other vertices (T, V, 3), and words added to an entry of its metadata."""
     before = animation.metadata.get(key)
-    entry = words if before is None else f"{before}; {words}"
+    entry = note if before is None else f"{before}; {note}"
     return replace(animation, vertices=vertices, metadata={**animation.metadata, key: entry})

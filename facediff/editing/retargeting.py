@@ -76,12 +76,14 @@ def retarget(
                 f"{{part}} {parts[0]}: {correspondence_path} exists and would be used without it; remove that file, or "
                 f"omit the part"
             )
-        found = load_correspondence(correspondence_path)
-        refuse_other_mesh(str(mesh_path), mesh.vertices, mesh.faces, found.target_vertices, found.target_faces)
-        made = carry(animation, found, mesh)
+        correspondence = load_correspondence(correspondence_path)
+        refuse_other_mesh(
+            str(mesh_path), mesh.vertices, mesh.faces, correspondence.target_vertices, correspondence.target_faces
+        )
+        carried = carry(animation, correspondence, mesh)
         if judge is not None:
-            judge(made, found)
-        return made, found
+            judge(carried, correspondence)
+        return carried, correspondence
     if correspondence_path is not None:
         if correspondence_path.suffix != ".npz":
             raise OptionError.naming(f"{{correspondence}} {correspondence_path}: expected a name that ends in .npz")
@@ -95,24 +97,26 @@ def retarget(
 
     def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:
         try:
-            found = correspond(animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, shown=shown)
+            correspondence = correspond(
+                animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, shown=shown
+            )
         except FaceDiffError as error:
             raise FaceDiffError(f"{mesh_path}: {error}") from error
-        made = carry(animation, found, mesh)
+        carried = carry(animation, correspondence, mesh)
         if judge is not None:
-            judge(made, found)
-        return made, found
+            judge(carried, correspondence)
+        return carried, correspondence
 
     try:
-        made, found = attempt(landmarks)
+        carried, correspondence = attempt(landmarks)
     except FaceDiffError:
         named = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
         if named is None or judge is None:
             raise
-        made, found = attempt(named)
+        carried, correspondence = attempt(named)
     if correspondence_path is not None:
-        save_correspondence(correspondence_path, found)
-    return made, found
+        save_correspondence(correspondence_path, correspondence)
+    return carried, correspondence
 
 
 def carry(animation: Animation, correspondence: Correspondence, target: Mesh) -> Animation:
@@ -124,11 +128,16 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
         FaceDiffError: if one of the meshes is not the correspondence's, or has its vertices in another order, or a
             frame is not finite.
     """
-    found = correspondence
     refuse_other_mesh(
-        animation.name, animation.template, animation.triangles, found.source_vertices, found.source_faces
+        animation.name,
+        animation.template,
+        animation.triangles,
+        correspondence.source_vertices,
+        correspondence.source_faces,
     )
-    refuse_other_mesh("target mesh", target.vertices, target.faces, found.target_vertices, found.target_faces)
+    refuse_other_mesh(
+        "target mesh", target.vertices, target.faces, correspondence.target_vertices, correspondence.target_faces
+    )
     animation.refuse_not_finite()
     head, animation = animation.head, animation.still()
     rest = np.asarray(target.vertices, np.float64)
@@ -137,8 +146,10 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
     step = max(1, CHUNK_BYTES // (24 * max(len(rest), len(neutral))))
     for first in range(0, len(vertices), step):
         some = slice(first, first + step)
-        vertices[some] = rest + carry_displacements(found, np.asarray(animation.vertices[some], np.float64) - neutral)
-    head = None if head is None else _carried_head(vertices, rest, head, found)
+        vertices[some] = rest + carry_displacements(
+            correspondence, np.asarray(animation.vertices[some], np.float64) - neutral
+        )
+    head = None if head is None else _carried_head(vertices, rest, head, correspondence)
     return Animation(
         name=animation.name,
         vertices=vertices,
@@ -146,12 +157,12 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
         template=rest.astype(np.float32),
         frame_rate=animation.frame_rate,
         faces=np.asarray(target.faces, np.int32),
-        unit=unit_of(animation.unit, found.similarity.scale),
+        unit=unit_of(animation.unit, correspondence.similarity.scale),
         speech=animation.speech,
         sample_rate=animation.sample_rate,
         colours=target.colours,
-        regions={name: carried_region(found, indices) for name, indices in animation.regions.items()},
-        inner_lip_pairs=carried_pairs(found, animation.inner_lip_pairs),
+        regions={name: carried_region(correspondence, indices) for name, indices in animation.regions.items()},
+        inner_lip_pairs=carried_pairs(correspondence, animation.inner_lip_pairs),
         metadata={
             **animation.metadata,
             "carried": f"from a mesh of {len(neutral)} vertices to one of {len(rest)} by nearest points of its surface",
@@ -162,14 +173,16 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
 NECK = 0.5  # Below a head, its motion as a whole fades over this share of the source's height: a body stands still
 
 
-def _carried_head(vertices: npt.NDArray[np.float32], rest: Array, head: Array, found: Correspondence) -> Array | None:
+def _carried_head(
+    vertices: npt.NDArray[np.float32], rest: Array, head: Array, correspondence: Correspondence
+) -> Array | None:
     """Move vertices (T, V, 3) as a head does, eyes and hair included; the motion (T, 6), if all of them move so."""
-    own = found.similarity
+    own = correspondence.similarity
     turns = head[:, :3] @ own.rotation.T  # axes turn with the mesh
     matrices = rotations(turns)
     shifts = own.scale * head[:, 3:] @ own.rotation.T + own.translation - matrices @ own.translation
     height = own.inverse().apply(rest)[:, 1]
-    low, high = found.source_vertices[:, 1].min(), found.source_vertices[:, 1].max()
+    low, high = correspondence.source_vertices[:, 1].min(), correspondence.source_vertices[:, 1].max()
     share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
     whole = bool((share == 1).all())
     for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
@@ -189,16 +202,18 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
     # Displacements are differences of positions: the similarity's translation does not act on them.
     matrix = correspondence.similarity.scale * correspondence.similarity.rotation
     moved = np.asarray(displacements, np.float64)
-    made = sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
+    carried = (
+        sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
+    )
     smoothing = averaging(correspondence.trust, correspondence.target_faces)
     if smoothing is not None:
         # Frames and coordinates become columns, so that one sparse product averages all of them.
-        columns = made.transpose(1, 0, 2).reshape(made.shape[1], -1)
-        known = correspondence.trust[:, None] * columns
+        columns = carried.transpose(1, 0, 2).reshape(carried.shape[1], -1)
+        trusted = correspondence.trust[:, None] * columns
         for _ in range(ROUNDS):
-            columns = known + smoothing @ columns
-        made = columns.reshape(made.shape[1], made.shape[0], 3).transpose(1, 0, 2)
-    return np.asarray(correspondence.share[:, None] * made)
+            columns = trusted + smoothing @ columns
+        carried = columns.reshape(carried.shape[1], carried.shape[0], 3).transpose(1, 0, 2)
+    return np.asarray(correspondence.share[:, None] * carried)
 
 
 def unit_of(unit: str, scale: float) -> str:
@@ -228,9 +243,9 @@ def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]
     """Pairs of facing vertices of the source as those of the target's vertices that lie there, each pair once."""
     if pairs is None or not len(pairs):
         return None
-    found = facing_pairs(correspondence, pairs)
-    made = np.unique(found[found[:, 0] != found[:, 1]], axis=0)
-    return made if len(made) else None
+    facing_vertices = facing_pairs(correspondence, pairs)
+    different = np.unique(facing_vertices[facing_vertices[:, 0] != facing_vertices[:, 1]], axis=0)
+    return different if len(different) else None
 
 
 def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]) -> Indices:
@@ -244,7 +259,7 @@ def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer])
     sides = sides_of_pairs(source.vertices, source.faces, np.asarray(pairs, np.int64))
     side = (correspondence.weights * sides[correspondence.corners]).sum(axis=1)
     rest = correspondence.similarity.inverse().apply(correspondence.target_vertices)
-    made = np.empty((len(pairs), 2), np.int64)
+    target_pairs = np.empty((len(pairs), 2), np.int64)
     every = np.arange(len(rest))
     for row, ends in enumerate(np.asarray(pairs)):
         # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same.
@@ -254,8 +269,8 @@ def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer])
             + source.size * (correspondence.share <= 0)
             for vertex, sign in zip(ends, (1.0, -1.0), strict=True)
         )
-        made[row] = facing(rest, every, above, every, below)
-    return made
+        target_pairs[row] = facing(rest, every, above, every, below)
+    return target_pairs
 
 
 def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
@@ -288,13 +303,13 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
             faces = _about_what_moves(neutral, points, faces)
         used, corners = np.unique(faces, return_inverse=True)
         corners = corners.reshape(-1, 3)
-        found = correspond(neutral[used], corners, template, animation.triangles)
-        metres = found.similarity.scale * metres_per_unit(animation.unit)
+        correspondence = correspond(neutral[used], corners, template, animation.triangles)
+        metres = correspondence.similarity.scale * metres_per_unit(animation.unit)
         shown = Animation(
             str(path), points[:, used].astype(np.float32), neutral[used].astype(np.float32), 1.0,
             faces=corners.astype(np.int32), unit=f"{metres:.9g}",
         )  # fmt: skip
-        reports.append(check_fit(shown, carry(shown, found, goal), found))
+        reports.append(check_fit(shown, carry(shown, correspondence, goal), correspondence))
         if reports[-1].good:
             break
     if not reports[-1].good:
@@ -302,7 +317,7 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
             f"{path}: its shapes cannot be carried to {animation.name}: {reports[0].faults[0]}. Carry the animation to "
             f"their mesh with `facediff retarget`, and give them without {{carry}}"
         )
-    moves = carry_displacements(found, points[:, used] - neutral[used])
+    moves = carry_displacements(correspondence, points[:, used] - neutral[used])
     moved = replace(
         files,
         shapes=template + moves,
@@ -383,27 +398,31 @@ def load_correspondence(path: Path) -> Correspondence:
             raise FaceDiffError(f"{path}: has no {name}; make a new correspondence")
         if held[name].dtype.kind != kind or held[name].ndim != axes or not np.isfinite(held[name]).all():
             raise FaceDiffError(f"{path}: its {name} are damaged; make a new correspondence")
-    made = Correspondence(
+    correspondence = Correspondence(
         **{name: held[name] for name in ARRAYS},
         similarity=Similarity(held["rotation"], held["translation"], float(held["scale"])),
     )
-    if not _consistent(made):
+    if not _consistent(correspondence):
         raise FaceDiffError(f"{path}: its parts do not fit one another; make a new correspondence")
-    return made
+    return correspondence
 
 
-def _consistent(made: Correspondence) -> bool:
-    sources, targets = len(made.source_vertices), len(made.target_vertices)
+def _consistent(parts: Correspondence) -> bool:
+    sources, targets = len(parts.source_vertices), len(parts.target_vertices)
     return (
-        made.corners.shape == made.weights.shape == (targets, 3)
-        and made.distances.shape == made.trust.shape == made.share.shape == (targets,)
-        and made.similarity.rotation.shape == (3, 3)
-        and made.similarity.translation.shape == (3,)
-        and made.similarity.scale > 0
-        and made.source_vertices.shape == (sources, 3)
-        and made.target_vertices.shape == (targets, 3)
+        parts.corners.shape == parts.weights.shape == (targets, 3)
+        and parts.distances.shape == parts.trust.shape == parts.share.shape == (targets,)
+        and parts.similarity.rotation.shape == (3, 3)
+        and parts.similarity.translation.shape == (3,)
+        and parts.similarity.scale > 0
+        and parts.source_vertices.shape == (sources, 3)
+        and parts.target_vertices.shape == (targets, 3)
         and all(
             faces.shape[1] == 3 and faces.size > 0 and faces.min() >= 0 and faces.max() < count
-            for faces, count in ((made.source_faces, sources), (made.corners, sources), (made.target_faces, targets))
+            for faces, count in (
+                (parts.source_faces, sources),
+                (parts.corners, sources),
+                (parts.target_faces, targets),
+            )
         )
     )

@@ -62,11 +62,11 @@ def mirror_pairs(names: tuple[str, ...] = ARKIT) -> list[tuple[int, int]]:
 def arkit_name(name: str) -> str | None:
     """The ARKit name that a spelling stands for: ``EyeBlink_L``, ``jaw_open``, ``17 - browInnerUp``; None if none."""
     # Leading digits number the shapes; what follows a dot, a colon or a bar is the shape's name within a node.
-    known = _spellings()
+    spellings = _spellings()
     for part in (name, re.split(r"[.:|]", name)[-1]):
         key = plain(part)
-        if found := known.get(key) or known.get(key.lstrip("0123456789")):
-            return found
+        if arkit := spellings.get(key) or spellings.get(key.lstrip("0123456789")):
+            return arkit
     return None
 
 
@@ -77,12 +77,12 @@ def plain(name: str) -> str:
 
 @lru_cache(maxsize=1)
 def _spellings() -> dict[str, str]:
-    known = {plain(name): name for name in ARKIT}
+    spellings = {plain(name): name for name in ARKIT}
     for name in ARKIT:
         for side in ("Left", "Right"):
             if name.endswith(side):
-                known[plain(name.removesuffix(side)) + side[0].lower()] = name
-    return known
+                spellings[plain(name.removesuffix(side)) + side[0].lower()] = name
+    return spellings
 
 
 def absent_from(names: Sequence[str]) -> tuple[str, ...]:
@@ -216,23 +216,23 @@ def lay_onto(files: ShapeFiles, goal: Array, notes: list[str], unit: str) -> Arr
     factor = 1.0 / metres_per_unit(unit) if files.metric else 1.0
     rest = files.first.parent / files.rest
     try:
-        found = robust_align(neutral * factor, goal, scale=True)
+        similarity = robust_align(neutral * factor, goal, scale=True)
     except FaceDiffError as error:
         raise FaceDiffError(f"{rest}: cannot be aligned with the animation's face: {error}") from error
-    apart = np.linalg.norm(found.apply(neutral * factor) - goal, axis=1)
+    apart = np.linalg.norm(similarity.apply(neutral * factor) - goal, axis=1)
     if np.median(apart) > ANOTHER_ORDER * face_size(goal):
         raise OptionError.naming(
             f"{rest}: has the vertices of the animation's template in another order; write it again with the order "
             f"kept (Blender: import and export with vertex order), or use {{carry}}"
         )
     # A small difference in size or pose is another speaker's head, whose movements are used as they are.
-    scale = found.scale if not 1 / SAME_SIZE < found.scale < SAME_SIZE else 1.0
-    angle = float(np.arccos(np.clip((np.trace(found.rotation) - 1) / 2, -1, 1)))
+    scale = similarity.scale if not 1 / SAME_SIZE < similarity.scale < SAME_SIZE else 1.0
+    angle = float(np.arccos(np.clip((np.trace(similarity.rotation) - 1) / 2, -1, 1)))
     if scale != 1.0:
         notes.append(f"the shapes are scaled by {scale:.4g} to the animation's unit of length")
     if angle > SAME_POSE:
         notes.append(f"the shapes are turned by {np.rad2deg(angle):.0f}° to the animation's axes")
-    matrix: Array = scale * factor * (found.rotation if angle > SAME_POSE else np.eye(3))
+    matrix: Array = scale * factor * (similarity.rotation if angle > SAME_POSE else np.eye(3))
     return matrix
 
 
@@ -240,18 +240,18 @@ def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -
     """The set under ARKit's names where there are such."""
     names: dict[str, str] = {}
     for name in files.names:
-        known = arkit_name(name) or name
-        if known in names:
-            raise FaceDiffError(f'{files.path}: "{names[known]}" and "{name}" are both {known}; keep one of them')
-        names[known] = name
-    made = ShapeSet(tuple(names), neutral, np.ascontiguousarray(deltas))
-    if not np.isfinite(made.deltas).all():
+        own_name = arkit_name(name) or name
+        if own_name in names:
+            raise FaceDiffError(f'{files.path}: "{names[own_name]}" and "{name}" are both {own_name}; keep one of them')
+        names[own_name] = name
+    shape_set = ShapeSet(tuple(names), neutral, np.ascontiguousarray(deltas))
+    if not np.isfinite(shape_set.deltas).all():
         raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it again")
-    if made.extra:
-        notes.append(f"not ARKit's, kept as channels of their own: {', '.join(made.extra)}")
-    if made.still:
-        notes.append(f"move no vertex, so that their weights stay 0: {', '.join(made.still)}")
-    return replace(made, notes=tuple(notes))
+    if shape_set.extra:
+        notes.append(f"not ARKit's, kept as channels of their own: {', '.join(shape_set.extra)}")
+    if shape_set.still:
+        notes.append(f"move no vertex, so that their weights stay 0: {', '.join(shape_set.still)}")
+    return replace(shape_set, notes=tuple(notes))
 
 
 # Blendshapes on disk: a folder of meshes, or a .glb with named targets.
@@ -290,11 +290,11 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
         return _read_glb(path, vertices)
     if not path.is_dir():
         raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
-    found = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
-    rest = [file for file in found if plain(file.stem) in NEUTRAL]
+    candidates = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+    rest = [file for file in candidates if plain(file.stem) in NEUTRAL]
     if len(rest) > 1:
         raise FaceDiffError(f"{path}: {rest[0].name} and {rest[1].name} are both the face at rest; keep one of them")
-    shapes = [file for file in found if file not in rest]
+    shapes = [file for file in candidates if file not in rest]
     if not shapes:
         raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
     files = [*rest, *shapes]
@@ -345,8 +345,8 @@ def _built_in(template: Array | None) -> ShapeFiles:
 
 def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
     try:
-        found = read_targets(open_glb(path), vertices)
+        targets = read_targets(open_glb(path), vertices)
     except (ValueError, IndexError) as error:
         raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
-    points = found.neutral + found.deltas
-    return ShapeFiles(path, path, found.names, points, found.neutral, found.faces, metric=True, rest=path.name)
+    points = targets.neutral + targets.deltas
+    return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, metric=True, rest=path.name)

@@ -137,14 +137,14 @@ def _candidates(surface: Surface, points: Array, slack: float) -> tuple[Indices,
     rounding = 1e-6 * float(radii.max() + np.abs(centres).max())
     # A centre is on the surface, so the surface is no further away; a triangle is no nearer than its ball.
     limit = np.min([tree.query(points)[0] for _, tree in trees], axis=0) + slack + rounding
-    found = []
+    pairs = []
     for faces, tree in trees:
         near = tree.query_ball_point(points, limit + radii[faces].max())
         point = np.repeat(np.arange(len(points)), [len(some) for some in near])
         face = faces[np.fromiter(itertools.chain.from_iterable(near), np.int64)]
         kept = np.linalg.norm(points[point] - centres[face], axis=1) - radii[face] <= limit[point]
-        found.append((point[kept], face[kept]))
-    point, face = (np.concatenate(part) for part in zip(*found, strict=True))
+        pairs.append((point[kept], face[kept]))
+    point, face = (np.concatenate(part) for part in zip(*pairs, strict=True))
     return point, face
 
 

@@ -60,9 +60,9 @@ def symmetry_plane(vertices: npt.NDArray[np.floating], start: Plane) -> Plane:
         product = (first - first.mean(axis=0)).T @ (second - second.mean(axis=0))
         normal = np.linalg.eigh(product + product.T)[1][:, 0]
         normal = normal if normal @ start.normal > 0 else -normal
-        found = Plane(normal, float(normal @ centre))
-        moved = np.linalg.norm(found.normal - plane.normal) * size + abs(found.offset - plane.offset)
-        plane = found
+        mirror = Plane(normal, float(normal @ centre))
+        moved = np.linalg.norm(mirror.normal - plane.normal) * size + abs(mirror.offset - plane.offset)
+        plane = mirror
         if moved < SETTLED * size:
             break
     return plane

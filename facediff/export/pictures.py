@@ -43,32 +43,36 @@ def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights
     )
 
 
-def draw_correspondence(path: Path, animation: Animation, made: Animation, found: Correspondence) -> None:
+def draw_correspondence(path: Path, animation: Animation, carried: Animation, correspondence: Correspondence) -> None:
     """Draw both meshes with the mouth most open, how far each target vertex moves, and the distance of the meshes.
 
     Args:
         path: the picture (.png).
         animation: on the source mesh.
-        made: the same on the target mesh.
-        found: the correspondence between them.
+        carried: the same on the target mesh.
+        correspondence: the correspondence between them.
     """
     opening = mouth_opening(animation)
     if opening is None:  # without known lips, the frame furthest from the neutral face
         opening = np.array([np.square(frame - animation.template).sum() for frame in animation.vertices])
     frame = int(opening.argmax())
     # In the source's axes and unit, so that one camera shows both.
-    back = found.similarity.inverse()
-    posed = back.apply(made.vertices[frame])
+    back = correspondence.similarity.inverse()
+    posed = back.apply(carried.vertices[frame])
     source = np.asarray(animation.vertices[frame])
-    moved, moves = heat(np.linalg.norm(made.vertices[frame] - made.template, axis=1) * millimetres(made), "motion")
-    apart, distances = heat(found.distances * (found.share > 0) * millimetres(made), "distance of the meshes")
+    moved, moves = heat(
+        np.linalg.norm(carried.vertices[frame] - carried.template, axis=1) * millimetres(carried), "motion"
+    )
+    apart, distances = heat(
+        correspondence.distances * (correspondence.share > 0) * millimetres(carried), "distance of the meshes"
+    )
     _draw(
         path,
         [
             DrawnFace(f"{animation.name}, frame {frame}", source, animation.triangles, animation.colours),
-            DrawnFace("on the target mesh", posed, made.triangles, made.colours),
-            DrawnFace(moved, posed, made.triangles, moves),
-            DrawnFace(apart, back.apply(made.template), made.triangles, distances),
+            DrawnFace("on the target mesh", posed, carried.triangles, carried.colours),
+            DrawnFace(moved, posed, carried.triangles, moves),
+            DrawnFace(apart, back.apply(carried.template), carried.triangles, distances),
         ],
         # A whole figure would show its face in a few pixels.
         focus=[source, animation.template],

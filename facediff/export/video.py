@@ -96,5 +96,5 @@ def procedural(animations: Sequence[Animation]) -> str:
     notes = dict.fromkeys(
         re.sub(r" \([^)]*\)", "", animation.metadata.get("procedural", "")) for animation in animations
     )
-    words = ", ".join(note.replace(";", ",") for note in notes if note)
-    return f"procedural: {words}" if words else ""
+    rules = ", ".join(note.replace(";", ",") for note in notes if note)
+    return f"procedural: {rules}" if rules else ""

@@ -25,8 +25,8 @@ class _Formats(Mapping[str, Format]):
     def __getitem__(self, suffix: str) -> Format:
         if suffix not in list(self):
             raise KeyError(suffix)
-        made: Format = registry.export_format.get(suffix[1:])()
-        return made
+        format_of_suffix: Format = registry.export_format.get(suffix[1:])()
+        return format_of_suffix
 
     def __iter__(self) -> Iterator[str]:
         return iter([f".{name}" for name in registry.export_format.names()])
@@ -142,12 +142,12 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
             check_free(folder_of(target))
 
 
-def check_used(suffix: str, given: Collection[str]) -> None:
+def check_used(suffix: str, option_names: Collection[str]) -> None:
     """Refuse options that the format of a suffix does not use; an unknown suffix is refused elsewhere.
 
     Args:
         suffix: of the file.
-        given: names of the options that were given, as ``facediff export`` calls them.
+        option_names: names of the options that were given, as ``facediff export`` calls them.
 
     Raises:
         FaceDiffError: naming the first option that changes nothing.
@@ -156,12 +156,12 @@ def check_used(suffix: str, given: Collection[str]) -> None:
         return
     form = FORMATS[suffix]
     for name in OPTIONS:
-        if name in given and name not in form.uses:
+        if name in option_names and name not in form.uses:
             users = [other for other, other_form in FORMATS.items() if name in other_form.uses]
             raise OptionError(name, f"has no effect on {suffix}, but on {', '.join(users)}; omit it")
-    if "shapes" in given and "tolerance" in given:
+    if "shapes" in option_names and "tolerance" in option_names:
         raise OptionError("tolerance", "has no effect with {shapes}, which fixes the targets; omit one")
-    if "key_tolerance" in given and "shapes" not in given:
+    if "key_tolerance" in option_names and "shapes" not in option_names:
         raise OptionError("key_tolerance", "has no effect without {shapes}, whose weights have keys; omit it")
 
 

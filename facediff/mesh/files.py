@@ -239,16 +239,16 @@ Columns = dict[str, Any]  # by property: an array of numbers, or a sequence of l
 
 
 def _ply_binary(elements: list[_Element], body: memoryview) -> dict[str, Columns]:
-    found: dict[str, Columns] = {}
+    columns: dict[str, Columns] = {}
     at = 0
     for element in elements:
         if element.count * element.least > len(body) - at:
             raise ValueError(f"it is cut short: its {element.count} rows of {element.name} are not all there")
         rows, at = _ply_rows(element, body, at)
-        found[element.name] = rows
+        columns[element.name] = rows
     if at != len(body):
         raise ValueError(f"it holds {len(body) - at} bytes more than its header declares")
-    return found
+    return columns
 
 
 def _ply_rows(element: _Element, body: memoryview, at: int) -> tuple[Columns, int]:
@@ -295,18 +295,18 @@ def _ply_row(element: _Element, body: memoryview, at: int) -> tuple[list[Any], i
     return values, at
 
 
-def _ply_text(elements: list[_Element], words: list[bytes]) -> dict[str, Columns]:
-    found: dict[str, Columns] = {}
+def _ply_text(elements: list[_Element], cells: list[bytes]) -> dict[str, Columns]:
+    columns: dict[str, Columns] = {}
     at = 0
     for element in elements:
         width = len(element.properties)
-        if element.count * width > len(words) - at:
+        if element.count * width > len(cells) - at:
             raise ValueError(f"it is cut short: its {element.count} rows of {element.name} are not all there")
         if all(length is None for _, _, length in element.properties):
-            flat = [float(word) for word in words[at : at + element.count * width]]
+            flat = [float(word) for word in cells[at : at + element.count * width]]
             table = np.array(flat).reshape(element.count, width) if width else np.zeros((element.count, 0))
             with np.errstate(over="ignore"):  # what a float cannot hold becomes infinite, and is refused as that
-                found[element.name] = {
+                columns[element.name] = {
                     name: table[:, i].astype(kind) if kind[1] == "f" else table[:, i]
                     for i, (name, kind, _) in enumerate(element.properties)
                 }
@@ -317,17 +317,17 @@ def _ply_text(elements: list[_Element], words: list[bytes]) -> dict[str, Columns
             for name, kind, length in element.properties:
                 count = 1
                 if length is not None:
-                    count, at = int(words[at]), at + 1
-                if not 0 <= count <= len(words) - at:
+                    count, at = int(cells[at]), at + 1
+                if not 0 <= count <= len(cells) - at:
                     raise ValueError(f"it is cut short: a list of {element.name} is not all there")
                 number = float if length is None or kind[1] == "f" else int
-                values = [number(word) for word in words[at : at + count]]
+                values = [number(word) for word in cells[at : at + count]]
                 lists[name].append(values if length is not None else values[0])
                 at += count
-        found[element.name] = lists if element.count else {}
-    if at != len(words):
-        raise ValueError(f"it holds {len(words) - at} numbers more than its header declares")
-    return found
+        columns[element.name] = lists if element.count else {}
+    if at != len(cells):
+        raise ValueError(f"it holds {len(cells) - at} numbers more than its header declares")
+    return columns
 
 
 # STL: triangles without shared vertices; they stay as the file has them.
@@ -380,7 +380,7 @@ def _read_off(data: bytes, path: Path) -> Mesh:
     head = re.match(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b", data)
     if head is None:
         raise ValueError("it does not begin with OFF")
-    lines = [words for line in data[head.end() :].splitlines() if (words := line.partition(b"#")[0].split())]
+    lines = [cells for line in data[head.end() :].splitlines() if (cells := line.partition(b"#")[0].split())]
     if not lines or len(lines[0]) < 2:
         raise ValueError("it does not say how many vertices and faces it has")
     n_vertices, n_faces = int(lines[0][0]), int(lines[0][1])

@@ -77,8 +77,8 @@ class Flame:
 
     def shaped(self, shape: npt.NDArray[np.floating]) -> Array:
         """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has, but not more."""
-        given = _coefficients("shape", shape, SHAPES, 1)
-        return np.asarray(self.template + (self._shape_basis[:, : len(given)] @ given).reshape(-1, 3))
+        coefficients = _coefficients("shape", shape, SHAPES, 1)
+        return np.asarray(self.template + (self._shape_basis[:, : len(coefficients)] @ coefficients).reshape(-1, 3))
 
     def vertices(
         self,
@@ -214,11 +214,12 @@ def _numbers(
     """An array of the file as float64, with its shape checked; None stands for any length but zero."""
     values = plain_array(content[key], f"{path}: {key}")
     fits = len(values.shape) == len(shape) and all(
-        length == wanted if wanted is not None else length for length, wanted in zip(values.shape, shape, strict=True)
+        length == expected if expected is not None else length
+        for length, expected in zip(values.shape, shape, strict=True)
     )
     if not fits:
-        words = ", ".join("any" if length is None else str(length) for length in shape)
-        raise FaceDiffError(f"{path}: {key} has shape {values.shape}, expected ({words}); {HELP}")
+        lengths = ", ".join("any" if length is None else str(length) for length in shape)
+        raise FaceDiffError(f"{path}: {key} has shape {values.shape}, expected ({lengths}); {HELP}")
     numbers = values.astype(np.float64)
     if not np.isfinite(numbers).all():
         raise FaceDiffError(f"{path}: {key} holds NaN or infinity; download the file again")
@@ -304,22 +305,22 @@ def read_masks(path: Path, names: str) -> list[int]:
     loaded = load_pickle(path)
     if names and not isinstance(loaded, dict):
         raise FaceDiffError(f"{path}: expected a dict from mask to vertex indices, got {type(loaded).__name__}")
-    wanted, unwanted = [], []
+    included, excluded = [], []
     for part in names.split("+") if names else []:
         # A mask may have a hyphen in its own name.
         first, *others = [part] if part in loaded else part.split("-")
-        wanted.append(first)
-        unwanted += others
-    for name in [*wanted, *unwanted]:
+        included.append(first)
+        excluded += others
+    for name in [*included, *excluded]:
         if name not in loaded:
             raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, loaded)))}')
     try:
-        chosen = [loaded[name] for name in [*wanted, *unwanted]] if names else [loaded]
+        chosen = [loaded[name] for name in [*included, *excluded]] if names else [loaded]
         arrays = [np.asarray(mask) for mask in chosen]
     except ValueError as error:
         raise FaceDiffError(f"{path}: expected lists of vertex indices ({error})") from error
     if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):
         raise FaceDiffError(f"{path}: expected lists of whole numbers, the vertex indices")
-    count = len(wanted) if names else 1
+    count = len(included) if names else 1
     without = {int(index) for array in arrays[count:] for index in array}
     return [int(index) for array in arrays[:count] for index in array if int(index) not in without]

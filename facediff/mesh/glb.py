@@ -172,10 +172,10 @@ class Glb:
 
 def attributes(primitive: dict[str, Any]) -> dict[str, Any]:
     """Which accessor holds which of a primitive's attributes."""
-    found = primitive.get("attributes")
-    if not isinstance(found, dict):
+    by_name = primitive.get("attributes")
+    if not isinstance(by_name, dict):
         raise ValueError("has a mesh without attributes")
-    return found
+    return by_name
 
 
 def whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:

@@ -101,7 +101,7 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
             material = primitive.get("material")
             holders = [entry, glb.entry("meshes", mesh)]
             holders += [materials[material]] if type(material) is int and 0 <= material < len(materials) else []
-            names = tuple(dict.fromkeys(n for each in holders if isinstance(n := each.get("name"), str) and n))
+            names = tuple(dict.fromkeys(n for holder in holders if isinstance(n := holder.get("name"), str) and n))
             yield Placed(mesh, node, primitive, names, local, matrix, faces[:, ::-1] if mirrored else faces)
 
 

@@ -187,15 +187,15 @@ def mesh_hierarchy(
         place = np.full(len(template), -1)
         place[chosen] = np.arange(len(chosen))
         points, inner = template[chosen], place[faces][(place[faces] >= 0).all(axis=1)]
-    made = []
+    mesh_levels = []
     for _ in range(levels):
         coarse = coarsen(points, inner, -(-len(points) // factor), pooling)
         table = spirals(inner, len(points), spiral_length, dilation, points)
-        made.append(MeshLevel(len(points), inner, table, coarse.down, coarse.up))
+        mesh_levels.append(MeshLevel(len(points), inner, table, coarse.down, coarse.up))
         points, inner = coarse.template, coarse.faces
     table = spirals(inner, len(points), spiral_length, dilation, points)
-    made.append(MeshLevel(len(points), inner, table, None, None))
-    hierarchy = MeshHierarchy(len(template), chosen, tuple(made))
+    mesh_levels.append(MeshLevel(len(points), inner, table, None, None))
+    hierarchy = MeshHierarchy(len(template), chosen, tuple(mesh_levels))
     with suppress(FaceDiffError), atomic(path) as temporary:  # a hierarchy that cannot be cached is computed again
         np.savez(temporary, allow_pickle=False, **hierarchy.arrays())
     return hierarchy
@@ -405,7 +405,7 @@ def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> 
     point, face = pairs.row, pairs.col
     share, square = closest_on_triangles(points[point], coarse[faces[face]])
     order = np.lexsort((face, square, point))
-    found, best = np.unique(point[order], return_index=True)
+    searched, best = np.unique(point[order], return_index=True)
     best = order[best]
-    corners[found], weights[found] = faces[face[best]], share[best]
+    corners[searched], weights[searched] = faces[face[best]], share[best]
     return corners, weights

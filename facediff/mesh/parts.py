@@ -64,36 +64,36 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
         array([1])
     """
     parts = mesh_parts(path)
-    known = list(dict.fromkeys(name for part in parts for name in part.names))
-    if not known:
+    part_names = list(dict.fromkeys(name for part in parts for name in part.names))
+    if not part_names:
         raise OptionError.naming(
             f"{path}: its parts have no names; expected a .glb or .obj with named parts, or no {{part}}"
         )
     chosen = []
-    for wanted in names:
+    for pattern in names:
         for fold in (str, str.casefold):  # another case counts only where nothing is written so
-            found = [part for part in parts if any(fnmatchcase(fold(name), fold(wanted)) for name in part.names)]
-            if found:
+            matching = [part for part in parts if any(fnmatchcase(fold(name), fold(pattern)) for name in part.names)]
+            if matching:
                 break
         else:
-            raise FaceDiffError(f'{path}: has no part "{wanted}"; {choices(wanted, known)}')
-        chosen += [part.triangles for part in found]
+            raise FaceDiffError(f'{path}: has no part "{pattern}"; {choices(pattern, part_names)}')
+        chosen += [part.triangles for part in matching]
     return np.unique(np.concatenate(chosen))
 
 
 def _obj_parts(data: bytes) -> list[tuple[tuple[str, ...], int]]:
     """Names and number of triangles of each run of faces."""
-    made: list[tuple[tuple[str, ...], int]] = []
+    runs: list[tuple[tuple[str, ...], int]] = []
     current = ["", "", ""]
     for line in data.splitlines():
-        words = line.split()
-        if not words:
+        cells = line.split()
+        if not cells:
             continue
-        if words[0] in NAMING:
-            current[NAMING[words[0]]] = b" ".join(words[1:]).decode("utf-8", "replace")
-        elif words[0] == b"f":
+        if cells[0] in NAMING:
+            current[NAMING[cells[0]]] = b" ".join(cells[1:]).decode("utf-8", "replace")
+        elif cells[0] == b"f":
             names = tuple(dict.fromkeys(name for name in current if name))
-            if not made or made[-1][0] != names:
-                made.append((names, 0))
-            made[-1] = (names, made[-1][1] + len(words) - 3)
-    return made
+            if not runs or runs[-1][0] != names:
+                runs.append((names, 0))
+            runs[-1] = (names, runs[-1][1] + len(cells) - 3)
+    return runs

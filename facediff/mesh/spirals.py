@@ -47,13 +47,13 @@ def spirals(
     if length < 1 or dilation < 1:
         raise FaceDiffError(f"spirals: length {length} and dilation {dilation}; expected at least 1 for both")
     rings = ordered_rings(faces, n_vertices)
-    wanted = min(length * dilation, n_vertices)
+    full_length = min(length * dilation, n_vertices)
     table = np.empty((n_vertices, length), np.int64)
     for vertex in range(n_vertices):
-        spiral = _spiral(vertex, rings, wanted)
-        if len(spiral) < wanted:
-            spiral += _nearest(vertex, spiral, wanted, template)
-        if dilation > 1 or wanted < length:
+        spiral = _spiral(vertex, rings, full_length)
+        if len(spiral) < full_length:
+            spiral += _nearest(vertex, spiral, full_length, template)
+        if dilation > 1 or full_length < length:
             # Every so many, then the ones between if vertices are scarce, then the vertex itself.
             between = [entry for i, entry in enumerate(spiral) if i % dilation]
             spiral = [*spiral[::dilation], *between, *[vertex] * length][:length]
@@ -106,12 +106,12 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
     return rings
 
 
-def _spiral(vertex: int, rings: list[list[int]], wanted: int) -> list[int]:
+def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
     """The vertex and the rings around it, cut at ``wanted`` entries; shorter where the rings end."""
     ring = rings[vertex]
     spiral = [vertex, *ring]
     seen = set(spiral)
-    while ring and len(spiral) < wanted:
+    while ring and len(spiral) < full_length:
         outer: list[int] = []
         for inner in ring:
             around = rings[inner]
@@ -124,23 +124,23 @@ def _spiral(vertex: int, rings: list[list[int]], wanted: int) -> list[int]:
             new = [around[i] for i in order if fresh[i]]
             seen.update(new)
             outer += new
-            if len(spiral) + len(outer) >= wanted:
+            if len(spiral) + len(outer) >= full_length:
                 break
         spiral += outer
         ring = outer
-    return spiral[:wanted]
+    return spiral[:full_length]
 
 
-def _nearest(vertex: int, spiral: list[int], wanted: int, template: Points | None) -> list[int]:
+def _nearest(vertex: int, spiral: list[int], full_length: int, template: Points | None) -> list[int]:
     """The vertices nearest to ``vertex`` that are not in the spiral, as many as it lacks."""
     if template is None:
         raise FaceDiffError(
-            f"spirals: the rings around vertex {vertex} hold {len(spiral)} vertices of {wanted}; give the template, "
-            f"so that the nearest vertices can fill the rest"
+            f"spirals: the rings around vertex {vertex} hold {len(spiral)} vertices of {full_length}; give the "
+            f"template, so that the nearest vertices can fill the rest"
         )
     square = np.square(np.asarray(template, np.float64) - np.asarray(template[vertex], np.float64)).sum(axis=1)
     square[spiral] = np.inf
-    missing = wanted - len(spiral)
+    missing = full_length - len(spiral)
     reach = np.partition(square, missing - 1)[missing - 1]
     near = np.flatnonzero(square <= reach)  # by index, so that ties go to the smaller one
     nearest: list[int] = near[np.argsort(square[near], kind="stable")][:missing].tolist()

@@ -58,8 +58,7 @@ class ConditionedRun:
 
     def share(self, times: npt.NDArray[np.floating]) -> Array:
         """Its share at times: (T, 1), or (T, V) where it differs between vertices."""
-        found = np.ones((len(times), 1))
-        return reduce(lambda made, each: made * each.at(times), self.shares, found)
+        return reduce(np.multiply, (share.at(times) for share in self.shares), np.ones((len(times), 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +79,7 @@ class Share:
         """The share (T, 1): of a number, how near the curve is to it, on the way to its neighbours."""
         if not self.values:
             return text_shares(self.keys, times, eased=True)[str(self.value)][:, None]
-        unit = [float(each == self.value) for each in self.values]
+        unit = [float(value == self.value) for value in self.values]
         return np.interp(curve(self.keys, times, eased=True), self.values, unit)[:, None]
 
 
@@ -100,7 +99,8 @@ class ExpressivityShare(Share):
         """The share (T, V)."""
         curves = {name: curve(keys, times, eased=True) for name, keys in self.channels}
         rows = [
-            self.weights.factors({name: float(each[i]) for name, each in curves.items()}) for i in range(len(times))
+            self.weights.factors({name: float(factors[frame]) for name, factors in curves.items()})
+            for frame in range(len(times))
         ]
         sample = np.stack(rows)
         return sample if self.value else 1 - sample
@@ -130,14 +130,14 @@ def plan_runs(
     if direction is None:
         return [ConditionedRun(style, condition, model.choices())]
     channels = [name for name in direction.channels if name in ("style", "condition") or name.startswith("guidance.")]
-    found: list[list[tuple[str, float | str, Share]]] = []
+    alternatives: list[list[tuple[str, float | str, Share]]] = []
     for name in channels:
         keys = direction.channels[name]
         numbers = tuple(sorted({float(key.value) for key in keys})) if name.startswith("guidance.") else ()
         values: Sequence[float | str] = numbers or list(dict.fromkeys(str(key.value) for key in keys))
-        found.append([(name, value, Share(keys, value, numbers)) for value in values])
+        alternatives.append([(name, value, Share(keys, value, numbers)) for value in values])
     expressive = _expressivity(direction, model, identity)
-    found += [expressive] if expressive else []
+    alternatives += [expressive] if expressive else []
     styles = {
         text: _named(direction, "style", lambda text=text: style_from(text, identity, model, template=style_template))
         for text in dict.fromkeys(str(key.value) for key in direction.channels.get("style", ()))
@@ -145,10 +145,12 @@ def plan_runs(
     last = max(key.time for key in direction.keys)
     times = np.arange(int(np.ceil(last * model.frame_rate)) + 2) / model.frame_rate
     runs: list[ConditionedRun] = []
-    for chosen in product(*found):
+    for chosen in product(*alternatives):
         # Shares of an alternative that is alone are 1 at all times; without them the motion stays as it is.
         shares = tuple(
-            share for alternatives, (_, _, share) in zip(found, chosen, strict=True) if len(alternatives) > 1
+            share
+            for values_of_channel, (_, _, share) in zip(alternatives, chosen, strict=True)
+            if len(values_of_channel) > 1
         )
         run = ConditionedRun(style, condition, {}, shares)
         if shares and not run.share(times).any():
@@ -166,9 +168,11 @@ def plan_runs(
                     _named(direction, name, lambda scales=scales: model.choose_guidance(scales))
                 elif name == "expressivity":
                     _named(direction, name, lambda value=value: model.choose_expressivity(value))
-            given = str(now["condition"]) if "condition" in now else condition
-            _named(direction, "condition", lambda given=given: model.check_condition(given))
-            runs.append(ConditionedRun(styles.get(str(now.get("style")), style), given, model.choices(), shares))
+            run_condition = str(now["condition"]) if "condition" in now else condition
+            _named(direction, "condition", lambda run_condition=run_condition: model.check_condition(run_condition))
+            runs.append(
+                ConditionedRun(styles.get(str(now.get("style")), style), run_condition, model.choices(), shares)
+            )
     return runs
 
 
@@ -188,7 +192,7 @@ def _expressivity(
     if not channels:
         return []
     constants = {name.partition(".")[2] or ALL: direction.constant(name) for name in channels}
-    known = next(iter(channels.values()))
+    keys = next(iter(channels.values()))
     template = model.assets.template(identity).numpy()
     regions = {name: np.asarray(indices, np.int64) for name, indices in model.assets.regions.items()}
     try:
@@ -201,9 +205,9 @@ def _expressivity(
         value = factors[ALL] if whole else torch.from_numpy(weights.factors(factors)).float()
         if not model.samples and {*factors.values()} == {1.0}:
             value = 1.0
-        return [("expressivity", value, Share(known, 1.0))]
+        return [("expressivity", value, Share(keys, 1.0))]
     curves = tuple((name.partition(".")[2] or ALL, keys) for name, keys in channels.items())
-    return [("expressivity", value, ExpressivityShare(known, value, (), curves, weights)) for value in (0.0, 1.0)]
+    return [("expressivity", value, ExpressivityShare(keys, value, (), curves, weights)) for value in (0.0, 1.0)]
 
 
 def blend(motions: Sequence[Tensor], runs: Sequence[ConditionedRun], frame_rate: float, start: int = 0) -> Tensor:
@@ -219,13 +223,13 @@ def blend(motions: Sequence[Tensor], runs: Sequence[ConditionedRun], frame_rate:
     if len(runs) == 1 or not count:
         return motions[0]
     times = (start + np.arange(count)) / frame_rate
-    made = torch.zeros_like(motions[0])
+    blended = torch.zeros_like(motions[0])
     for motion, run in zip(motions, runs, strict=True):
         share = torch.from_numpy(run.share(times)).to(motion)
         counting = share.any(dim=1)
         # A frame that is one run's alone stays as it is to the last bit: 0 + 1 · x.
-        made[:, counting] += share[counting][None, :, :, None] * motion[:, counting]
-    return made
+        blended[:, counting] += share[counting][None, :, :, None] * motion[:, counting]
+    return blended
 
 
 class DirectedStream:

@@ -92,7 +92,7 @@ class VertexSums:
         """Sums (V, 3) of the triangles' values (F, 3)."""
         if not has_scipy():
             spread = np.repeat(np.asarray(values, np.float64), 3, axis=0)
-            return np.stack([np.bincount(self._corners, each, self._n_vertices) for each in spread.T], axis=1)
+            return np.stack([np.bincount(self._corners, component, self._n_vertices) for component in spread.T], axis=1)
         return np.asarray(self._at_vertices @ values, dtype=np.float64)
 
     def mean_centres(self, vertices: Floats) -> Float64:

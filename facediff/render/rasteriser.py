@@ -176,8 +176,8 @@ class Renderer:
         columns = np.zeros((2, -(-count // LOOKED_UP), LOOKED_UP), np.float32)
         np.multiply(normals.T, np.float32((TABLE_SIZE - 1) / 2), out=columns.reshape(2, -1)[:, :count])
         columns += np.float32((TABLE_SIZE - 1) / 2)
-        found = cv2.remap(self._light, columns[0], columns[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(found.reshape(-1, 4)[:count], dtype=np.float32)
+        light = cv2.remap(self._light, columns[0], columns[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(light.reshape(-1, 4)[:count], dtype=np.float32)
 
     def _kept_light(self, coverage: Float32, window: _Window, *, tinted: bool) -> Float32:
         """What is multiplied to the drawn values: the strongest light's strength, less where a pixel lies behind.

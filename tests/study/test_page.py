@@ -29,10 +29,15 @@ def made(small: Path, tmp_path: Path) -> Path:
 def opened(browser: Chromium, url: str, **window: Any) -> Page:  # noqa: ANN401 - passed on
     page = browser.open(url, **window)
     page.wait_for("window.facediffStudy")
-    # Pages of all folders share one storage. The mark tells the page that is left from the one that comes.
-    page.evaluate("window.beforeReload = true, localStorage.clear(), location.reload(), null")
-    page.wait_for("!window.beforeReload && window.facediffStudy && facediffStudy.state.started === null")
+    page.evaluate("localStorage.clear()")  # pages of all folders share one storage
+    reload(page)
     return page
+
+
+def reload(page: Page) -> None:
+    """Load the page again and wait until it takes clicks; by the mark, the page that is left does not count."""
+    page.evaluate("window.beforeReload = true, location.reload(), null")
+    page.wait_for("!window.beforeReload && window.facediffStudy")
 
 
 def begin(page: Page) -> None:
@@ -78,8 +83,8 @@ def test_served_from_the_first_click_to_the_report(made: Path, serve: Serve, bro
     begin(page)
     answer(page, clicks=3)  # a double click submits once
     answer(page, key="ArrowRight")
-    page.evaluate("location.reload()")
-    page.wait_for("window.facediffStudy && facediffStudy.state.trials.length === 2")
+    reload(page)
+    page.wait_for("facediffStudy.state.trials.length === 2")
     page.evaluate("document.getElementById('start').click()")
     page.wait_for("facediffStudy.current")
     assert page.evaluate("document.getElementById('count').textContent") == "Video 3 of 3"

@@ -64,7 +64,9 @@ class PageFormat(Format):
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write a page that shows all animations next to each other."""
-        write_page(path, [each if not options.no_speech else replace(each, speech=None) for each in animations])
+        write_page(
+            path, [animation if not options.no_speech else replace(animation, speech=None) for animation in animations]
+        )
 
 
 def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 30.0, truth: int | None = None) -> None:
@@ -176,7 +178,9 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
         "heat": heat,
         "archive": ARCHIVE,
         "direction": _direction_facts(),
-        "animations": [_animation_facts(each, number in compared, blobs) for number, each in enumerate(animations)],
+        "animations": [
+            _animation_facts(animation, number in compared, blobs) for number, animation in enumerate(animations)
+        ],
     }
 
 
@@ -220,11 +224,11 @@ def _head_in_mm(head: npt.NDArray[np.float64], animation: Animation) -> bytes:
 
 def _weights_of(animation: Animation, blobs: Blobs) -> dict[str, int]:
     """How much each vertex belongs to each region, in 255ths: what the preview of expressiveness needs."""
-    found = {}
+    blob_numbers = {}
     for name in animation.regions:
         weights = region_factors(animation.template, animation.regions, {name: 1.0, ALL: 0.0})
-        found[name] = blobs.add(np.rint(255 * weights).astype(np.uint8).tobytes())
-    return found
+        blob_numbers[name] = blobs.add(np.rint(255 * weights).astype(np.uint8).tobytes())
+    return blob_numbers
 
 
 def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict[str, Any]:
@@ -247,7 +251,9 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
         "extent": extent,
         "compared": compared,
         "pairs": None if pairs is None or not len(pairs) else blobs.add(pairs.astype("<i4").tobytes()),
-        "regions": {name: blobs.add(np.asarray(each, "<i4").tobytes()) for name, each in animation.regions.items()},
+        "regions": {
+            name: blobs.add(np.asarray(indices, "<i4").tobytes()) for name, indices in animation.regions.items()
+        },
         "head": None if animation.head is None else blobs.add(_head_in_mm(animation.head, animation)),
         "weights": _weights_of(animation, blobs),
         "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),

@@ -90,11 +90,11 @@ class Picking:
         Raises:
             FaceDiffError: naming what is wrong, or the file if it cannot be written.
         """
-        found = parse_landmarks(content, "request", counts=self.counts)
-        if len(found) < FEWEST:
-            raise FaceDiffError(f"request: holds {len(found)} pairs; expected {FEWEST} or more")
-        write_landmarks(self.file, found, *self.counts)
-        return len(found)
+        landmarks = parse_landmarks(content, "request", counts=self.counts)
+        if len(landmarks) < FEWEST:
+            raise FaceDiffError(f"request: holds {len(landmarks)} pairs; expected {FEWEST} or more")
+        write_landmarks(self.file, landmarks, *self.counts)
+        return len(landmarks)
 
 
 def picking_page(picking: Picking) -> list[str]:
@@ -109,7 +109,7 @@ def picking_page(picking: Picking) -> list[str]:
         # No mouth is where the alignment expects it: a person knows best how the mesh lies in its file.
         seen, back = None, _as_in_its_file(rest, target.vertices, shown)
     laid = back.apply(target.vertices)
-    known = known_landmarks(rest, goal.faces)
+    source_landmarks = known_landmarks(rest, goal.faces)
     of_target = known_topology(target.vertices)
     suggested = landmarks_by_shape(laid, shown, seen) if seen is not None and of_target is None else {}
     blobs = Blobs()
@@ -132,14 +132,14 @@ def picking_page(picking: Picking) -> list[str]:
         "format": FORMAT,
         "file": picking.file.name,
         "fewest": FEWEST,
-        "names": [[name, words] for name, words in NAMES.items()],
-        "known": {"source": known.vertices, "target": {} if of_target is None else of_target.vertices},
-        "exact": known.topology is not None,
+        "names": [[name, description] for name, description in NAMES.items()],
+        "known": {"source": source_landmarks.vertices, "target": {} if of_target is None else of_target.vertices},
+        "exact": source_landmarks.topology is not None,
         "suggested": suggested,
         "start": [] if picking.start is None else as_rows(picking.start),
         "sides": {
-            side: _side(animation, found, blobs)
-            for side, animation, found in zip(
+            side: _side(animation, side_features, blobs)
+            for side, animation, side_features in zip(
                 ("source", "target"), animations, (features, features if seen is not None else None), strict=True
             )
         },
@@ -269,11 +269,11 @@ def pick_landmarks(
     """
     require_server("picking landmarks", extra="serve")
     begin = start if start is not None else file if file.exists() else None
-    given = None
+    landmarks = None
     if begin is not None:
         counts = len(source.template), len(target.vertices)
-        given = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices), counts)
-        given.check(*counts)
-    picking = Picking(source, target, names, file, given, shown)
+        landmarks = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices), counts)
+        landmarks.check(*counts)
+    picking = Picking(source, target, names, file, landmarks, shown)
     page = "".join(picking_page(picking))
     return run_server(lambda stop: make_app(picking, page, names_of(host), stop), host=host, port=port, ready=ready)
