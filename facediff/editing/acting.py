@@ -268,6 +268,8 @@ class _ProsodyPerformer(Performer):
         """Gestures that overlap, together never more than 1."""
         left = 1.0
         for time, size in gestures:
+            # As probabilities combine: two overlapping rises go further than one, and no number of them beyond the
+            # whole way.
             left *= 1 - size * gesture(now - time, shape)
         return 1 - left
 

@@ -219,6 +219,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     terms = objective(moving, shapes, options, animation.frame_rate)
     products, square = [], 0.0
     for _, moved in _displacements(animation, moving):
+        # Frame by frame only the products with the shapes are kept: (T, K) numbers instead of (T, 3N).
         products.append(moved.reshape(len(moved), -1) @ terms.projection.T)
         square += float(np.square(moved).sum())
     right = np.concatenate(products)
@@ -238,6 +239,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     values[:, moving.places] = np.clip(scaled_weights / scale, options.lower, options.upper)
     rms, most = _residuals(animation, moving, values[:, moving.places])
     millimetres = 1000.0 * metres_per_unit(animation.unit)
+    # Over all frames together: a frame in which the face hardly moves has a large share of nothing left.
     remaining = float(np.sqrt(np.square(rms).mean()))
     if remaining > options.residual_limit * amplitude and millimetres * remaining > VISIBLE_MM:
         raise OptionError.naming(
@@ -289,6 +291,7 @@ def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
         if end - first < 2:
             continue
         share = (np.arange(first + 1, end) - first)[:, None] / (end - first)
+        # As a player interpolates: all curves of a span share one pair of keys.
         line = values[first] + share * (values[end] - values[first])
         apart = np.abs(values[first + 1 : end] - line).max(axis=1)
         worst = int(apart.argmax())

@@ -94,6 +94,7 @@ def minimise_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations
         np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
         np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
     )
+    # The cost makes it pay to have one of both parts only; where rounding leaves some of both, the difference counts.
     both_parts, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
     positive, negative = np.split(both_parts, 2, axis=1)
     return positive - negative
@@ -110,6 +111,7 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
     Returns:
         x (T, K), and whether its :meth:`Problem.residual` meets the tolerance (K,).
     """
+    # The unbounded minimum, clipped to the box, is near the solution: few weights lie on a bound in the end.
     x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
     widths = problem.upper - problem.lower
     width = float(widths[widths > 0].min(initial=1.0))
@@ -137,6 +139,8 @@ def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask
     while length > SHORTEST:
         following = problem.clip(x + length * direction)
         moved = following - x
+        # Armijo's rule for projected steps: free variables promise a decrease by their slope along the direction,
+        # held ones by how far they really move, since the box may cut their way short.
         promised_decrease = length * promise - float((slope * moved)[held].sum())
         if problem.change(slope, moved) <= -SUFFICIENT * promised_decrease:
             return following if moved.any() else None
@@ -150,6 +154,7 @@ def _newton(problem: Problem, right: Array, free: Mask) -> Array:
     neighbours = np.full((frames, 1), 2.0)
     neighbours[0] -= 1
     neighbours[-1] -= 1
+    # A base install lacks SciPy: the same system is solved as a chain of blocks, frame by frame.
     if not has_scipy():
         both = free[:, :, None] & free[:, None]
         blocks = np.where(both, problem.matrix, 0.0)
@@ -226,6 +231,8 @@ class Pivoting:
             if not len(wrong):
                 self._side = side
                 return np.clip(x, lower, upper)
+            # Exchanging all wrong variables is quick and may run in circles. When it has not made them fewer for some
+            # rounds, only the last one changes sides: Murty's rule, which always ends.
             if len(wrong) < fewest:
                 fewest, patience = len(wrong), PATIENCE
             elif patience:
@@ -242,12 +249,15 @@ class Pivoting:
         free = side == 0
         if not free.any():
             return x
+        # What the bound variables contribute moves to the right-hand side; a system of the free ones is left.
         x[free] = 0.0
         goal = (right - self.matrix @ x)[free]
         key = free.tobytes()
         inverse = self._inverses.get(key)
         block = self._solvable[np.ix_(free, free)]
         if inverse is None:
+            # Frame after frame the same few sets of variables are free, so that an inverse pays where a solve would
+            # not.
             inverse = self._inverses[key] = np.asarray(np.linalg.inv(block), np.float64)
             if len(self._inverses) > KEPT:
                 self._inverses.popitem(last=False)

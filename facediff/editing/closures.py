@@ -51,6 +51,7 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     still = rest[upper] - rest[lower]
     gaps = np.asarray(animation.vertices[:, upper], np.float64) - animation.vertices[:, lower] - still
     apart = np.linalg.norm(gaps, axis=-1).mean(1)
+    # The direction in which lips part is that of the widest fifth of the frames: at rest, gaps have none.
     widest = gaps[apart >= np.quantile(apart, 0.8)].mean(0)
     if apart.max(initial=0) < LEAST * metre or not bumps.any():
         return animation
@@ -61,6 +62,7 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     per_unit = float(((shape[upper] - shape[lower]) * direction).sum(-1).mean())
     if per_unit < 0.2:
         return animation  # nothing that moves with the opening closes it: this face does not open its mouth
+    # Lips pressed together more firmly than at rest are left as they are.
     excess = np.maximum(opening, 0) / per_unit
     reach = float(np.linalg.norm(shape, axis=-1).max()) or 1.0
     amounts = np.zeros(len(excess))
@@ -101,6 +103,7 @@ def _shape_of_opening(animation: Animation, opening: Array) -> Array:
     slope = np.zeros(animation.template.shape)
     for amount, frame in zip(centred, animation.frames(), strict=True):
         slope += amount * np.asarray(frame, np.float64)
+    # Brows and lids move with speech without opening the mouth, and must not follow it when it closes.
     weights = np.ones(len(slope))
     if "upper_face" in animation.regions:
         weights = region_factors(animation.template, animation.regions, {"upper_face": 0.0, ALL: 1.0})

@@ -181,6 +181,7 @@ class ControlledFace:
                 values = values * (strength > 0 if name == "lids" else strength)
                 limits = channel_of(name).range
                 assert limits is not None  # noqa: S101 - for the type checker
+                # Keys and acting add up, within what the channel allows for keys alone.
                 poses[name] = np.clip(poses[name] + values if name in poses else values, limits.least, limits.most)
         turned = any(name in poses for name in HEAD)
         return Amounts(

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+# As much as the stiffest round: with less, the first rounds would pull the target away from its landmarks.
 LANDMARK_TRUST = 100.0
 CLOSE, FAR = 0.1, 0.3
 """Distances, as shares of the face's size, from which on motion fades, and from which on a vertex stands still."""
@@ -113,6 +114,8 @@ def correspond(
     # trust in a place by the distance that is left after it.
     away = np.linalg.norm(laid.vertices - nearest_points.points, axis=1) / source.size
     left = nearest_points.distances / source.size
+    # Thin parts such as lips have a sheet on either side. A place on one whose normal is turned by more than 107
+    # degrees (a cosine of -0.3) is not trusted at all, one that is turned by less than 73 degrees fully.
     trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((nearest_points.cosines + 0.3) / 0.6, 0.0, 1.0)
     share = np.clip((FAR - left) / (FAR - CLOSE), 0.0, 1.0)
     corners, weights = nearest_points.corners, nearest_points.weights
@@ -287,6 +290,7 @@ class Partners:
         """The nearest point of each target vertex (Vt, 3) on its part of the source."""
         by_part = [nearest(surface, points[some], normals[some], self.size) for some, surface in self.parts]
         order = np.argsort(np.concatenate([some for some, _ in self.parts]))
+        # Parts list the target's vertices in their own order; sorting brings the rows back to that of the mesh.
         names = (field.name for field in fields(Nearest))
         return Nearest(**{name: np.concatenate([getattr(part, name) for part in by_part])[order] for name in names})
 
@@ -308,6 +312,7 @@ def partners(source: Surface, laid: Surface, features: tuple[Features, Features]
     away = np.linalg.norm(goals[:, None] - centres[None], axis=2)
     alike = np.abs(np.log(extents[:, None] / sizes[None])) < np.log(ALIKE)
     limit = NEAR * np.minimum(extents[:, None], sizes[None])
+    # A pair that is out of the question costs far more than staying without a partner, which costs 1.
     cost = np.where(alike & (away < limit), away / limit, 1e6)
     rest = source
     if features is not None:
@@ -446,6 +451,7 @@ def _warp(points: Array, features: Features, seen: Features) -> Array:
     total, weight, most = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
     for code, goal, own, _, width in sides:
         allowed = seen.codes != OPPOSITE[code]
+        # Every second sample is enough: the Gaussians are eight times as wide as the gaps between these samples.
         square = np.square(points[allowed, None] - own[None, ::2]).sum(axis=2)
         near = np.exp(-square / (WARP[0] * width) ** 2)
         total[allowed] += near @ (goal - own)[::2]
@@ -465,6 +471,7 @@ def _rims(base: Array, laid: Surface, features: Features, seen: Features) -> tup
         kept = (away < RIM * width) & (seen.codes[seeds] == code)
         names.append(seeds[kept])
         pulls.append((laid.vertices[seeds] + (goal - own)[sample] - base[seeds])[kept])
+    # Near a corner a vertex may lie along both curves: the upper one, which comes first, keeps it.
     rim = np.concatenate([np.zeros(0, np.int64), *names])
     rim, first = np.unique(rim, return_index=True)
     return rim, np.concatenate([np.zeros((0, 3)), *pulls])[first]
@@ -488,6 +495,8 @@ def smooth_field(values: Array, trust: Array, edges: Indices, stiffness: float) 
 
     # The small number keeps the matrix positive definite on pieces of the mesh where nothing is known.
     matrix = diags_array(trust + 1e-9) + stiffness * laplacian(_adjacency(edges, len(trust)))
+    # Symmetric and positive definite, so that no pivoting is needed and the factors stay sparse; SciPy has no sparse
+    # Cholesky factorisation.
     factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(factors.solve(trust[:, None] * values))
 
@@ -500,6 +509,7 @@ def averaging(trust: Array, faces: Indices) -> csr_array | None:
         return None
     near = _adjacency(edges_of(faces), len(trust))
     matrix = (diags_array((1.0 - trust) / np.maximum(near.sum(axis=1), 1.0)) @ near).tocsr()
+    # Rows of trusted vertices hold zeros only; without them the products touch the doubtful vertices alone.
     matrix.eliminate_zeros()
     return matrix
 

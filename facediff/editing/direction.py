@@ -452,6 +452,7 @@ def curve(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = False) -> 
     place, now = _places(when, times)
     following = np.minimum(place + 1, len(keys) - 1)
     first, last = values[place], values[following]
+    # Past the last key both are the same, and the division must not give NaN.
     span = np.maximum(when[following] - when[place], 1e-12)
     t = np.clip((now - when[place]) / span, 0.0, 1.0)
     kinds = np.array([key.interpolation for key in keys])[place]

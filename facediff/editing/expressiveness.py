@@ -90,6 +90,7 @@ def scale_regions(
     now: dict[str, float] = {}
     for index, frame in enumerate(animation.vertices):
         before, now = now, {name: float(values[index]) for name, values in in_frames.items()}
+        # Factors mostly stand still, and blending the regions costs as much as scaling a frame.
         if now != before:
             factor = weights.factors(now).astype(np.float32)
         offsets = frame - animation.template

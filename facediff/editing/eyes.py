@@ -269,6 +269,7 @@ def closing_of_lids(
             raise FaceDiffError("lids: an edge needs two vertices at least, from one corner of the eye to the other")
         edge = np.concatenate([upper, lower])
         way = np.concatenate([(1.0 - MEET) * _ways(top, bottom), MEET * _ways(bottom, top)])
+        # The straight way between the edges would lead through the eyeball, which bulges most in the middle.
         way[:, 2] += AHEAD * width * np.concatenate([_arch(top), 0.5 * _arch(bottom)])
         distance = np.linalg.norm(places[:, None] - places[edge], axis=-1)
         near = np.flatnonzero(distance.min(axis=1) < REACH * width)
@@ -276,6 +277,7 @@ def closing_of_lids(
         # Inverse distances to the fourth power: at an edge vertex its own way alone, in between a blend.
         pull = 1.0 / np.maximum(distance[near], 1e-6 * width) ** 4
         blended = share[:, None] * (pull @ way) / pull.sum(axis=1, keepdims=True)
+        # Where the reach of both eyes overlaps, at the bridge of the nose, the nearer eye decides.
         larger = np.linalg.norm(blended, axis=1) > np.linalg.norm(closing[near], axis=1)
         closing[near[larger]] = blended[larger]
     if rigid is not None:

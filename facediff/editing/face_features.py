@@ -179,6 +179,7 @@ class Seen:
         both = np.unique(np.sort(both, axis=1), axis=0)
         both = both[both[:, 0] != both[:, 1]]
         lengths = np.linalg.norm(self.vertices[used[both[:, 0]]] - self.vertices[used[both[:, 1]]], axis=1)
+        # SciPy's sparse graphs take an explicit zero for a missing edge; welded vertices lie at distance 0.
         lengths = np.maximum(lengths, 1e-12)
         lengths_of_edges = csr_array((lengths, (both[:, 0], both[:, 1])), shape=(len(used),) * 2)
         rows = np.full(len(self.vertices), -1)
@@ -204,13 +205,17 @@ class Seen:
         area = _cross(b - a, c - a)
         safe = np.where(np.abs(area) < 1e-12, 1.0, area)
         wb, wc = _cross(p - a, c - a) / safe, _cross(b - a, p - a) / safe
+        # The tolerance lets both triangles at an edge claim the pixels on it: no ray slips through between them.
         inside = (np.abs(area) >= 1e-12) & (wb >= -1e-9) & (wc >= -1e-9) & (wb + wc <= 1 + 1e-9)
         which, column, row = which[inside], column[inside], row[inside]
         wb, wc = wb[inside], wc[inside]
         weights = np.stack([1 - wb - wc, wb, wc], 1)
         depth = (weights * points[which, :, 2]).sum(axis=1)
+        # Per pixel the nearest triangle comes first, and of equally deep ones the one with the smaller number, so
+        # that sheets which lie on one another are seen the same way everywhere.
         order = np.lexsort((which, -depth, row * columns + column))
         pixel = (row * columns + column)[order]
+        # np.unique gives the first row of each pixel, which is the best one.
         head = np.unique(pixel, return_index=True)[1]
         best = order[head]
         number: Indices = np.full(rows * columns, -1, np.int64)
@@ -264,6 +269,7 @@ class Seen:
             return None
         number, depth, weights = self.raster(kept, low, step, columns, rows)
         number, depth, weights = number[::-1], depth[::-1], weights[::-1]  # from the top down
+        # An odd height keeps the closing centred on its pixel.
         tall = max(3, int(highest * expected / step) | 1)
         # The inside of an open mouth lies behind the surface that spans the lips.
         finite = np.where(number >= 0, depth, depth[number >= 0].min() if (number >= 0).any() else 0.0)
@@ -274,6 +280,8 @@ class Seen:
             return None
         above, below = number[pairs[:, 0], pairs[:, 2]], number[pairs[:, 1], pairs[:, 2]]
         a, b = self.corners[above], self.corners[below]
+        # Triangles with a common corner are joined, however far apart their pixels are. This cheap test spares most
+        # of the searches along the surface below.
         apart = ~(a[:, :, None] == b[:, None, :]).any(axis=(1, 2))
         pairs, above, below, a, b = (part[apart] for part in (pairs, above, below, a, b))
         if not len(pairs):
@@ -282,6 +290,8 @@ class Seen:
         straight = np.linalg.norm(first - second, axis=1)
         margin = 0.6 * expected
         graph, place = self.graph(self.within(low - margin, high + margin, skin))
+        # On whole skin the way along the surface is hardly longer than the straight line; across an opening it leads
+        # round one of the corners. The share of the width keeps bumps from counting as openings.
         limit = FARTHER * straight + PARTED * expected
         parted = self._ways_between(graph, place, (first, second), (a, b), limit) > limit
         # What is seen through a hole lies behind its rims, and the way round the hole may be short.
@@ -314,6 +324,7 @@ class Seen:
         starts, row = np.unique(place[corners[0]], return_inverse=True)
         row = row.reshape(-1, 3)
         shortest = np.full(len(limit), np.inf)
+        # In batches: all starts at a time would need a distance for every pair of a start and a vertex.
         for begin in range(0, len(starts), 256):
             inside = (row >= begin) & (row < begin + 256)
             some = np.flatnonzero(inside.any(axis=1))
@@ -329,6 +340,7 @@ class Seen:
         names = np.unique(pairs[:, 2])
         upper = np.stack([first[pairs[:, 2] == name][pairs[pairs[:, 2] == name, 0].argmin()] for name in names])
         lower = np.stack([second[pairs[:, 2] == name][pairs[pairs[:, 2] == name, 1].argmax()] for name in names])
+        # The median filter that smooths a side spans five samples.
         if len(names) < 5:
             return None
         sides = [_resampled(_smoothed(side)) for side in (upper, lower)]
@@ -416,6 +428,8 @@ def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low
         return None
     middle = 0.5 * (pairs[:, 0] + pairs[:, 1])
     tree = cKDTree(np.stack([pairs[:, 2] * 1.0, 0.75 * middle], 1))
+    # Pixels that lie a few columns or rows apart are one chain: teeth interrupt an opening, and it is steep at its
+    # corners.
     near = tree.query_pairs(4.5, output_type="ndarray")
     count = len(pairs)
     labels = connected_components(coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(count,) * 2), False)[
@@ -428,6 +442,8 @@ def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low
         if wide < LEAST:
             continue
         centre = low[0] + step * pairs[some, 2].mean()
+        # Width counts up to 1.3 of what is expected, so that a wide gap elsewhere does not beat the mouth in the
+        # middle.
         worth = min(wide, 1.3) - 1.0 * abs(centre - window.x) / window.expected
         if worth > most:
             best, most = some, worth
@@ -440,6 +456,7 @@ LEAST = 0.3  # An opening is at least this share of its expected width
 def _smoothed(points: Array) -> Array:
     from scipy.ndimage import gaussian_filter1d, median_filter
 
+    # The median drops single columns that saw a tooth or the far cheek; the Gaussian evens out the pixels' steps.
     steady = median_filter(points, size=(5, 1), mode="nearest")
     return np.asarray(gaussian_filter1d(steady, 1.0, axis=0, mode="nearest"))
 
@@ -498,6 +515,8 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
     width = expected_mouth.width
     x, y, _ = expected_mouth.centre
     skin, mouth = None, None
+    # The larger window finds a mouth that a rough alignment has put aside; it comes second, since it also shows
+    # nostrils.
     for grown in (1.0, 1.6):
         window = SearchWindow(x, y, 1.1 * width * grown, 0.55 * width * grown, width)
         skin = seen.skin_at(window)
@@ -520,6 +539,7 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
             eyes.append(None)
             continue
         if place is None:
+            # Proportions of an average face in widths of its mouth; the window leaves room for others.
             sign = 2 * side - 1
             window = SearchWindow(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)
         else:

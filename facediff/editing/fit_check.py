@@ -100,6 +100,7 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
         own = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
         mean = own.mean(axis=1)
         widest = int(mean[1:].argmax())
+        # Lips that are glued or torn show most where the mouth is widest.
         frames = np.unique(np.append(frames, widest))
         opening = float(mean[1 + widest] - mean[0])
         if opening * metres_per_unit(animation.unit) > SPEAKS:
@@ -198,6 +199,7 @@ def _crossed(
 
     own, own_rest = heights(animation, pairs, np.array([0.0, 1.0, 0.0]))
     new, new_rest = heights(carried, facing, up)
+    # Closed lips touch, and rounding puts some a little past one another: a millimetre is not yet a fault.
     slack = 0.001 / metres_per_unit(animation.unit)
     return float(((new < new_rest - scale * slack) & (own > own_rest - 0.5 * slack)).mean())
 
@@ -227,6 +229,7 @@ def _covered(animation: Animation, correspondence: Correspondence, frames: npt.N
     if not motion.any():
         return 1.0
     some = np.flatnonzero(motion > 0.05 * motion.max())
+    # A sample is enough for a share, and each place costs a search.
     if len(some) > 400:
         some = np.sort(np.random.default_rng(0).choice(some, 400, replace=False))
     laid = Surface(

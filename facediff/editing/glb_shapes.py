@@ -77,6 +77,7 @@ def _of_mesh(glb: Glb, index: int) -> Targets:
 
 def _joined(glb: Glb, parts: list[Placed]) -> Targets:
     """Parts one after the other; targets of one name are one shape, and a part that lacks it stands still."""
+    # An avatar's head, teeth and lashes each have a target called jawOpen: by name they are one shape again.
     columns: dict[str, int] = {}
     named = []
     for part in parts:

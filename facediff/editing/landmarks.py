@@ -164,6 +164,7 @@ def _lie_as_on_a_face(points: Array, landmarks: Mapping[str, int]) -> bool:
     lengths = np.linalg.norm(across, axis=1)
     if not (lengths > 0).all():
         return False
+    # All ways from right to left are parallel on a face; their sum is steadier than any of them.
     axis = across.sum(axis=0) / np.linalg.norm(across.sum(axis=0))
     if (across @ axis < PARALLEL * lengths).any():
         return False
@@ -174,6 +175,8 @@ def _lie_as_on_a_face(points: Array, landmarks: Mapping[str, int]) -> bool:
         return False
     eyes, mouth = (0.5 * (at[f"{base}_left"] + at[f"{base}_right"]) for base in ("eye_outer", "mouth_corner"))
     down = mouth - eyes
+    # From the eyes downwards: bridge, tip and base of the nose, then the chin, which lies beyond the mouth. A mesh of
+    # another order of vertices that passes the tests above fails this one.
     order = [float(down @ (at[name] - eyes)) for name in ("nose_bridge", "nose_tip", "nose_base", "chin")]
     return order == sorted(order) and order[-1] > float(down @ down) > 0.05 * size**2
 
@@ -406,6 +409,7 @@ def parse_landmarks(
     ]
     landmarks = Landmarks(tuple(names), places[0], places[1])
     for key, places_of, position in (("source", places[0], 0), ("target", places[1], 1)):
+        # The file says what it was picked on: vertex numbers of another mesh would be valid and wrong.
         count = content.get(f"{key}_vertices")
         expected = None if counts is None else counts[position]
         if count is not None and expected is not None and count != expected:

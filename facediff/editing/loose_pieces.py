@@ -67,6 +67,8 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
     extent = (np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)).max(axis=1)
     skin = laid.vertices[seen.skin]
     near = cKDTree(skin).query(points)[1]
+    # Behind the nearest skin, by its normal, for most of a piece's vertices: eyeballs and gums poke through here and
+    # there.
     inside = mean((np.einsum("nd,nd->n", points - skin[near], laid.normals[seen.skin][near]) < 0).astype(float)) > 0.7
     # Lips protrude, so that the line between them lies behind what hangs in front, such as a moustache.
     oral = (

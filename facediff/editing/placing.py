@@ -46,15 +46,20 @@ def place(
     random = np.random.default_rng(0)
     used = np.unique(moved.faces)
     used = used if len(used) <= samples else np.sort(random.choice(used, samples, replace=False))
+    # Seeded above: the same two meshes give the same similarity every time.
     points, normals, similarity = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
     for _ in range(rounds):  # Gauss-Newton on the distances to the planes, with Tukey's biweight
         laid = similarity.apply(points)
         there = nearest(goal, laid, normals @ similarity.rotation.T, size=0.0)
         # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
         # rest comes closer.
+        # 1.4826 turns the median of distances into a standard deviation, as for normally distributed errors. The
+        # floor keeps the weights defined for meshes that lie on one another exactly.
         spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
         weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
+        # Sheets that face another way, such as the inside of a lip or the back of the head, attract nothing.
         weights *= there.cosines > 0.5
+        # Seven unknowns want a few times as many places; with fewer, the similarity of the last round stands.
         if np.count_nonzero(weights) < 20:
             break
         step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
@@ -75,6 +80,7 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
     proper = [turn for turn in principal if np.linalg.det(turn) > 0]
     scale = face_size(target) / face_size(source)
     trials = []
+    # Axes as they are, the 24 rotations of a cube (programs swap axes), and principal axes, for meshes at an angle.
     for rotation in (np.eye(3), *Rotation.create_group("O").as_matrix(), *proper):
         trial = Similarity(rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0), scale)
         for _ in range(5):
@@ -95,9 +101,12 @@ def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Sim
     from scipy.spatial.distance import cdist
 
     away = cdist(current.apply(source), target)
+    # Pairs in both directions: one direction alone is best fitted by shrinking the mesh into a point.
     to, back = away.argmin(axis=1), away.argmin(axis=0)
     pairs = np.concatenate([np.stack([np.arange(len(source)), to]), np.stack([back, np.arange(len(target))])], axis=1)
     apart = away[pairs[0], pairs[1]]
+    # Trimmed: the furthest pairs are of parts that one mesh lacks (Chetverikov et al., "The trimmed iterative closest
+    # point algorithm", ICPR 2002).
     counted = apart <= np.quantile(apart, TRIMMED)
     similarity = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
     return similarity, float(apart[counted].mean() / face_size(target))
@@ -114,6 +123,7 @@ def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array,
     # Planes leave some directions undetermined (the rotation of a sphere): least squares does not move along them.
     turn, shift, growth = np.split(np.linalg.lstsq(weighted.T @ rows, weighted.T @ left, rcond=1e-9)[0], [3, 6])
     rotation = rotations(turn[None])[0]
+    # The solution holds to first order, for small steps: no round may grow or shrink a mesh by more than 1.65.
     scale = float(np.exp(np.clip(growth[0], -0.5, 0.5)))
     return Similarity(rotation, centre + size * shift - scale * rotation @ centre, scale)
 
@@ -162,6 +172,7 @@ def place_face(
             if seen is not None:
                 worth *= WITH_MOUTH * WITH_EYE ** sum(eye is not None for eye in seen.eyes)
             tried.append((worth, back, seen))
+            # A mouth and both eyes in their places settle it, and every further look costs a rendering of the mesh.
             if seen is not None and worth < CLEARLY * WITH_MOUTH * WITH_EYE**2 * apart:
                 break
         if any(seen is not None for _, _, seen in tried):
@@ -218,6 +229,8 @@ def _candidates_for(
     rotation, shift, scale = _starts(moved, goal, points, turns)
     own = np.abs(rotation - np.eye(3)).max(axis=(1, 2)) < 1e-9
     state = (rotation, shift, scale)
+    # Seven rounds with few points sort the starts; only the best ones are refined, with more points and a tighter
+    # cap.
     for _ in range(7):
         state, apart = _round(points[few], normals[few], tree, facing, state, 0.25 * width)
     apart = np.where(own, CLEARLY * apart, apart)
@@ -249,6 +262,7 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
     for part in (moved.vertices[used], *(part for part in parts if LEAST_GROUP <= len(part) < len(used))):
         extent = np.ptp(part, axis=0)
         for axis, sign in itertools.product(range(3), (1, -1)):
+            # Much longer than wide: a figure or a bust, whose face is at one of its ends.
             if extent[axis] < 1.6 * np.sort(extent)[0]:
                 continue
             along = sign * part[:, axis]
@@ -285,10 +299,12 @@ def _round(
     distance, index = distance.reshape(laid.shape[:2]) / scale[:, None], index.reshape(laid.shape[:2])
     cosine = np.einsum("bnd,bnd->bn", normals @ rotation.swapaxes(1, 2), facing[index])
     agree = cosine > 0.3
+    # The cap keeps what the other mesh lacks, such as hair, from deciding between alignments.
     apart = np.where(agree, np.minimum(distance / cap, 1.0), 1.0).mean(axis=1)
     limit = np.quantile(np.where(agree, distance, np.inf), 0.75, axis=1, method="lower")
     limit = np.where(np.isfinite(limit), limit, cap)
     weights = (agree & (distance <= np.maximum(limit, 1e-12)[:, None])).astype(np.float64)
+    # Too few points that face the same way would be fitted to noise: such an alignment stays as it is.
     enough = weights.sum(axis=1) >= 0.2 * len(points)
     weights[~enough] = 1.0
     new = _similarities(points, tree.data[index], weights)
@@ -305,6 +321,7 @@ def _similarities(points: Array, goals: Array, weights: Array) -> tuple[Array, A
     away, towards = points[None] - centre[:, None], goals - goal[:, None]
     u, spread, vt = np.linalg.svd(np.einsum("bn,bnd,bne->bde", share, towards, away))
     proper = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    # A reflection becomes the best rotation by its weakest axis.
     u[:, :, 2] *= proper[:, None]
     rotation = u @ vt
     variance = np.maximum(np.einsum("bn,bnd->b", share, away**2), 1e-30)

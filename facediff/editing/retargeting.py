@@ -110,6 +110,8 @@ def retarget(
     try:
         carried, correspondence = attempt(landmarks)
     except FaceDiffError:
+        # Named landmarks come second: a good fit needs none, and they are only known to a vertex, so that they would
+        # pull at it.
         named = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
         if named is None or judge is None:
             raise
@@ -183,6 +185,7 @@ def _carried_head(
     shifts = own.scale * head[:, 3:] @ own.rotation.T + own.translation - matrices @ own.translation
     height = own.inverse().apply(rest)[:, 1]
     low, high = correspondence.source_vertices[:, 1].min(), correspondence.source_vertices[:, 1].max()
+    # A figure's head turns on its neck: below the source's lowest vertex the turn fades, and its feet stay put.
     share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
     whole = bool((share == 1).all())
     for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
@@ -210,6 +213,8 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
         # Frames and coordinates become columns, so that one sparse product averages all of them.
         columns = carried.transpose(1, 0, 2).reshape(carried.shape[1], -1)
         trusted = correspondence.trust[:, None] * columns
+        # Jacobi steps of x = trust · x₀ + (1 − trust) · mean of the neighbours: each carries trusted motion one edge
+        # further into what is not trusted.
         for _ in range(ROUNDS):
             columns = trusted + smoothing @ columns
         carried = columns.reshape(carried.shape[1], carried.shape[0], 3).transpose(1, 0, 2)
@@ -304,6 +309,7 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
         used, corners = np.unique(faces, return_inverse=True)
         corners = corners.reshape(-1, 3)
         correspondence = correspond(neutral[used], corners, template, animation.triangles)
+        # Shapes state no unit; the alignment says how large they are.
         metres = correspondence.similarity.scale * metres_per_unit(animation.unit)
         shown = Animation(
             str(path), points[:, used].astype(np.float32), neutral[used].astype(np.float32), 1.0,

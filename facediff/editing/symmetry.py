@@ -54,11 +54,13 @@ def symmetry_plane(vertices: npt.NDArray[np.floating], start: Plane) -> Plane:
     plane = start
     for _ in range(ROUNDS):
         away, index = tree.query(plane.mirror(some))
+        # What has no mirror image, such as a parting or a scar, must not turn the plane.
         kept = away <= np.quantile(away, KEPT)
         first, second = some[kept], points[index[kept]]
         centre = 0.5 * (first.mean(axis=0) + second.mean(axis=0))
         product = (first - first.mean(axis=0)).T @ (second - second.mean(axis=0))
         normal = np.linalg.eigh(product + product.T)[1][:, 0]
+        # An eigenvector has no sign; the first guess tells left from right.
         normal = normal if normal @ start.normal > 0 else -normal
         mirror = Plane(normal, float(normal @ centre))
         moved = np.linalg.norm(mirror.normal - plane.normal) * size + abs(mirror.offset - plane.offset)

@@ -132,6 +132,7 @@ def robust_fit(
         before = rotation, translation, factor
         residual = _residuals(source, target, *before)
         spread = np.maximum(np.median(residual, axis=-1, keepdims=True) / MEDIAN_TO_SCALE, DEGENERATE * size)
+        # Tukey's biweight, (1 − (r / cσ)²)²: points beyond c standard deviations lose all influence.
         robust = np.square(np.clip(1.0 - np.square(residual / (TUKEY * spread)), 0.0, None))
         rotation, translation, factor = _fit(source, target, base * robust, scale)
         # The scale is not compared: where points lie off the origin, it cannot change without the translation.
@@ -152,10 +153,12 @@ def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Arra
     # A triple without outliers fits all points that did not move, whatever the others do; its median residual is then
     # small. Some hundred points are enough to compare medians, so that many frames are cheap.
     random = np.random.default_rng(0)
+    # Seeded, so that equal meshes are aligned by the same bits in every run and on every worker.
     judges = random.permutation(len(target))[:JUDGES]
     judged, goal = source[:, judges], target[judges]
     best = _fit(source, target, np.broadcast_to(base, source.shape[:2]), scale)
     least = np.median(_residuals(judged, goal, *best), axis=-1)
+    # Three points determine a rotation without a remainder: weights would change nothing.
     alike = np.ones((len(source), 3))
     for triple in random.integers(len(target), size=(TRIALS, 3)):
         trial = _fit(source[:, triple], target[triple], alike, scale, check=False)
@@ -177,6 +180,7 @@ def _fit(
         raise FaceDiffError("alignment: no point has any weight; expected at least three that are not on a line")
     share = (weights / total)[:, None, :]
     centre, goal = share @ source, share @ target
+    # The target need not be centred as well: the source's offsets sum to zero by weight.
     away = source - centre
     u, spread, vt = np.linalg.svd(((target - goal) * share.swapaxes(1, 2)).swapaxes(1, 2) @ away)
     if check and (spread[:, 1] <= DEGENERATE * np.maximum(spread[:, 0], np.finfo(float).tiny)).any():
@@ -294,6 +298,7 @@ def remove_rigid_motion(
         chunk += translation[:, None]
         out[part] = chunk
         rotations[part], translations[part] = rotation, translation
+        # Over the vertices of the fit only: what a speaking mouth moves says nothing about the alignment.
         residuals[part] = np.sqrt(np.square(chunk[:, every] - goal).sum(axis=-1).mean(axis=-1))
     return RigidMotion(out, rotations, translations, residuals)
 
@@ -316,6 +321,7 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
         FaceDiffError: if a frame that was used holds NaN, or its vertices do not determine a rotation.
     """
     some = _sample(frames, sample)
+    # A handful at least: with fewer vertices a single noisy one would turn the whole head.
     count = min(some.shape[1], max(10, round(share * some.shape[1])))
     stable = np.arange(some.shape[1])
     for _ in range(ROUNDS):
@@ -373,6 +379,7 @@ def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
 
 def _aligned_with_median(some: Array, stable: Indices) -> tuple[Array, Array]:
     """Frames (S, V, 3) aligned with the middle one, then twice with their median; and that median (V, 3)."""
+    # Vertices are spread over the list, not drawn at random: neighbours have neighbouring numbers in most meshes.
     anchors = stable[np.linspace(0, len(stable) - 1, min(len(stable), ANCHORS)).round().astype(int)]
     median = some[len(some) // 2]
     aligned = some

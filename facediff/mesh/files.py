@@ -91,6 +91,8 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
     listed = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
     LIMITS.check("vertices", (listed.count(b" ") + listed.count(b"\t")) // 4, path)
     first_face, last_vertex = max(data.find(b"\nf "), data.find(b"\nf\t")), data.rfind(b"\nv ")
+    # Negative numbers count back from the face's own line; with vertices after it they would name others here, where
+    # all vertices are read first.
     if b" -" in listed and 0 <= first_face < last_vertex:
         raise ValueError("faces between its vertices count backwards from where they stand")
     colours = np.rint(table[:, 3:6].clip(0, 1) * 255).astype(np.uint8) if width >= 6 else None

@@ -113,6 +113,8 @@ class Flame:
             posed = result[part]
             flat = posed.reshape(len(posed), -1)
             np.matmul(expression[part], self._basis[:count], out=flat)
+            # One product for a chunk of frames instead of one a frame; the basis has the jaw's rows only, since no
+            # other joint turns.
             flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
             posed += face
             joint = (self._jaw_regressor @ face + expression[part] @ self._jaw_basis[:count])[:, None]
@@ -188,6 +190,7 @@ def read_flame_arrays(path: Path) -> FlameArrays:
     template = _numbers(content, "v_template", path, (None, 3))
     count = len(template)
     weights = _numbers(content, "weights", path, (count, JOINTS))
+    # Eq. 2 leaves the share 1 − w of a vertex where it is: right only where the weights of all joints sum to 1.
     if np.abs(weights.sum(axis=1) - 1).max() > 1e-3:
         raise FaceDiffError(f"{path}: the weights of a vertex do not add up to 1; {HELP}")
     faces = _numbers(content, "f", path, (None, 3))
@@ -195,6 +198,7 @@ def read_flame_arrays(path: Path) -> FlameArrays:
         raise FaceDiffError(f"{path}: f names vertices that do not exist; {HELP}")
     parents = _numbers(content, "kintree_table", path, (2, JOINTS))[0].astype(np.int64)
     parents[0] = -1  # the files have 2³² − 1 there
+    # A parent comes before its children, so that one pass over the joints places all of them.
     if (parents[1:] < 0).any() or (parents >= np.arange(JOINTS)).any():
         raise FaceDiffError(f"{path}: kintree_table has the parents {parents.tolist()}; {HELP}")
     return FlameArrays(

@@ -97,6 +97,8 @@ class Glb:
         if count is not None and stated != count:
             raise ValueError(f"has a target of {stated} vertices where the mesh has {count}")
         LIMITS.check("vertices", stated if width > 1 else stated // 3, self.source)
+        # Thousands of accessors may name the same bytes: what they expand to counts, as float64, not what the file
+        # holds.
         self._expanded += stated * width * 8
         LIMITS.check("bytes", self._expanded, self.source)
         if "bufferView" in accessor:
@@ -136,6 +138,7 @@ class Glb:
             raise ValueError("has a negative or broken offset")
         if not count:
             return np.empty((0, width), kind)
+        # The last row need not be followed by its whole stride, as interleaved exporters write it.
         if offset + (count - 1) * stride + row > length or start + length > len(self.binary):
             raise ValueError("has data beyond its end")
         return np.ndarray((count, width), kind, self.binary, start + offset, (stride, kind.itemsize)).copy()
@@ -163,6 +166,7 @@ class Glb:
             return corners.reshape(-1, 3)
         if mode == STRIP:
             strip = np.stack([corners[:-2], corners[1:-1], corners[2:]], 1)
+            # Every second triangle of a strip winds the other way round.
             strip[1::2] = strip[1::2, [1, 0, 2]]
             return strip
         if mode == FAN:

@@ -97,6 +97,8 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
                     skins[number] = _stands(glb, number, nodes)
                 if len(skins[number]):
                     matrix = _skinned(glb, skins[number], primitive, len(local))
+            # A scale below zero turns a mesh inside out; its triangles are turned round so that they face outwards
+            # again. A skin has a matrix per vertex, of which the mean decides.
             mirrored = matrix is not None and np.linalg.det(matrix[..., :3, :3].reshape(-1, 3, 3).mean(axis=0)) < 0
             material = primitive.get("material")
             holders = [entry, glb.entry("meshes", mesh)]
@@ -148,6 +150,7 @@ def _placed_nodes(glb: Glb) -> dict[int, Array | None]:
     if scenes:
         roots = glb.entry("scenes", glb.content.get("scene", 0)).get("nodes", [])
     else:
+        # A file without scenes shows its roots: the nodes that are below no other one.
         below = {child for node in nodes for child in _list(node.get("children", [])) if type(child) is int}
         roots = [index for index in range(len(nodes)) if index not in below]
     if not nodes:
@@ -172,6 +175,7 @@ def _stands(glb: Glb, index: int, nodes: dict[int, Array | None]) -> Array:
     joints = _list(skin.get("joints", []))
     if not joints or not all(type(joint) is int and joint in nodes for joint in joints):
         return np.zeros((0, 4, 4))
+    # A joint's matrix times its inverse bind matrix is the identity in the pose that the skin was bound in.
     placed = np.stack([np.eye(4) if (own := nodes[joint]) is None else own for joint in joints])
     if "inverseBindMatrices" not in skin:
         return placed
@@ -199,6 +203,8 @@ def _skinned(glb: Glb, stands: Array, primitive: dict[str, Any], count: int) -> 
         for slot, share in zip(slots.T, shares.T, strict=True):
             placed += share[:, None, None] * stands[slot]
             total += share
+    # Vertices without any weight would collapse into the origin; as in the common viewers, the first joint takes
+    # them.
     lost = ~(total > 0)
     placed[lost], total[lost] = stands[0], 1.0
     return np.asarray(placed / total[:, None, None])

@@ -231,6 +231,7 @@ def _key(template: Points, faces: Indices, vertices: Indices | None, options: li
         library = "none"
     shapes = [len(template), len(faces), -1 if vertices is None else len(vertices)]
     digest = hashlib.sha256(json.dumps([VERSION, library, shapes, options]).encode())
+    # Little-endian, whatever the machine: one cache may be shared by several.
     digest.update(template.astype("<f4").tobytes())
     digest.update(faces.astype("<i8").tobytes())
     if vertices is not None:
@@ -284,7 +285,9 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
         raise FaceDiffError(f"coarsen: {n_vertices} vertices asked for; expected 1 to {len(points)}")
     labels = _clusters(points, faces, n_vertices)
     # The vertex of each cluster that is nearest to the cluster's mean; of equal ones the first.
+    # The vertex nearest to the mean stands for its cluster: the simplifier's own positions lie off the surface.
     square = np.square(points - _means(labels, n_vertices).apply(points)[labels]).sum(axis=1)
+    # Ties go to the smaller number, so that a hierarchy depends on the mesh alone and a checkpoint finds it again.
     order = np.lexsort((np.arange(len(points)), square, labels))
     chosen = order[np.searchsorted(labels[order], np.arange(n_vertices))]
     # Coarse vertices are numbered in the order of the chosen ones.
@@ -298,6 +301,7 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     coarse_faces = checked_faces(clusters[faces], n_vertices)
     coarse_faces = coarse_faces[np.sort(np.unique(np.sort(coarse_faces, axis=1), axis=0, return_index=True)[1])]
     corners, weights = project(points, coarse, coarse_faces, clusters)
+    # Weights of zero would make the operators larger for nothing: a point on an edge has two corners.
     rows, places = np.nonzero(weights > 0)
     up = Operator(rows, corners[rows, places], weights[rows, places].astype(np.float32), (len(points), n_vertices))
     return Coarse(coarse, coarse_faces, clusters, down, up)
@@ -327,6 +331,7 @@ def _clusters(points: Array, faces: Indices, n_vertices: int) -> Indices:
             roots[goes] = roots[stays]
         roots[loose] = roots[used[near]]
     labels = np.unique(roots, return_inverse=True)[1]
+    # The decoder's layers have fixed sizes: a level must have exactly so many vertices.
     while labels.max() >= n_vertices:
         labels = _merged(points, faces, labels, n_vertices)
     return labels
@@ -400,6 +405,8 @@ def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> 
     # neighbours, and the product with the matrix again one for every face around a vertex or one of its neighbours.
     index = np.arange(0, faces.size + 1, 3)
     touching = csr_array((np.ones(faces.size), faces.ravel(), index), shape=(len(faces), len(coarse))).T
+    # A point's nearest face lies next to its cluster's vertex or one edge further; searching all faces could jump to
+    # the other lip, which touches this one at rest.
     around = (touching @ touching.T @ touching).tocsr()
     pairs = around[clusters].tocoo()
     point, face = pairs.row, pairs.col

@@ -95,6 +95,7 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
     for vertex, follow in enumerate(follows):
         # An open fan starts at the neighbour that follows no other; a closed one has no such neighbour.
         ends = set(follow.values())
+        # Sorted, so that the order of a vertex's neighbours does not depend on the order of the faces in the file.
         starts = [*sorted(follow.keys() - ends), *sorted(follow.keys() & ends), *sorted(loose.get(vertex, ()))]
         seen: dict[int, None] = {}  # a set that keeps its order
         for start in starts:
@@ -119,6 +120,8 @@ def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
             if not any(fresh):
                 continue
             # In counter-clockwise order, the new vertices begin after the ones that are in the spiral already.
+            # The first new vertex after an old one, counter-clockwise: the outer ring goes on where the inner one
+            # ended.
             start = next((i for i, new in enumerate(fresh) if new and not fresh[i - 1]), 0)
             order = (*range(start, len(around)), *range(start))
             new = [around[i] for i in order if fresh[i]]
@@ -139,8 +142,10 @@ def _nearest(vertex: int, spiral: list[int], full_length: int, template: Points 
             f"template, so that the nearest vertices can fill the rest"
         )
     square = np.square(np.asarray(template, np.float64) - np.asarray(template[vertex], np.float64)).sum(axis=1)
+    # What is in the spiral already must not come twice.
     square[spiral] = np.inf
     missing = full_length - len(spiral)
+    # A partition finds the distance of the last one needed without sorting all vertices.
     reach = np.partition(square, missing - 1)[missing - 1]
     near = np.flatnonzero(square <= reach)  # by index, so that ties go to the smaller one
     nearest: list[int] = near[np.argsort(square[near], kind="stable")][:missing].tolist()
