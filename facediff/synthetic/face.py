@@ -346,11 +346,15 @@ def _fill(points: Array) -> list[tuple[float, float]]:
     new: list[tuple[float, float]] = []
     for row, level in enumerate(np.arange(LOWEST_LEVEL + 6, HIGHEST_LEVEL - 3, pitch)):
         limit = float(np.pi * radius(level))
-        for length in np.arange(4.0 + 0.5 * pitch * (row % 2), limit, pitch):
-            own = float(spacing(np.array(length / radius(level)), np.array(level)))
+        lengths = np.arange(4.0 + 0.5 * pitch * (row % 2), limit, pitch)
+        # The spacing is interpolated for a whole row at a time: point by point it took most of the six seconds that
+        # every process which needs the face would wait.
+        own_spacings = spacing(lengths / radius(level), np.full_like(lengths, level))
+        for length, own in zip(lengths, own_spacings.tolist(), strict=True):
+            if limit - length < 0.5 * own or length < 0.6 * own:
+                continue
             far = np.hypot(taken[:, 0] - length, taken[:, 1] - level)
-            nearest = (far / np.minimum(0.5 * (spacings + own), own)).min()
-            if nearest < 0.88 or limit - length < 0.5 * own or length < 0.6 * own:
+            if (far / np.minimum(0.5 * (spacings + own), own)).min() < 0.88:
                 continue
             if any(_inside(hole, np.array([[length, level]]))[0] for hole in holes):
                 continue

@@ -118,9 +118,8 @@ def test_mesh_file_can_be_read(corpus: Path) -> None:
 
 
 def test_same_seed_same_bytes_and_other_seed_other_motion(corpus: Path, tmp_path: Path) -> None:
-    some = ["F1_e01", "M3_e01"]
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        generate(tmp_path / name, seed=seed, only=some, progress=False)
+        generate(tmp_path / name, seed=seed, only=["F1_e01"], progress=False)
     first, second, other = (digests(tmp_path / name) for name in "abc")
     assert first == second
     assert first["wav/F1_e01.wav"] == other["wav/F1_e01.wav"]
