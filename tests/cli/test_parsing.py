@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
-from facediff.cli.app import COMMANDS, find, load
+from facediff.cli.app import COMMANDS, load
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.parsing import (
     RENAMED,
@@ -28,7 +26,6 @@ from facediff.utils.option import Option
 from facediff.utils.ranges import Range
 
 ROOT = Path(__file__).parents[2]
-CONSOLE = re.compile(r"^```(?:console|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 OWN_PARSERS = ("run", "lightning")
 FUNCTIONS = sorted(name for name in COMMANDS if COMMANDS[name].target.partition(":")[2] not in OWN_PARSERS)
 
@@ -269,27 +266,6 @@ def test_one_option_has_one_type_everywhere() -> None:
                 kind = (str(parameter.value_type), parameter.is_list)
                 found.setdefault(parameter.name, {}).setdefault(kind, command_name)
     assert {name: kinds for name, kinds in found.items() if len(kinds) > 1} == {}
-
-
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"])
-DOCUMENTED = [
-    (page.name, line.partition(" | ")[0])
-    for page in PAGES
-    for line in re.findall(
-        r"^(?:\$ )?(facediff [a-z].*)$", "\n".join(CONSOLE.findall(page.read_text("utf-8"))), re.MULTILINE
-    )
-]
-
-
-def test_documented_commands_parse() -> None:
-    assert len(DOCUMENTED) > 50
-    for page, line in DOCUMENTED:
-        words = shlex.split(line, comments=True)[1:]
-        if "--help" in words or "FIGURE" in words:
-            continue
-        name, rest = find(words)
-        if name in FUNCTIONS:
-            assert arguments_of(load(name), f"{page}: facediff {name}", rest)
 
 
 def test_every_number_of_every_command_has_a_range() -> None:
