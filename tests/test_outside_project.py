@@ -20,11 +20,22 @@ from facediff import registry
 ROOT = Path(__file__).parents[1]
 PROJECT = ROOT / "docs" / "examples" / "outside_project"
 ADDED = {
+    ("audio_encoder", "loudness"),
+    ("identity_encoder", "one_hot"),
+    ("motion_space", "halved"),
+    ("mesh_encoder", "distances"),
+    ("style_encoder", "mean"),
+    ("fusion", "gated"),
     ("decoder", "moving_average"),
+    ("sampler", "one_jump"),
     ("model", "AutoregressiveTransformer"),
     ("corpus", "ThreeSpeakers"),
     ("metric", "lip_range"),
+    ("augmentation", "reversed"),
+    ("voice_gate", "above_level"),
+    ("acting", "raised_brows"),
     ("export_format", "bounds"),
+    ("receiver", "counter"),
 }
 
 
@@ -58,6 +69,11 @@ def facediff(site: Path, *commands: list[str]) -> str:
     )
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-3000:]
     return run.stdout
+
+
+def test_the_package_has_one_of_every_kind() -> None:
+    assert {kind for kind, _ in ADDED} == registry.KINDS.keys()
+    assert len(ADDED) == len(registry.KINDS)
 
 
 def test_components_lists_the_extensions_of_an_installed_package(site: Path) -> None:
@@ -117,6 +133,25 @@ def test_an_installed_model_is_trained_scored_animated_exported_and_adapted(
     assert len(list(predictions.iterdir())) == 4
     assert "lip_range" in scores.read_text()
     assert torch.load(adapted, weights_only=True)["state_dict"]["identity_table.weight"].shape == (3, 16)
+
+
+def test_all_of_its_components_train_and_animate_together(site: Path, tiny_root: Path, tmp_path: Path) -> None:
+    """Dual-path diffusion of which every component is the package's; speech, gate and acting are as well."""
+    kinds = ("audio_encoder", "identity_encoder", "motion_space", "mesh_encoder", "style_encoder", "fusion")
+    names = dict(ADDED)
+    fit = ["--model=DualPathDiffusion", "--model.dim=16", "--data=ThreeSpeakers", f"--data.root={tiny_root}"]
+    fit += [f"--model.{kind}={names[kind]}" for kind in (*kinds, "decoder", "sampler")]
+    fit += ["--data.augmentations=[reversed]", "--data.augmented_share=1", "--trainer.max_epochs=1"]
+    fit += ["--trainer.accelerator=cpu", "--trainer.enable_progress_bar=false", f"--trainer.logger.save_dir={tmp_path}"]
+    checkpoint = tmp_path / "fit" / "version_0" / "checkpoints" / "last.ckpt"
+    speech = tmp_path / "speech.wav"
+    soundfile.write(speech, np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
+    animate = ["animate", str(speech), "--checkpoint", str(checkpoint), "--identity", "A", "--quiet"]
+    facediff(site, ["fit", *fit], [*animate, "--voice-gate", "above_level", "-o", str(tmp_path / "speech.npz")])
+    printed = facediff(site, ["live", str(checkpoint), str(speech), "--to", "counter", "--quiet"])
+    assert "25 frames" in printed
+    with np.load(tmp_path / "speech.npz") as archive:
+        assert np.isfinite(archive["vertices"]).all()
 
 
 def test_a_metric_of_its_own_needs_one_short_file() -> None:
