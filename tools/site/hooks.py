@@ -65,6 +65,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, site_path("docs", file.src_uri), content=notebook_page(file)))
     files.append(File.generated(config, "api/README.md", content=api_index(config.extra["api"])))
     files.append(File.generated(config, "assets/iframe-worker.js", abs_src_path=str(HERE / "iframe_worker.js")))
+    files.append(File.generated(config, "assets/site.css", abs_src_path=str(HERE / "site.css")))
     waiting = [file for file in files.documentation_pages() if file.abs_src_path]
     while waiting:
         file = waiting.pop()
@@ -119,11 +120,18 @@ def site_path(folder: str, link: str) -> str:
 
 
 def notebook_page(file: File) -> str:
-    """A notebook's text and code as Markdown, with a link to the notebook itself."""
+    """A notebook's text, code and printed outputs as Markdown, with a link to the notebook itself."""
     parts = []
     for cell in json.loads(file.content_string)["cells"]:
         text = "".join(cell["source"])
         parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text.replace(".ipynb)", ".md)"))
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            shown = "".join(output.get("text") or data.get("text/plain", "")).rstrip()
+            if picture := data.get("image/png"):
+                parts.append(f"![output](data:image/png;base64,{''.join(picture).replace(chr(10), '')})")
+            elif shown:
+                parts.append(f"```text\n{shown}\n```")
     title, _, rest = parts[0].partition("\n")
     parts[0] = f"{title}\n\n[The notebook]({file.name}.ipynb), to be run in Jupyter.\n{rest}"
     return "\n\n".join(parts) + "\n"
