@@ -1,8 +1,9 @@
-"""The notebooks run from top to bottom, with a small corpus and a few steps of training, and hold no outputs."""
+"""The notebooks run from top to bottom, with a small corpus and a few steps of training, and hold small outputs."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -72,11 +73,14 @@ def test_the_notebook_runs(path: Path, kernel: KernelManager, tmp_path: Path) ->
     assert 'src="http' not in text
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_the_notebook_is_committed_without_outputs(path: Path) -> None:
-    notebook = nbformat.read(path, as_version=4)
-    nbformat.validate(notebook)
-    assert path.stat().st_size < 20_000
-    for cell in notebook.cells:
-        assert cell.get("outputs", []) == []
-        assert cell.get("execution_count") is None
+def test_the_notebooks_are_committed_with_small_outputs() -> None:
+    assert len(NOTEBOOKS) >= 4
+    for path in NOTEBOOKS:
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+        assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1)), path
+        assert sum(bool(cell.outputs) for cell in cells) >= 3, path
+        text = path.read_text(encoding="utf-8")
+        assert len(text) < 30_000, path
+        assert not re.search(r"/(?:tmp|home|root|work|opt|Users)/", text), path
