@@ -17,6 +17,7 @@ from facediff.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from facediff import metrics as metrics
+    from facediff.animation.animation import Animation as Animation
     from facediff.editing.direction import Direction as Direction
     from facediff.editing.direction import Key as Key
     from facediff.editing.direction import read_direction as read_direction
@@ -24,17 +25,17 @@ if TYPE_CHECKING:
     from facediff.pipelines.animator import Animator as Animator
     from facediff.pipelines.animator import import_checkpoint as import_checkpoint
     from facediff.pipelines.animator import load as load
-    from facediff.pipelines.motion import Animation as Animation
     from facediff.pipelines.motion import read as read
     from facediff.pipelines.motion import view as view
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "animation.animation": "Animation",
         "editing.direction": "Direction Key read_direction",
         "errors": "FaceDiffError",
         "pipelines.animator": "Animator import_checkpoint load",
-        "pipelines.motion": "Animation read view",
+        "pipelines.motion": "read view",
     },
     packages="metrics",
 )

@@ -23,6 +23,7 @@ ALLOWED: dict[str, set[str]] = {
         "utils",
         "errors",
         "metrics",
+        "animation",
         "editing",
         "pipelines",
     },  # most of it when a name is first used

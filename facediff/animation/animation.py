@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from pathlib import Path
+from typing import Any, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.animation.options import (
+    AnimationControls,
+    ControlKeywords,
+    ExportKeywords,
+    ExportOptions,
+    with_options,
+)
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh.flame import rotations
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import in_range
+from facediff.utils.lazy import late
 from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, check_number
 from facediff.utils.units import metres_per_unit as metres_per_unit
 
@@ -22,9 +31,14 @@ MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are 
 OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
 
 
-@dataclass(frozen=True, eq=False)
+MOTION = "facediff.pipelines.motion"  # What shows, changes and writes animations
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Animation:
-    """Finished motion of one face, with everything that players, exporters and retargeting need.
+    """Finished motion of one face: to look at, to compare, to change and to write.
+
+    It has everything that players, exporters and retargeting need. In a notebook it plays, with its speech.
 
     Attributes:
         name: its name in messages and in files.
@@ -49,8 +63,8 @@ class Animation:
     Example:
         >>> template = np.zeros((4, 3), np.float32)
         >>> animation = Animation("hello", np.stack([template] * 50), template, frame_rate=25)
-        >>> animation.seconds
-        2.0
+        >>> animation
+        Animation("hello": 50 frames, 2.00 s at 25 a second, 4 vertices in m, silent)
     """
 
     name: str
@@ -167,3 +181,131 @@ class Animation:
             return None
         wanted = round(self.seconds * self.sample_rate)
         return np.pad(self.speech[:wanted], (0, max(0, wanted - len(self.speech)))).astype(np.float32)
+
+    @with_options(ExportOptions, ExportKeywords)
+    def save(self, path: str | Path, **options: Unpack[ExportKeywords]) -> list[Path]:
+        """Write a file of any export format; all of it, or nothing.
+
+        Args:
+            path: the file; its suffix chooses the format: .npz keeps everything, .glb, .usdc, .mp4, .html …
+            options: listed below; those that the format does not use are refused.
+
+        Returns:
+            the file, and those that were written next to it.
+
+        Raises:
+            FaceDiffError: if there is no such format, it does not support an option, or a file cannot be written.
+        """
+        files: list[Path] = late(f"{MOTION}:save")([self], path, options)
+        return files
+
+    def compare(
+        self, truth: Animation, output: str | Path | None = None, *, labels: Sequence[str] | None = None
+    ) -> Any:  # noqa: ANN401 - facediff.pipelines.motion.Page
+        """The animation next to the truth, with a heat map of each vertex's distance from it.
+
+        The longer one is cut to the shorter.
+
+        Args:
+            truth: a motion of the same face at the same frame rate, such as :func:`facediff.read` gives.
+            output: an .html file to write as well.
+            labels: names to show, the truth's first.
+
+        Returns:
+            the page, which plays in a notebook and can be written with :meth:`Page.save`.
+
+        Raises:
+            FaceDiffError: if the two cannot be compared, or the file cannot be written.
+        """
+        return late(f"{MOTION}:compare")([self], truth, output, labels)
+
+    @with_options(AnimationControls, ControlKeywords)
+    def control(self, **options: Unpack[ControlKeywords]) -> Animation:
+        """The animation with animation controls applied: ``anim.control(expressiveness=1.2, blinks=True)``.
+
+        Args:
+            options: listed below.
+
+        Raises:
+            FaceDiffError: if a value is out of range, or does not fit the face.
+        """
+        animation: Animation = late(f"{MOTION}:control")(self, AnimationControls(**options))
+        return animation
+
+    def retarget(
+        self,
+        target_mesh: str | Path,
+        *,
+        correspondence: str | Path | None = None,
+        landmarks: str | Path | None = None,
+    ) -> Animation:
+        """The same motion on another mesh.
+
+        Args:
+            target_mesh: the other face at rest: .obj, .ply, .glb …
+            correspondence: .npz to use if it exists, else to write for other animations.
+            landmarks: .csv of pairs of vertices that are one place, or the .json of `facediff retarget --pick`.
+
+        Raises:
+            FaceDiffError: if a file cannot be read, or the mesh does not fit.
+        """
+        animation: Animation = late(f"{MOTION}:retarget")(self, target_mesh, correspondence, landmarks)
+        return animation
+
+    def blendshapes(
+        self,
+        shapes: str | Path,
+        *,
+        carry: bool = False,
+        smoothness: float = 0.02,
+        symmetry: float = 0.0,
+        sparsity: float = 0.02,
+        bounds: tuple[float, float] = (0.0, 1.0),
+        region: str | None = None,
+        residual_limit: float = 0.8,
+        only_arkit: bool = False,
+    ) -> Any:  # noqa: ANN401 - facediff.editing.blendshapes.Weights
+        """Weights of blendshapes that come nearest to the motion; their ``save`` writes a table.
+
+        Args:
+            shapes: folder of .obj or .ply files named jawOpen, mouthFunnel …, a .glb with named targets, or ``puppet``
+                for those of the built-in face.
+            carry: the shapes are of another topology: transfer them to this mesh.
+            smoothness: cost of change over time; 0 is off.
+            symmetry: cost of a difference between left and right; 0 is off.
+            sparsity: cost of weights, which keeps shapes at 0 that would cancel one another; 0 is off.
+            bounds: least and greatest weight.
+            region: look at a region of the face only, such as ``lips``.
+            residual_limit: share of the motion that weights may leave before they are refused.
+            only_arkit: leave out shapes whose names are not ARKit's.
+
+        Raises:
+            FaceDiffError: if the shapes cannot be read or do not fit, or a number is out of range.
+        """
+        return late(f"{MOTION}:blendshapes")(
+            self,
+            shapes,
+            carry=carry,
+            only_arkit=only_arkit,
+            smoothness=smoothness,
+            symmetry=symmetry,
+            sparsity=sparsity,
+            lower=bounds[0],
+            upper=bounds[1],
+            region=region,
+            residual_limit=residual_limit,
+        )
+
+    def _repr_html_(self) -> str | None:
+        """What a notebook shows: the face, which plays; nothing but the text where there is no mesh."""
+        text: str | None = late(f"{MOTION}:Page")([self])._repr_html_()
+        return text
+
+    def __repr__(self) -> str:
+        metadata = self.metadata
+        facts = [f"{len(self.vertices)} frames", f"{self.seconds:.2f} s at {self.frame_rate:g} a second"]
+        facts += [f"{len(self.template)} vertices in {self.unit}"]
+        facts += [f"identity {metadata['identity']}"] if "identity" in metadata else []
+        facts += [f"style of {metadata['style']}"] if "style" in metadata else []
+        facts += ["with speech" if self.speech is not None else "silent"]
+        return f'Animation("{self.name}": {", ".join(facts)})'

@@ -31,12 +31,7 @@ Precision = Literal["32", "bf16"]
 
 # In a union, the first type is that of the command line.
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from facediff.animation.animation import Animation
-
-    StyleLike = str | Path | Mapping[str, float] | Animation | npt.NDArray[np.floating] | Any
+    StyleLike = str | Path | Mapping[str, float] | Any
     DirectionLike = Path | str | Sequence[Mapping[str, Any]] | Mapping[str, Any] | Any
 else:
     StyleLike = str | Any
@@ -381,7 +376,25 @@ GROUPS = (GenerationOptions, WindowOptions, RecordingOptions, AnimationControls,
 """The groups that :class:`AnimationOptions` consists of, in the order of help texts."""
 
 
-class StreamKeywords(TypedDict, total=False):
+class ActingKeywords(TypedDict, total=False):
+    """Keyword arguments of what moves the face while speech arrives."""
+
+    controls_seed: int | None
+    direction: DirectionLike | None
+    acting: str | None
+
+
+class ControlKeywords(ActingKeywords, total=False):
+    """Keyword arguments of ``Animation.control``."""
+
+    expressiveness: Scales | None
+    blinks: float | bool | None
+    gaze: float | bool | None
+    sway: float | bool | None
+    eyes: FilePath | None
+
+
+class StreamKeywords(ActingKeywords, total=False):
     """Keyword arguments of ``Animator.stream``: the options that need no whole recording."""
 
     identity: str | None
@@ -397,13 +410,10 @@ class StreamKeywords(TypedDict, total=False):
     window: float | None
     overlap: float | None
     low_latency: bool
-    controls_seed: int | None
-    direction: DirectionLike | None
-    acting: str | None
     precision: Precision
 
 
-class RecordingKeywords(StreamKeywords, total=False):
+class RecordingKeywords(StreamKeywords, ControlKeywords, total=False):
     """Keyword arguments of ``Animator.animate`` but for the number of samples, which decides what it returns."""
 
     max_seconds: float | None
@@ -411,11 +421,6 @@ class RecordingKeywords(StreamKeywords, total=False):
     alignment: FilePath | None
     transcript: str | None
     closure_budget: float | None
-    expressiveness: Scales | None
-    blinks: float | bool | None
-    gaze: float | bool | None
-    sway: float | bool | None
-    eyes: FilePath | None
     target_mesh: FilePath | None
     correspondence: FilePath | None
 

@@ -136,7 +136,8 @@ def animate(
             retry_failed=batch.retry_failed,
         )
     from facediff.export import check_export
-    from facediff.pipelines.animate import check_options, direction_for, open_pipeline
+    from facediff.pipelines.animate import check_options, direction_for
+    from facediff.pipelines.opening import open_pipeline
     from facediff.speech.inputs import read_recording
     from facediff.speech.voice_activity import speech_problems
 

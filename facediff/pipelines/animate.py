@@ -1,8 +1,8 @@
 """Recordings of speech animated with one model, one face and one style: all that is not the model's own.
 
-From top to bottom: what is refused before a model is loaded (:func:`check_options`); :func:`open_pipeline`; and
-:class:`AnimationPipeline`, which takes speech from samples to finished animations and files. Subclasses generate the
-motion: with PyTorch (:mod:`facediff.pipelines.trained`) or without (:mod:`facediff.pipelines.exported`).
+From top to bottom: what is refused before a model is loaded (:func:`check_options`); and :class:`AnimationPipeline`,
+which takes speech from samples to finished animations and files. Subclasses generate the motion: with PyTorch
+(:mod:`facediff.pipelines.trained`) or without (:mod:`facediff.pipelines.exported`).
 """
 
 from __future__ import annotations
@@ -89,31 +89,6 @@ def gate_of(options: AnimationOptions) -> VoiceGate | None:
     from facediff.speech.voice_activity import read_gate
 
     return read_gate(gate_text(options))
-
-
-def is_exported(source: str | Path) -> bool:
-    """Whether a model is a folder of ``facediff export-model``."""
-    return (Path(source) / "model.json").is_file()
-
-
-def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
-    """The pipeline for the model that the options name: trained, with PyTorch, or exported, without.
-
-    Raises:
-        FaceDiffError: if the model, the style or another option cannot be used.
-
-    Example::
-
-        pipeline = open_pipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))
-        pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), ExportOptions())
-    """
-    if is_exported(options.checkpoint):
-        from facediff.pipelines.exported import ExportedPipeline
-
-        return ExportedPipeline(options)
-    from facediff.pipelines.trained import TrainedPipeline
-
-    return TrainedPipeline(options)
 
 
 class AnimationPipeline(ABC):
@@ -409,8 +384,8 @@ class AnimationPipeline(ABC):
         if self._correspondence is not None:
             return carry(animation, self._correspondence, read_mesh(target))
 
-        def judge(retargeted: Animation, correspondence: Correspondence) -> None:
-            refuse_poor(target, check_fit(animation, retargeted, correspondence))
+        def judge(retargeted: Animation, fit: Correspondence) -> None:
+            refuse_poor(target, check_fit(animation, retargeted, fit))
 
         # All samples have one face, so that one correspondence serves all.
         is_known = file is not None and file.exists()

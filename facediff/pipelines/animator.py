@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast, overload
 
+from facediff.animation import Animation
 from facediff.animation.options import (
     AnimateKeywords,
     AnimationOptions,
@@ -21,8 +22,9 @@ from facediff.animation.options import (
 )
 from facediff.editing.controls import keys_of
 from facediff.errors import FaceDiffError, OptionError
-from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for, is_exported
-from facediff.pipelines.motion import Animation, Samples
+from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
+from facediff.pipelines.motion import Samples
+from facediff.pipelines.opening import is_exported
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hub import EXPECTED, check_model_source
 from facediff.utils.licences import Commercial, commercial_use, in_words
@@ -228,8 +230,7 @@ class SpeechAnimator(ABC):
                         pipeline.direct(keys_of(direction, pipeline.frame_rate))
                 waveform, usual_name = speech_of(recording, rate, chosen.max_seconds)
                 with pipeline.animations(waveform, name or usual_name) as finished:
-                    samples = [Animation.of(animation) for animation in finished]
-                animations.append(samples[0] if chosen.samples == 1 else Samples(samples))
+                    animations.append(finished[0] if chosen.samples == 1 else Samples(finished))
         return animations[0] if several is None else animations
 
     @with_options(AnimationOptions, StreamKeywords)

@@ -17,7 +17,8 @@ from facediff.animation.style_files import style_paths
 from facediff.editing.controls import check_controls, keys_file
 from facediff.errors import FaceDiffError, OptionError, choices, printable
 from facediff.export import FORMATS, check_export
-from facediff.pipelines.animate import check_options, is_exported, open_pipeline
+from facediff.pipelines.animate import check_options
+from facediff.pipelines.opening import is_exported, open_pipeline
 from facediff.speech.inputs import read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting

@@ -35,7 +35,7 @@ class VertexGenerator(Protocol):
         """The frames (m, V, 3) that are left."""
 
 
-class Performer(Protocol):
+class ActingStream(Protocol):
     """Acts to speech while it arrives."""
 
     def feed(self, samples: Array, /) -> Acted:
@@ -63,7 +63,7 @@ class AnimationStream:
         generator: VertexGenerator,
         *,
         rest: MouthAtRest | None = None,
-        performer: Performer | None = None,
+        performer: ActingStream | None = None,
         controls: Controls | None = None,
         rate: int = SAMPLE_RATE,
     ) -> None:

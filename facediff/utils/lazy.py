@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping
+from typing import Any
 
 
 def lazy_names(
@@ -40,3 +41,13 @@ def lazy_names(
 
     names = {*owner, *inside}
     return get, lambda: sorted({*names, *vars(sys.modules[package])}), sorted(names)
+
+
+def late(target: str) -> Callable[..., Any]:
+    """A function by its name, ``package.module:function``, imported when it is called for.
+
+    For methods of a plain class whose work is done by packages above it, which themselves work with the class.
+    """
+    module, _, name = target.partition(":")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function

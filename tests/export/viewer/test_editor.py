@@ -184,7 +184,7 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
 def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
     """The page starts from the take that was made with old keys; the other way is from the bare motion."""
     bare = facediff.Animation.of(directed(Direction([Key(0, "head.roll", 0.0)])))
-    bare = facediff.Animation.of(replace(bare, metadata={}))
+    bare = replace(bare, metadata={})
     old = [Key(0, "expressiveness", 2.0), Key(0, "head.yaw", -10.0, "linear"), Key(2, "head.yaw", 20.0)]
     new = [Key(0, "expressiveness", 0.5), Key(0, "expressiveness.lips", 3.0), Key(0, "head.pitch", 25.0)]
     made = bare.control(direction=Direction(old), sway=3.0)

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import pytest
 
-import facediff
 from tests.fakes.clicks import FRAMES, RATE, clicks
 from tools.browser.chromium import Chromium
 
 
 @pytest.mark.parametrize("kind", ["animation", "comparison"])
 def test_output_of_a_notebook_plays_by_itself(kind: str, browser: Chromium, tmp_path: Path) -> None:
-    anim = facediff.Animation.of(clicks())
-    shown = anim if kind == "animation" else anim.compare(facediff.Animation.of(clicks(lower=3.0)))
+    anim = clicks()
+    shown = anim if kind == "animation" else anim.compare(clicks(lower=3.0))
     notebook = tmp_path / "notebook.html"
     notebook.write_text(f"<!doctype html><title>notebook</title><body>{shown._repr_html_()}", encoding="utf-8")
     page = browser.open(notebook.as_uri(), width=900, height=640)

@@ -1,0 +1,36 @@
+"""The pipeline for a model, whichever kind it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from facediff.animation.options import AnimationOptions
+
+if TYPE_CHECKING:
+    from facediff.pipelines.animate import AnimationPipeline
+
+
+def is_exported(source: str | Path) -> bool:
+    """Whether a model is a folder of ``facediff export-model``."""
+    return (Path(source) / "model.json").is_file()
+
+
+def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
+    """The pipeline for the model that the options name: trained, with PyTorch, or exported, without.
+
+    Raises:
+        FaceDiffError: if the model, the style or another option cannot be used.
+
+    Example::
+
+        pipeline = open_pipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))
+        pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), ExportOptions())
+    """
+    if is_exported(options.checkpoint):
+        from facediff.pipelines.exported import ExportedPipeline
+
+        return ExportedPipeline(options)
+    from facediff.pipelines.trained import TrainedPipeline
+
+    return TrainedPipeline(options)
