@@ -189,9 +189,8 @@ def test_the_light_parts_load_nothing_heavy(program: str) -> None:
 
 
 def test_metrics_need_torch_and_torchmetrics_only() -> None:
-    before, after = modules_after("import torchmetrics"), modules_after("import facediff.metrics")
-    extra = {name.split(".")[0] for name in after - before}
-    assert extra - set(sys.stdlib_module_names) == {"facediff"}
+    # tests/metrics/test_metric_import.py has what is loaded beyond torchmetrics, and how long that takes.
+    after = modules_after("import facediff.metrics")
     # torchmetrics itself takes transformers, matplotlib and others along where they are installed, but not these.
     assert not {name.split(".")[0] for name in after} & {"lightning", "jsonargparse", "diffusers", "jaxtyping"}
     ours = {name for name in after if name.startswith("facediff.")}

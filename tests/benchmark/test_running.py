@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,6 @@ from facediff.benchmark.outline import outline_of, read_results
 from facediff.benchmark.results import cell_file
 from facediff.benchmark.running import Setting, estimate, fit_options, pending, remember, run_cells
 from facediff.benchmark.writing import document
-from facediff.cli.benchmark import corpus_folders
-from facediff.errors import FaceDiffError
 from facediff.reporting.documents import markdown
 
 LAUNCHER = (sys.executable, "-m", "facediff.utils.tethered", "tests.fakes.stand_in")
@@ -222,48 +219,3 @@ def test_options_take_the_place_of_the_checkpoints_before_them(folder: Path) -> 
     options = fit_options(cell.trainings[-1], {"prior": Path("p.ckpt")}, cell)
     assert options["model.prior"] == "p.ckpt"
     assert options["seed_everything"] == cell.seed
-
-
-WRONG: Sequence[tuple[str, str, str]] = (
-    ("seeds: [0, 1]\n", "", "seeds"),
-    ("seeds: [0, 1]", "seeds: []", "seeds"),
-    ("seeds: [0, 1]", "seeds: [0, 0]", "seeds"),
-    ("seeds: [0, 1]", "seeds: [-1]", "seeds"),
-    ("corpora: {tiny: {}}", "corpora: {}", "corpora"),
-    ("corpora: {tiny: {}}", "corpora: {tiny: {root: nowhere}}", "nowhere"),
-    ("config: one.yaml}", "config: missing.yaml}", "missing.yaml"),
-    ("one: {config: one.yaml}", "one: {}", "one"),
-    ("one: {config: one.yaml}", "one: {config: one.yaml, checkpoint: a.ckpt}", "checkpoint"),
-    ("one: {config: one.yaml}", "one: {checkpoint: a.ckpt}", "a.ckpt"),
-    ("one: {config: one.yaml}", "one: {checkpoint: .}", "config.json"),  # a folder that is no model
-    ("one: {config: one.yaml}", "one: {predictions: a}", "a"),
-    ("one: {config: one.yaml}", "one: {predictions: .}", "."),
-    ("one: {config: one.yaml}", "one: {config: one.yaml, options: {--model.dim: 3}}", "--model.dim"),
-    ("one: {config: one.yaml}", "one: {config: one.yaml, options: {seed_everything: 3}}", "seed_everything"),
-    ("baseline: one", "baseline: three", "three"),
-    ("baseline: one", "basline: one", "basline"),
-    ("baseline: one", "weights: middle", "weights"),
-    ("baseline: one", "threads: 0", "threads"),
-    ("baseline: one", "references: [moving]", "moving"),
-)
-
-
-def test_a_bad_plan_meets_one_sentence(folder: Path) -> None:
-    for old, new, named in WRONG:
-        assert old in PLAN
-        (folder / "plan.yaml").write_text(PLAN.replace(old, new, 1))
-        with pytest.raises(FaceDiffError) as caught:
-            cells_of(read_plan(folder / "plan.yaml"))
-        assert named in str(caught.value), new
-    assert not (folder / "out").exists()
-
-
-def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path) -> None:
-    (folder / "here").mkdir()
-    (cell, *_) = cells_of(read_plan(folder / "plan.yaml", corpus_folders([f"tiny={folder / 'here'}"])))
-    assert cell.root == folder / "here"
-    for words in (["tiny"], ["=x"], ["tiny=a", "tiny=b"]):
-        with pytest.raises(FaceDiffError, match="--root"):
-            corpus_folders(words)
-    with pytest.raises(FaceDiffError, match="huge"):
-        read_plan(folder / "plan.yaml", {"huge": folder})

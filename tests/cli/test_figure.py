@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -71,17 +68,12 @@ def test_every_figure(figure: str, corpus: Path, capsys: pytest.CaptureFixture[s
         assert picture.size[0] == round(85 / 25.4 * 80)
 
 
-def test_in_a_process_of_its_own(corpus: Path, tmp_path: Path) -> None:
-    given = words("frames", corpus, "--close-up", "-o", "out/figure.pdf")
-    run = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "facediff", *given],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert (run.returncode, run.stdout) == (0, "written: out/figure.pdf\n"), run.stderr
+def test_a_close_up_below_the_working_folder(
+    corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words("frames", corpus, "--close-up", "-o", "out/figure.pdf")) == 0
+    assert capsys.readouterr().out == "written: out/figure.pdf\n"
     assert (tmp_path / "out" / "figure.pdf").read_bytes().startswith(b"%PDF")
 
 

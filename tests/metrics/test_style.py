@@ -12,11 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchmetrics import MetricCollection
 
+import facediff.metrics as fm
 from facediff.metrics import (
-    RealTimeFactor,
     StyleRetrievalAccuracy,
-    device_name,
-    real_time_factor,
     style_retrieval_accuracy,
 )
 from facediff.metrics.style import Closeness
@@ -124,42 +122,96 @@ def test_embeddings_that_do_not_fit_are_refused(embeddings: torch.Tensor, labels
     assert metric.queries() == 2
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(st.floats(0, 100), st.floats(0.1, 100)), min_size=1, max_size=9))
-def test_the_factor_is_a_ratio_of_sums(times: list[tuple[float, float]]) -> None:
-    expected = sum(took for took, _ in times) / sum(spoken for _, spoken in times)
-    metric = RealTimeFactor("one core")
-    for took, spoken in times:
-        metric.update(took, spoken)
-    assert metric.compute().item() == pytest.approx(expected)
-    took, spoken = torch.tensor(times, dtype=torch.float64).unbind(1)
-    assert real_time_factor(took, spoken).item() == pytest.approx(expected)
+def gallery(people: int = 4, clips: int = 9) -> tuple[fm.SpeakerGallery, np.ndarray, np.ndarray]:
+    """People whose faces differ little, and vary a lot in one way that all of them share."""
+    rng = np.random.default_rng(0)
+    own, mood = rng.normal(size=(people, 6, 3)), 5 * rng.normal(size=(6, 3))
+    labels = np.repeat(np.arange(people), clips)
+    means = own[labels] + rng.normal(size=(len(labels), 1, 1)) * mood + 0.1 * rng.normal(size=(len(labels), 6, 3))
+    return fm.SpeakerGallery(torch.from_numpy(means), tuple(labels.tolist())), own, mood
 
 
-def test_measuring_takes_the_time_inside(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([10.0, 12.5, 20.0, 90.0])
-    monkeypatch.setattr("facediff.metrics.speed.time.perf_counter", lambda: next(clock))
-    metric = RealTimeFactor(device_name("cpu"))
-    with metric.measure(speech=5.0):
-        pass
-    with pytest.raises(RuntimeError, match="inside"), metric.measure(speech=1.0):
-        raise RuntimeError("inside")
-    assert metric.compute().item() == 0.5
-    assert f"on {device_name('cpu')} [1]" in metric.describe()
-    assert "thread" in device_name("cpu")
+def test_the_nearest_speaker_is_found_whatever_the_mood() -> None:
+    known, own, mood = gallery()
+    rng = np.random.default_rng(1)
+    clips = own[:, None] + 2 * rng.normal(size=(4, 1, 1, 1)) * mood + 0.3 * rng.normal(size=(4, 30, 6, 3))
+    motion = torch.from_numpy(clips)
+    euclid = [np.square(known.means.numpy() - clip.mean(0)).sum((1, 2)).argmin() // 9 for clip in clips]
+    assert euclid != [0, 1, 2, 3]  # mood would decide
+    assert fm.nearest_speaker_accuracy(motion, [0, 1, 2, 3], known, shrinkage=1e-3).item() == 1.0
+    assert fm.nearest_speaker_accuracy(motion, [1, 2, 3, 0], known, shrinkage=1e-3).item() == 0.0
+    template = torch.from_numpy(rng.normal(size=(4, 6, 3)))
+    absolute = motion + template[:, None]
+    found = fm.nearest_speaker_accuracy(absolute, [0, 1, 2, 3], known, shrinkage=1e-3, template=template)
+    assert found.item() == 1.0
 
 
-def test_times_that_are_none_are_refused() -> None:
-    metric = RealTimeFactor("one core")
-    for took, spoken in ((-1.0, 1.0), (1.0, 0.0), (float("nan"), 1.0), (1.0, float("inf"))):
-        with pytest.raises(ValueError, match="must be positive seconds"):
-            metric.update(took, spoken)
-    with pytest.raises(ValueError, match="computing times of 2 clips, speech of 1"):
-        metric.update(torch.ones(2), 1.0)
-    with pytest.raises(ValueError, match="has no clip"):
-        metric.compute()
-    with pytest.raises(ValueError, match="hardware is empty"):
-        RealTimeFactor(" ")
-    metric.update(1.0, 4.0)
-    metric.half()
-    assert pickle.loads(pickle.dumps(metric)).compute().item() == 0.25  # noqa: S301
+def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
+    known, _, _ = gallery()
+    rng = np.random.default_rng(2)
+    means, labels = known.means.numpy().reshape(36, -1), np.array(known.speakers)
+    for components, shrinkage in ((3, 0.1), (16, 0.5), (40, 0.2)):  # there are 18
+        _, _, axes = np.linalg.svd(means - means.mean(0), full_matrices=False)
+        points = (means - means.mean(0)) @ axes[:components].T
+        own = np.stack([points[labels == person].mean(0) for person in range(4)])
+        within = points - own[labels]
+        covariance = within.T @ within / (36 - 4)
+        size = len(covariance)
+        inverse = np.linalg.inv(covariance + shrinkage * np.trace(covariance) / size * np.eye(size))
+        clips = rng.normal(size=(40, 5, 6, 3)) * 4
+        gaps = ((clips.mean(1).reshape(40, -1) - means.mean(0)) @ axes[:components].T)[:, None] - own
+        nearest = np.einsum("npi,ij,npj->np", gaps, inverse, gaps).argmin(1)
+        metric = fm.NearestSpeakerAccuracy(known, components=components, shrinkage=shrinkage)
+        metric.update(torch.from_numpy(clips), nearest.tolist())
+        assert metric.compute().item() == 1.0
+
+
+def test_the_nearest_speaker_follows_from_offsets_alone() -> None:
+    """Where the gallery's faces all lie to one side, this side says nothing of a speaker."""
+    known, own, mood = gallery()
+    rng = np.random.default_rng(3)
+    motion = torch.from_numpy(own[:, None] + rng.normal(size=(4, 1, 1, 1)) * mood + np.zeros((4, 3, 6, 3)))
+    aside = torch.from_numpy(100 * rng.normal(size=(6, 3)))
+    moved = fm.SpeakerGallery(known.means + aside, known.speakers)
+    for gallery_of, shift in ((known, 0 * aside), (moved, aside)):
+        found = fm.NearestSpeakerAccuracy(gallery_of, components=8)
+        found.update(motion + shift, [0, 1, 2, 3])
+        assert found.compute().item() == 1.0
+
+
+def test_fewer_recordings_than_components_have_one_less_than_themselves() -> None:
+    known, _, _ = gallery(people=3, clips=2)
+    metric = fm.NearestSpeakerAccuracy(known)
+    assert metric.basis.shape == (5, 18)
+    torch.testing.assert_close(metric.basis @ metric.basis.T, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
+    offsets = known.means.flatten(1) - known.means.flatten(1).mean(0)
+    torch.testing.assert_close(offsets @ metric.basis.T @ metric.basis, offsets, rtol=0, atol=1e-9)
+    assert "among 3, by Mahalanobis distance within speakers in 16 principal components of 6" in metric.describe()
+
+
+def test_one_recording_of_each_speaker_is_compared_in_euclidean_distance() -> None:
+    rng = np.random.default_rng(4)
+    means = torch.from_numpy(rng.normal(size=(3, 5, 3)))
+    clips = torch.from_numpy(rng.normal(size=(50, 2, 5, 3)))
+    gaps = clips.mean(1).flatten(1)[:, None] - means.flatten(1)
+    metric = fm.NearestSpeakerAccuracy(fm.SpeakerGallery(means, (4, 9, 6)))
+    metric.update(clips, [(4, 9, 6)[place] for place in gaps.square().sum(2).argmin(1)])
+    assert metric.compute().item() == 1.0
+
+
+@pytest.mark.parametrize("options", [{"components": 0}, {"components": -1}, {"shrinkage": 0.0}, {"shrinkage": -0.1}])
+def test_a_space_without_components_and_a_covariance_that_may_vanish_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        fm.NearestSpeakerAccuracy(gallery()[0], **options)  # type: ignore[arg-type]
+
+
+def test_a_speaker_without_recordings_is_left_out() -> None:
+    known, _, _ = gallery()
+    metric = fm.NearestSpeakerAccuracy(known)
+    metric.update(known.means[:, None][[0, 0]], [0, 7])
+    assert metric.compute().item() == 1.0
+    assert metric.coverage().left_out == 1
+    with pytest.raises(ValueError, match="vertices"):
+        metric.update(torch.rand(1, 5, 4, 3), [0])
+    with pytest.raises(ValueError, match="two speakers"):
+        fm.SpeakerGallery(known.means[:2], (3, 3))

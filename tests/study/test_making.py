@@ -25,7 +25,6 @@ from facediff.study import StudyOptions, plan_study, read_study
 from facediff.study.definition import DATABASE, Trial
 from facediff.study.page import page_of
 from facediff.study.store import AnswerStore
-from facediff.study.texts import bundled_texts
 from tests.fakes.study import write_methods
 from tests.fakes.tiny import write_tiny
 
@@ -269,17 +268,3 @@ def test_a_study_that_was_changed_is_noticed(place: Path, capsys: pytest.Capture
     path.write_text(json.dumps(content))
     assert main(["study", "serve", "study"]) == 2
     assert "changed" in capsys.readouterr().err
-
-
-def test_every_language_has_every_text() -> None:
-    texts = bundled_texts()
-    assert set(texts) >= {"en", "de", "zh", "es", "fr"}
-    assert next(iter(texts)) == "en"
-    for language, words in texts.items():
-        assert words.keys() == texts["en"].keys()
-        assert words["questions"].keys() == texts["en"]["questions"].keys()
-        assert {"{n}", "{total}"} <= set(words["progress"].replace("{", " {").replace("}", "} ").split())
-        flat = {**words, **words["questions"]}
-        assert all(isinstance(text, str) and text.strip() for name, text in flat.items() if name != "questions")
-        same = [name for name, text in flat.items() if text == {**texts["en"], **texts["en"]["questions"]}[name]]
-        assert language == "en" or set(same) <= {"pause"}

@@ -1,0 +1,79 @@
+"""Plans: what is wrong with one is said in a sentence before anything runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from facediff.benchmark import cells_of, read_plan
+from facediff.cli.benchmark import corpus_folders
+from facediff.errors import FaceDiffError
+
+PLAN = """\
+seeds: [0, 1]
+baseline: one
+corpora: {tiny: {}}
+methods:
+  one: {config: one.yaml}
+  two: {config: two.yaml, before: {prior: {config: one.yaml}}, options: {model.prior: "{prior}"}}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a plan and two configs."""
+    monkeypatch.setenv("STAND_IN_CALLS", str(tmp_path / "calls"))
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    (tmp_path / "part.yaml").write_text("dim: 3\n")
+    (tmp_path / "one.yaml").write_text("model: part.yaml\n")
+    (tmp_path / "two.yaml").write_text("model: {dim: 4}\n")
+    (tmp_path / "plan.yaml").write_text(PLAN)
+    return tmp_path
+
+
+WRONG: Sequence[tuple[str, str, str]] = (
+    ("seeds: [0, 1]\n", "", "seeds"),
+    ("seeds: [0, 1]", "seeds: []", "seeds"),
+    ("seeds: [0, 1]", "seeds: [0, 0]", "seeds"),
+    ("seeds: [0, 1]", "seeds: [-1]", "seeds"),
+    ("corpora: {tiny: {}}", "corpora: {}", "corpora"),
+    ("corpora: {tiny: {}}", "corpora: {tiny: {root: nowhere}}", "nowhere"),
+    ("config: one.yaml}", "config: missing.yaml}", "missing.yaml"),
+    ("one: {config: one.yaml}", "one: {}", "one"),
+    ("one: {config: one.yaml}", "one: {config: one.yaml, checkpoint: a.ckpt}", "checkpoint"),
+    ("one: {config: one.yaml}", "one: {checkpoint: a.ckpt}", "a.ckpt"),
+    ("one: {config: one.yaml}", "one: {checkpoint: .}", "config.json"),  # a folder that is no model
+    ("one: {config: one.yaml}", "one: {predictions: a}", "a"),
+    ("one: {config: one.yaml}", "one: {predictions: .}", "."),
+    ("one: {config: one.yaml}", "one: {config: one.yaml, options: {--model.dim: 3}}", "--model.dim"),
+    ("one: {config: one.yaml}", "one: {config: one.yaml, options: {seed_everything: 3}}", "seed_everything"),
+    ("baseline: one", "baseline: three", "three"),
+    ("baseline: one", "basline: one", "basline"),
+    ("baseline: one", "weights: middle", "weights"),
+    ("baseline: one", "threads: 0", "threads"),
+    ("baseline: one", "references: [moving]", "moving"),
+)
+
+
+def test_a_bad_plan_meets_one_sentence(folder: Path) -> None:
+    for old, new, named in WRONG:
+        assert old in PLAN
+        (folder / "plan.yaml").write_text(PLAN.replace(old, new, 1))
+        with pytest.raises(FaceDiffError) as caught:
+            cells_of(read_plan(folder / "plan.yaml"))
+        assert named in str(caught.value), new
+    assert not (folder / "out").exists()
+
+
+def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path) -> None:
+    (folder / "here").mkdir()
+    (cell, *_) = cells_of(read_plan(folder / "plan.yaml", corpus_folders([f"tiny={folder / 'here'}"])))
+    assert cell.root == folder / "here"
+    for words in (["tiny"], ["=x"], ["tiny=a", "tiny=b"]):
+        with pytest.raises(FaceDiffError, match="--root"):
+            corpus_folders(words)
+    with pytest.raises(FaceDiffError, match="huge"):
+        read_plan(folder / "plan.yaml", {"huge": folder})

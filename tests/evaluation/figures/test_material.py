@@ -1,0 +1,88 @@
+"""What a figure is drawn from: clips that are chosen, and files and facts that are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from facediff.errors import FaceDiffError
+from facediff.evaluation.figures import (
+    FigureData,
+    Moment,
+    error_maps,
+    find_clips,
+    motion_maps,
+    opening_curves,
+    pick_frames,
+    read_pairs,
+)
+from tests.fakes.tiny import VERTICES
+
+CLIPS = ["A_e06", "A_e07", "B_e06"]
+Read = Callable[[str, str], NDArray[np.float64]]
+
+
+def test_lengths_are_cut_to_the_shortest_with_a_note(damaged: Callable[..., FigureData], read: Read) -> None:
+    whole = read("ours", "A_e06")
+    material = damaged(whole[:5])
+    maps, notes = error_maps(material, ["A_e06"])
+    assert maps["ours"].frames == 5
+    assert notes == [f"A_e06: lengths differ (truth {len(whole)}, ours 5 frames): cut to the first 5"]
+    assert motion_maps(material, ["A_e06"])[0]["truth"].frames == 5
+    curves, note = opening_curves(material, "A_e06", read_pairs("0-6", None, VERTICES))
+    assert len(curves.openings["truth"]) == 5
+    assert note is not None
+
+
+def test_a_stride_of_the_truth(own_material: FigureData, read: Read) -> None:
+    opened = replace(own_material, truth_stride=2).open("A_e06")
+    np.testing.assert_array_equal(opened["truth"].numpy(), read("truth", "A_e06")[::2].astype("f4"))
+
+
+def test_unusable_files_are_named(damaged: Callable[..., FigureData], read: Read) -> None:
+    whole = read("ours", "A_e06")
+    with pytest.raises(FaceDiffError, match=r"ours: .*A_e06.*holds no numbers"):
+        damaged(whole[:0]).open("A_e06")
+    with pytest.raises(FaceDiffError, match=r"ours: .*all methods of a figure have the truth's mesh of 24 vertices"):
+        damaged(whole[:, :20]).open("A_e06")
+    whole[2, 3, 1] = np.nan
+    material = damaged(whole)
+    for compute in (error_maps, motion_maps):
+        with pytest.raises(FaceDiffError, match=r"A_e06_condition_A\.npy: frame 2 holds NaN"):
+            compute(material, ["A_e06"])
+    with pytest.raises(FaceDiffError, match="frame 2 holds NaN"):
+        pick_frames(material, "A_e06", [Moment(0.09)])
+    assert pick_frames(material, "A_e06", [Moment(0.13)])  # other frames can be shown
+
+
+def test_choosing_clips(own_material: FigureData, tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> None:
+    assert own_material.choose(["B_e06", "B_e06"]) == ["B_e06"]
+    with pytest.raises(FaceDiffError, match=r'no clip "A_e66".*did you mean "A_e06"'):
+        own_material.choose(["A_e66"])
+    with pytest.raises(FaceDiffError, match=r'ours has no prediction of clip "C_e06"'):
+        own_material.choose(["C_e06"])
+    for other in ({"truth": methods["ours"]}, {"none": tmp_path}, {"gone": tmp_path / "gone"}):
+        with pytest.raises(FaceDiffError):
+            find_clips(other, tiny_root / "vertices_npy")
+    with pytest.raises(FaceDiffError, match="--identity all"):
+        find_clips(methods, tiny_root / "vertices_npy", identity="all")
+    parted = {name: {clip: Path()} for name, clip in zip(("ours", "theirs"), CLIPS, strict=False)}
+    with pytest.raises(FaceDiffError, match="truth and ours and theirs have no clip in common"):
+        replace(own_material, methods=parted).choose()
+
+
+def test_unknown_facts_name_the_option_that_gives_them(own_material: FigureData) -> None:
+    with pytest.raises(FaceDiffError, match="--mesh"):
+        replace(own_material, faces=None).mesh(["A_e06"])
+    with pytest.raises(FaceDiffError, match="--frame-rate"):
+        pick_frames(replace(own_material, frame_rate=None), "A_e06", [Moment(0.1)])
+    with pytest.raises(FaceDiffError, match="--templates"):
+        motion_maps(replace(own_material, templates={}), ["A_e06"])
+    np.testing.assert_array_equal(replace(own_material, templates={}).mesh(["A_e06"])[1], own_material.rest)
+    assert own_material.scale == (1000.0, "mm")
+    assert replace(own_material, unit="normalised (a long story)").scale == (1.0, "normalised")
