@@ -10,9 +10,9 @@ MANY = 40
 """Names that are no longer listed in full."""
 
 
-def choices(name: str, known: Iterable[str]) -> str:
+def choices(name: str, candidates: Iterable[str]) -> str:
     """What follows "there is no …": the nearest of the known names, then all of them, unless they are very many."""
-    names = list(known)
+    names = list(candidates)
     near = difflib.get_close_matches(name, names, n=1)
     hint = f'did you mean "{near[0]}"? ' if near else ""
     if near and len(names) > MANY:
@@ -28,10 +28,10 @@ def printable(text: object) -> str:
         >>> printable("clip\x1b[2J\n")
         'clip\\x1b[2J\\n'
     """
-    found = str(text)
-    if found.isprintable():
-        return found
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in found)
+    message = str(text)
+    if message.isprintable():
+        return message
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in message)
 
 
 LONGEST = 1400

@@ -184,8 +184,8 @@ class Kind:
         """
         text = text.replace(" ", "")
         name, _, rest = text.partition(":")
-        words = (word.partition("=") for word in filter(None, rest.split(",")))
-        pairs = [(option, value) for option, _, value in words]
+        parts = (word.partition("=") for word in filter(None, rest.split(",")))
+        pairs = [(option, value) for option, _, value in parts]
         return name, self.options(name, pairs, f"{self.kind} {text}", hidden)
 
     def options(
@@ -203,20 +203,20 @@ class Kind:
             UnknownComponentError: if nothing has the name; the message names the nearest.
             FaceDiffError: if there is no such option, or its value is of another kind.
         """
-        known = {
+        defaults_by_name = {
             option: parameter.default
             for option, parameter in inspect.signature(self.get(name)).parameters.items()
             if parameter.default is not inspect.Parameter.empty and option not in hidden
         }
         options = {}
         for option, value in pairs:
-            if option not in known:
-                offered = choices(option, known) if known else "it has none"
+            if option not in defaults_by_name:
+                offered = choices(option, defaults_by_name) if defaults_by_name else "it has none"
                 raise FaceDiffError(f"{shown}: {name} has no option {option!r}: {offered}")
             if not value:
                 raise FaceDiffError(f"{shown}: option {option} has no value; write {option}=VALUE")
             try:
-                options[option] = _value(value, known[option])
+                options[option] = _value(value, defaults_by_name[option])
             except ValueError as error:
                 raise FaceDiffError(f"{shown}: option {option} is {value!r}; expected {error}") from error
         return options
@@ -376,9 +376,9 @@ def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = 
             given_by_owner = name not in parameters() or parameters()[name].default is inspect.Parameter.empty
             return f"{sizes if sizes and given_by_owner else own}.{name}"
 
-        given = inspect.signature(init).bind_partial(self, *values, **options).arguments
-        given = {name: value for name, value in given.items() if name in hints()}
-        for name, value in given.items():
+        arguments = inspect.signature(init).bind_partial(self, *values, **options).arguments
+        arguments = {name: value for name, value in arguments.items() if name in hints()}
+        for name, value in arguments.items():
             expected = mismatch(hints()[name], value)
             if expected is not None:
                 raise ArgumentError({located(name): value}, f"expected {expected}", located=True)
@@ -388,7 +388,7 @@ def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = 
             raise error if error.located else error.at(located) from error.__cause__
         except (ValueError, RuntimeError, ArithmeticError, MemoryError) as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            named = {located(name): value for name, value in given.items() if isinstance(value, int | float | str)}
+            named = {located(name): value for name, value in arguments.items() if isinstance(value, int | float | str)}
             raise ArgumentError(
                 named or {own: type(self).__name__}, f"{type(self).__name__} cannot be made ({reason})", located=True
             ) from error
@@ -454,14 +454,14 @@ def defaults(component: type) -> dict[str, Any]:
 
     A constructor that takes ``**options`` hands them to its base class, whose options count too.
     """
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for cls in component.__mro__:
         if "__init__" in vars(cls):
             parameters = inspect.signature(vars(cls)["__init__"]).parameters.values()
-            found = {p.name: p.default for p in parameters if p.default is not p.empty} | found
+            options = {p.name: p.default for p in parameters if p.default is not p.empty} | options
             if all(p.kind is not p.VAR_KEYWORD for p in parameters):
                 break
-    return found
+    return options
 
 
 def keeps_arguments(init: Callable[..., None]) -> Callable[..., None]:
@@ -495,6 +495,6 @@ def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
             arguments with which it can be built without the files that it was first built from (a pretrained network).
     """
     description: dict[str, Any] = plain(factory)
-    given: dict[str, Any] = getattr(component, "checkpoint_init_args", dict)()
-    description["init_args"] = plain({**defaults(component_class(factory)), **description["init_args"], **given})
+    portable: dict[str, Any] = getattr(component, "checkpoint_init_args", dict)()
+    description["init_args"] = plain({**defaults(component_class(factory)), **description["init_args"], **portable})
     return description

@@ -320,12 +320,12 @@ def continue_bookkeeping(callback: ModelCheckpoint, checkpoint: dict[str, Any], 
 
     for name in ("best_model_path", "kth_best_model_path", "last_model_path"):
         state[name] = moved(str(state.get(name, "")))
-    known = {moved(str(path)): score for path, score in state.get("best_k_models", {}).items()}
-    state["best_k_models"] = {path: score for path, score in known.items() if path}
+    scores = {moved(str(path)): score for path, score in state.get("best_k_models", {}).items()}
+    state["best_k_models"] = {path: score for path, score in scores.items() if path}
     if last is not None:
         # Files that were written after it are written again, under the same names.
         since = last.stat().st_mtime
-        again = {str(path) for path in Path(folder).rglob("*.ckpt") if path.stat().st_mtime > since} - set(known)
+        again = {str(path) for path in Path(folder).rglob("*.ckpt") if path.stat().st_mtime > since} - set(scores)
         exists = callback.file_exists
         callback.file_exists = lambda filepath, trainer: filepath not in again and exists(filepath, trainer)  # type: ignore
 
@@ -393,7 +393,7 @@ def requeue(run: Path) -> None:
 
 def throughput_monitors(trainer: Trainer) -> list[ThroughputMonitor]:
     """The callbacks that count batches and samples, and keep no state."""
-    return [found for found in trainer.callbacks if isinstance(found, ThroughputMonitor)]  # type: ignore[attr-defined]
+    return [callback for callback in trainer.callbacks if isinstance(callback, ThroughputMonitor)]  # type: ignore[attr-defined]
 
 
 def elapsed(monitor: ThroughputMonitor) -> float:
@@ -414,9 +414,9 @@ def agreed(trainer: Trainer, due: bool, number: int) -> tuple[bool, int]:
     """What at least one process wants, known to all: whether to save, and the signal that has come."""
     if trainer.world_size == 1:
         return due, number
-    wanted = torch.tensor([int(due), number], device=trainer.strategy.root_device)
-    torch.distributed.all_reduce(wanted, op=torch.distributed.ReduceOp.MAX)
-    return bool(wanted[0]), int(wanted[1])
+    request = torch.tensor([int(due), number], device=trainer.strategy.root_device)
+    torch.distributed.all_reduce(request, op=torch.distributed.ReduceOp.MAX)
+    return bool(request[0]), int(request[1])
 
 
 def random_states() -> dict[str, Any]:

@@ -148,12 +148,12 @@ def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
     where the model has parts beside its network.
     """
     named = [(name.removeprefix("network."), p) for name, p in module.named_parameters() if p.requires_grad]
-    found = [(name.split("."), parameter.grad) for name, parameter in named]
-    shared = len(commonprefix([words[:-1] for words, _ in found])) if found else 0
+    gradients = [(name.split("."), parameter.grad) for name, parameter in named]
+    shared = len(commonprefix([path[:-1] for path, _ in gradients])) if gradients else 0
     parts: dict[str, list[Tensor]] = {}
-    for words, gradient in found:
+    for path, gradient in gradients:
         if gradient is not None:
-            parts.setdefault(words[shared], []).append(gradient)
+            parts.setdefault(path[shared], []).append(gradient)
     return parts
 
 

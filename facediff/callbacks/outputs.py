@@ -47,8 +47,8 @@ class EpochLines(Callback):
             return
         names = ["train/loss", *dict.fromkeys(checkpoint.monitor for checkpoint in trainer.checkpoint_callbacks
                                               if isinstance(checkpoint, ModelCheckpoint))]  # fmt: skip
-        found = trainer.callback_metrics
-        values = ", ".join(f"{name} {float(found[name]):.4g}" for name in names if name in found)
+        metrics = trainer.callback_metrics
+        values = ", ".join(f"{name} {float(metrics[name]):.4g}" for name in names if name in metrics)
         last = f" of {trainer.max_epochs}" if trainer.max_epochs not in (None, -1) else ""
         seconds = time.monotonic() - self._started
         print(f"epoch {trainer.current_epoch + 1}{last}: {values}, {seconds:.0f} s", file=sys.stderr, flush=True)

@@ -139,7 +139,7 @@ class SamplingPreview(Callback):
         if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("SamplingPreview works with facediff's models and data modules only")
         self._chosen = []
-        if [found for found in trainer.callbacks if type(found) is type(self)][-1] is not self:  # type: ignore[attr-defined]
+        if [callback for callback in trainer.callbacks if type(callback) is type(self)][-1] is not self:  # type: ignore[attr-defined]
             return
         clips = data.clips("val")
         missing = [name for name in self.names or [] if name not in {clip.name for clip in clips}]
@@ -249,7 +249,7 @@ def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]
     """A context with the weights in the model that a checkpoint would hold; its own are put back afterwards."""
     # At the end of training, callbacks before the averaging one see the raw weights and later ones the averaged. Saved
     # as into a checkpoint, the averaged ones are obtained in any order.
-    averaging = next((found for found in trainer.callbacks if isinstance(found, WeightAveraging)), None)  # type: ignore[attr-defined]
+    averaging = next((callback for callback in trainer.callbacks if isinstance(callback, WeightAveraging)), None)  # type: ignore[attr-defined]
     checkpoint: dict[str, Any] = {"state_dict": {}}
     if averaging is not None:
         averaging.on_save_checkpoint(trainer, model, checkpoint)
@@ -340,7 +340,7 @@ def draw_clip(
     assets = model.assets
     if assets.faces is None:
         raise FaceDiffError(f"{assets.corpus} has no mesh to draw")
-    found = scores(model, sample, motion)
+    clip_scores = scores(model, sample, motion)
     corpus = f"{assets.corpus}, synthetic corpus" if assets.synthetic else assets.corpus
     renderer = Renderer(
         assets.faces.numpy(),
@@ -356,7 +356,7 @@ def draw_clip(
         highest=error_scale,
         scale_label=length(error_scale, assets.unit),
         labels=("truth", "facediff", "error"),
-        footer=f"{sample.name} after epoch {epochs}: LVE {found['lve']:.3g} ({corpus})",
+        footer=f"{sample.name} after epoch {epochs}: LVE {clip_scores['lve']:.3g} ({corpus})",
     )
     count, rate = len(motion), assets.frame_rate
     picks = [round((i + 0.5) * (count - 1) / PICTURES) for i in range(PICTURES)]
@@ -375,7 +375,7 @@ def draw_clip(
     times = [f"{pick / rate:.2f} s" for pick in picks]
     sheet = contact_sheet([picked[pick] for pick in picks], COLUMNS, labels=times)
     save_image(video.with_suffix(".png"), sheet)
-    return ClipPreview(sample.name, video, sheet, sound, found)
+    return ClipPreview(sample.name, video, sheet, sound, clip_scores)
 
 
 def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, float]:

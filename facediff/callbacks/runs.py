@@ -150,7 +150,7 @@ def share_folder(loggers: Sequence[Logger]) -> None:
             logger._version = loggers[0].version
 
 
-def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any], words: Sequence[str]) -> bool:
+def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any], arguments: Sequence[str]) -> bool:
     """Prepare the trainer's loggers; whether a run is continued in its folder.
 
     Training that begins from any other file than a ``last.ckpt``, or with a place for its run on the command line, is
@@ -160,11 +160,11 @@ def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any]
         trainer: with loggers that have not been used yet.
         path: the checkpoint that training begins from.
         content: what is in it; empty if it is not there.
-        words: the command line.
+        arguments: the command line.
     """
     run = None if path is None or trainer.logger is None else run_of(path)
     place = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
-    if run is not None and any(place.match(word) for word in words):
+    if run is not None and any(place.match(word) for word in arguments):
         run = run if os.path.realpath(run.parent) == os.path.realpath(runs_folder(trainer)) else None
     if run is not None and not content:
         print(f"{run}: was stopped before its first step; training starts from the beginning", flush=True)
@@ -243,8 +243,8 @@ class ResumableCSVLogger(CSVLogger):
         if self.continues and not rows:  # the file may be that of a run before
             self._experiment = _Writer(log_dir=self.log_dir)
         elif self.continues and path.is_file():
-            header, found = read_rows(path)
-            write_table(path, header, found[:rows])
+            header, written = read_rows(path)
+            write_table(path, header, written[:rows])
 
     @property
     @rank_zero_experiment

@@ -102,9 +102,9 @@ class CompiledTraining(Callback):
                 f"CompiledTraining: {type(pl_module).__name__} has no network whose parts could be compiled; omit "
                 f"the callback"
             )
-        known = dict(network.named_modules())
+        modules = dict(network.named_modules())
         for name in self.parts:
-            if name not in known or not name:
+            if name not in modules or not name:
                 there = ", ".join(child for child, _ in network.named_children())
                 raise FaceDiffError(
                     f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
@@ -119,7 +119,7 @@ class CompiledTraining(Callback):
                 f"CompiledTraining: torch.compile does not work on this machine ({reason}); install a C++ compiler "
                 f"such as g++, or omit the callback"
             ) from error
-        self._compiled = [known[name] for name in self.parts]
+        self._compiled = [modules[name] for name in self.parts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Mark the parts; each is compiled when it is first used."""

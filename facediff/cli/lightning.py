@@ -60,19 +60,20 @@ def lightning(name: str, arguments: Sequence[str]) -> int:
 def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     """Run one of Lightning's subcommands; the object that holds what it made: trainer, model, data module."""
     check_options(name, arguments)
-    words = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
-    checkpoint = value_of(words, "--ckpt_path")
+    options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+    checkpoint = value_of(options, "--ckpt_path")
     if checkpoint is not None and checkpoint != "last":  # that depends on the config
         check_model_source(checkpoint, "--ckpt_path")
         if name == "fit":
             check_training_source(checkpoint)
-        found = model_path(checkpoint)
-        words = change_values(words, lambda flag, value: str(found) if flag == "--ckpt_path" else value)
-        words = [*words_of_checkpoint(name, found, words), *words]
+        path = model_path(checkpoint)
+        options = change_values(options, lambda flag, value: str(path) if flag == "--ckpt_path" else value)
+        options = [*words_of_checkpoint(name, path, options), *options]
     if name == "test":
-        words = ["--verbose=false", *words]  # ScoreTable prints the scores; Lightning's table repeats them per loader
+        # ScoreTable prints the scores; Lightning's table repeats them for each loader.
+        options = ["--verbose=false", *options]
     if name == "predict":
-        words = ["--return_predictions=false", *words]  # they are on disk, and a corpus of them fills the memory
+        options = ["--return_predictions=false", *options]  # they are on disk, and a corpus of them fills the memory
 
     from facediff.cli.lightning_cli import run_lightning_cli
 
@@ -81,7 +82,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
         sys.path.append(os.getcwd())
     with exit_statuses():
-        return run_lightning_cli(name, words, experiment_name(words) or name)
+        return run_lightning_cli(name, options, experiment_name(options) or name)
 
 
 def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
@@ -94,14 +95,14 @@ def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
         FaceDiffError: as ``facediff fit`` itself.
     """
     check_options("fit", arguments)
-    words = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+    options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
     from facediff.cli.lightning_cli import parse_lightning_cli
 
     for kind in registry.KINDS.values():
         kind.load()
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
-    return parse_lightning_cli(words)
+    return parse_lightning_cli(options)
 
 
 @contextmanager
@@ -124,25 +125,25 @@ def exit_statuses() -> Iterator[None]:
             signal.signal(signal.SIGINT, interrupt)
 
 
-def check_options(name: str, words: Sequence[str]) -> None:
+def check_options(name: str, arguments: Sequence[str]) -> None:
     """Refuse options that no model or corpus can have, and too few of them.
 
     Raises:
         FaceDiffError: naming the option, or what is needed.
     """
-    known = [*OPTIONS, *OWN_OPTIONS.get(name, ())]
-    for word in words:
-        found = re.match(r"--(\w[\w-]*)", word)
-        if found and found[1] not in known:
+    names = [*OPTIONS, *OWN_OPTIONS.get(name, ())]
+    for word in arguments:
+        match = re.match(r"--(\w[\w-]*)", word)
+        if match and match[1] not in names:
             raise FaceDiffError(
-                f"{word.partition('=')[0]}: `facediff {name}` has no such option: {choices(found[1], known)}"
+                f"{word.partition('=')[0]}: `facediff {name}` has no such option: {choices(match[1], names)}"
             )
-    if not any(re.match(r"-c|-h|--(config|model|data|help|ckpt_path)\b", word) for word in words):
+    if not any(re.match(r"-c|-h|--(config|model|data|help|ckpt_path)\b", word) for word in arguments):
         needs = {"fit": "--config FILE, such as configs/experiment/puppet.yaml, or --model=NAME and --data=NAME"}
         scoring = "--ckpt_path CHECKPOINT, a file that `facediff fit` has written; it holds everything else"
         raise FaceDiffError(f"`facediff {name}` needs {needs.get(name, scoring)}")
-    if value_of(words, "--ckpt_path") == "last" and not any(
-        re.match(r"-c|-h|--(config|model|help)\b", w) for w in words
+    if value_of(arguments, "--ckpt_path") == "last" and not any(
+        re.match(r"-c|-h|--(config|model|help)\b", w) for w in arguments
     ):
         raise FaceDiffError(
             "--ckpt_path last: the config says where the runs are; add the --config that training began with, or give "
@@ -150,21 +151,21 @@ def check_options(name: str, words: Sequence[str]) -> None:
         )
 
 
-def refuse_repeated(words: Sequence[str]) -> None:
+def refuse_repeated(arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice with different values: the last one would win without a word.
 
     Raises:
         FaceDiffError: naming the option.
     """
-    given: dict[str, str] = {}
+    values: dict[str, str] = {}
 
     def note(flag: str, value: str) -> str:
         option = flag.replace(".init_args", "")
-        if given.setdefault(option, value) != value and not option.startswith(REPEATABLE):
-            raise FaceDiffError(f"{option} is given twice, as {given[option]} and as {value}; give it once")
+        if values.setdefault(option, value) != value and not option.startswith(REPEATABLE):
+            raise FaceDiffError(f"{option} is given twice, as {values[option]} and as {value}; give it once")
         return value
 
-    change_values(words, note)
+    change_values(arguments, note)
 
 
 def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None, option: str) -> None:
@@ -231,10 +232,10 @@ def corpus_and_folder(
     return module, options
 
 
-def change_values(words: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
+def change_values(arguments: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
     """The words with ``change(flag, value)`` in place of every value, written ``--flag value`` or ``--flag=value``."""
     changed, flag = [], ""
-    for word in words:
+    for word in arguments:
         if word.startswith("-"):
             flag, joined, value = word.partition("=")
             changed.append(f"{flag}={change(flag, value)}" if joined else word)
@@ -245,11 +246,11 @@ def change_values(words: Sequence[str], change: Callable[[str, str], str]) -> li
     return changed
 
 
-def value_of(words: Sequence[str], flag: str) -> str | None:
+def value_of(arguments: Sequence[str], flag: str) -> str | None:
     """The first value of a flag; None if it is not given."""
-    found: dict[str, str] = {}
-    change_values(words, lambda given, value: found.setdefault(given, value))
-    return found.get(flag)
+    values: dict[str, str] = {}
+    change_values(arguments, lambda option, value: values.setdefault(option, value))
+    return values.get(flag)
 
 
 def find_config(flag: str, value: str) -> str:
@@ -273,7 +274,7 @@ def find_config(flag: str, value: str) -> str:
     raise FaceDiffError(f"--config {value}: no such file; {hint}")
 
 
-def experiment_name(words: Sequence[str]) -> str | None:
+def experiment_name(arguments: Sequence[str]) -> str | None:
     """The file name, without suffix, of the first config that says what is trained, or on what; None if none does.
 
     Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it.
@@ -285,7 +286,7 @@ def experiment_name(words: Sequence[str]) -> str | None:
             files.append(value)
         return value
 
-    change_values(words, note)
+    change_values(arguments, note)
     return next((Path(file).stem for file in files if {"model", "data"} & keys_of(file)), None)
 
 
@@ -306,7 +307,7 @@ def fresh_component(flag: str, value: str) -> str:
     return json.dumps({"class_path": value, "init_args": plain(defaults(kind.get(value)))})
 
 
-def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str]:
+def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list[str]:
     """A checkpoint's model and data module as a config, for validate, test and predict; ``fit`` resumes by itself.
 
     Raises:
@@ -322,20 +323,20 @@ def words_of_checkpoint(name: str, path: Path, words: Sequence[str]) -> list[str
     build_model(path, checkpoint)  # what Lightning would stumble over is reported before it starts
     if name == "fit":
         return []
-    given = [word for word in words if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
-    if given:
+    changes = [word for word in arguments if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
+    if changes:
         raise FaceDiffError(
-            f"{given[0]}: the checkpoint {path} decides the model, and its weights fit no other; omit the option "
+            f"{changes[0]}: the checkpoint {path} decides the model, and its weights fit no other; omit the option "
             f"(only {', '.join(f'--model.{option}' for option in FREE)} may change)"
         )
     hparams = checkpoint["hyper_parameters"]
     options = {key: value for key, value in hparams.items() if not key.startswith("_") and key not in LINKS}
     config = {"seed_everything": 0, "model": {"class_path": hparams["_class_path"], "init_args": options}}
-    chosen = value_of(words, "--data")
+    chosen = value_of(arguments, "--data")
     import_corpus(path, checkpoint, chosen, "--data=")
     if chosen in (None, (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")):
-        corpus, arguments = corpus_of(path, checkpoint)
-        if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in words):
-            tell_folder(path, arguments)
-        config["data"] = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}", "init_args": arguments}
+        corpus, corpus_options = corpus_of(path, checkpoint)
+        if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in arguments):
+            tell_folder(path, corpus_options)
+        config["data"] = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}", "init_args": corpus_options}
     return ["--config", yaml.safe_dump(config, sort_keys=False)]

@@ -49,19 +49,19 @@ LINKS = ("n_vertices", "identities", "frame_rate")
 """Constructor arguments of a model that the data module knows."""
 
 
-def run_lightning_cli(name: str, words: Sequence[str], experiment: str) -> FaceDiffCLI:
+def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> FaceDiffCLI:
     """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`.
 
     Args:
         name: of the subcommand.
-        words: its options.
+        arguments: its options.
         experiment: what runs are called unless the option ``name`` says otherwise.
     """
     options = {"save_dir": "runs", "name": "${experiment_name:}"}
     logger = {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": options}
     try:
         with (
-            parsing([name, *words], lambda *, _root_: _root_[name]["name"]),
+            parsing([name, *arguments], lambda *, _root_: _root_[name]["name"]),
             warnings.catch_warnings(),
         ):
             for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
@@ -103,28 +103,28 @@ def run_lightning_cli(name: str, words: Sequence[str], experiment: str) -> FaceD
 
 
 @contextmanager
-def parsing(words: Sequence[str], experiment: Callable[..., str]) -> Iterator[None]:
+def parsing(arguments: Sequence[str], experiment: Callable[..., str]) -> Iterator[None]:
     """Have Lightning parse some words; ``experiment`` is what a config's ``${experiment_name:}`` stands for."""
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     guard_configs("omegaconf+")
     # In place of ${name}, which jsonargparse makes relative to the file that it stands in, and then does not find.
     OmegaConf.register_resolver("experiment_name", experiment, replace=True)
     # Lightning starts the other processes of a distributed run with the words of this one.
-    argv, sys.argv = sys.argv, [sys.argv[0], *words]
+    argv, sys.argv = sys.argv, [sys.argv[0], *arguments]
     try:
         yield
     finally:
         sys.argv = argv
 
 
-def parse_lightning_cli(words: Sequence[str]) -> tuple[str, dict[str, Any]]:
+def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
     """Parse the words of ``fit`` and make nothing of them; class and options of the data module.
 
     Raises:
         FaceDiffError: in one sentence, where an option, a name or a value is wrong.
     """
     try:
-        with parsing(words, lambda *, _root_: "benchmark"), warnings.catch_warnings():
+        with parsing(arguments, lambda *, _root_: "benchmark"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             parsed = ParsedCLI(**PARSED, save_config_callback=None, experiment="benchmark", run=False)
     except Exception as error:
@@ -203,33 +203,33 @@ def explain(message: str) -> str:
     flag = re.search(r"NestedArg\(key='([\w.]+)'", message)
     option = ".".join([keys[0], flag[1]] if keys and flag else keys)
     owner, _, last = option.rpartition(".")
-    if found := re.search(r"dot import path string: (\S+)", message):
+    if match := re.search(r"dot import path string: (\S+)", message):
         if last in registry.COMPONENTS:
-            return registry.COMPONENTS[last].unknown(found[1])
+            return registry.COMPONENTS[last].unknown(match[1])
         bases: dict[str, tuple[str, type]] = {
             "model": ("model", AnimationModel),
             "data": ("corpus", SpeechMotionDataModule),
         }
         if last not in bases:
-            return f"--{option} {found[1]}: there is no such class; expected its import path"
+            return f"--{option} {match[1]}: there is no such class; expected its import path"
         kind, base = bases[last]
-        return f'there is no {kind} "{found[1]}": {choices(found[1], subclasses(base))}'
+        return f'there is no {kind} "{match[1]}": {choices(match[1], subclasses(base))}'
     chosen = owner if owner.startswith(("model", "data")) else ""
     see = f"`--{chosen}.help=NAME` lists the options" if chosen else "`facediff fit --help` lists the options"
-    if found := re.search(r"Option '([\w.]+)' is not accepted", message):
-        known = component_options(message)
-        wrong = option if flag else f"{option}.{found[1]}"
-        return f"--{wrong}: there is no such option; {choices(found[1], known) if known else see}"
-    if found := re.search(r"arguments? (?:is|are) required: (.*)", message):
-        missing = [f"--{option}.{name}" if option else f"--{name.partition('.')[2]}" for name in found[1].split(", ")]
+    if match := re.search(r"Option '([\w.]+)' is not accepted", message):
+        names = component_options(message)
+        wrong = option if flag else f"{option}.{match[1]}"
+        return f"--{wrong}: there is no such option; {choices(match[1], names) if names else see}"
+    if match := re.search(r"arguments? (?:is|are) required: (.*)", message):
+        missing = [f"--{option}.{name}" if option else f"--{name.partition('.')[2]}" for name in match[1].split(", ")]
         return f"{' and '.join(missing)} must be given, as an option or in a file with --config; {see}"
-    if found := re.search(r"Expected a path but (\S+) either not accessible or invalid", message):
-        return f"--{option} {found[1]}: no file, no name that `facediff components` lists, and no class of this kind"
+    if match := re.search(r"Expected a path but (\S+) either not accessible or invalid", message):
+        return f"--{option} {match[1]}: no file, no name that `facediff components` lists, and no class of this kind"
     types = re.findall(r"Expected (?:a |an )?<class '([\w.]+)'>|Literal\[(.*?)\]", message)
     expected = [word for pair in dict.fromkeys(types) for word in pair if word not in ("", "NoneType")]
     if expected:
-        given = re.search(r"val='(.*?)'\)|value: (?!Namespace|NestedArg)([^\s.]+)", message)
-        value = f" {given[1] or given[2]}" if given else ""
+        typed = re.search(r"val='(.*?)'\)|value: (?!Namespace|NestedArg)([^\s.]+)", message)
+        value = f" {typed[1] or typed[2]}" if typed else ""
         return f"--{option}{value}: expected {' or '.join(expected)}; {see}"
     return f"{' '.join(message.split())}; {see}"
 
@@ -241,18 +241,18 @@ def component_options(message: str) -> list[str]:
     if module.startswith("facediff.registry."):
         kind = registry.COMPONENTS[module.rpartition(".")[2]]
         return list(registry.defaults(kind.get(name)))
-    found = getattr(sys.modules.get(module), name, None)
-    return list(registry.defaults(found)) if isinstance(found, type) else []
+    component = getattr(sys.modules.get(module), name, None)
+    return list(registry.defaults(component)) if isinstance(component, type) else []
 
 
 def subclasses(base: type) -> list[str]:
     """Names of all concrete subclasses that are imported."""
-    found: list[str] = []
+    names: list[str] = []
     cls: type
     for cls in base.__subclasses__():
-        found += [] if getattr(cls, "__abstractmethods__", None) else [cls.__name__]
-        found += subclasses(cls)
-    return found
+        names += [] if getattr(cls, "__abstractmethods__", None) else [cls.__name__]
+        names += subclasses(cls)
+    return names
 
 
 PARSED: dict[str, Any] = {

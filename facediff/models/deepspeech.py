@@ -103,8 +103,8 @@ def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch
     def logarithm(x: Tensor) -> Tensor:
         return torch.where(x == 0, tiny, x).log()
 
-    made = logarithm(power @ filters.T) @ transform.T
-    return torch.cat([logarithm(power.sum(-1, keepdim=True)), made[..., 1:]], -1)
+    coefficients = logarithm(power @ filters.T) @ transform.T
+    return torch.cat([logarithm(power.sum(-1, keepdim=True)), coefficients[..., 1:]], -1)
 
 
 def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inputs"]:
@@ -116,9 +116,9 @@ def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inpu
     """
     # The library takes whole numbers, cut off towards zero. Not every accelerator knows float64.
     samples = (audio.cpu().double() * 32768.0).trunc().clamp(-32768, 32767)
-    found = nn.functional.pad(cepstra(samples)[:, ::2], (0, 0, context, context))
+    padded = nn.functional.pad(cepstra(samples)[:, ::2], (0, 0, context, context))
     # (batch, steps, cepstra, steps around): a step's row holds one step after the other.
-    rows = sliding(found, 2 * context + 1, 1, found.shape[1] - 2 * context).transpose(2, 3).flatten(2)
+    rows = sliding(padded, 2 * context + 1, 1, padded.shape[1] - 2 * context).transpose(2, 3).flatten(2)
     mean = rows.mean((1, 2), keepdim=True)
     deviation = rows.std((1, 2), correction=0, keepdim=True)
     return ((rows - mean) / deviation).to(audio)
@@ -171,7 +171,7 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
     Raises:
         FaceDiffError: if it is another network's.
     """
-    found: dict[str, Tensor] = {}
+    matched: dict[str, Tensor] = {}
     left = []
     for name, value in graph.items():
         part = name.rpartition("/")[2]
@@ -182,46 +182,46 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
         elif part[:1] not in ("h", "b") or part[1:] not in DENSE:
             left.append(name)
             continue
-        if part in found:
+        if part in matched:
             raise FaceDiffError(f"{source}: holds several networks ({name}); expected DeepSpeech 0.1.0, {RELEASE}")
-        found[part] = value
+        matched[part] = value
     expected = {f"{kind}{number}" for number in DENSE for kind in "hb"} | {"fw.k", "fw.b", "bw.k", "bw.b"}
-    if missing := sorted(expected - found.keys()):
+    if missing := sorted(expected - matched.keys()):
         raise FaceDiffError(
             f"{source}: lacks {', '.join(missing[:3])}, so it is not DeepSpeech's network; expected output_graph.pb of "
             f"{RELEASE}"
         )
     misshapen = [
         name
-        for name, value in found.items()
+        for name, value in matched.items()
         if value.ndim != (1 if name[-1] == "b" or name[0] == "b" and name[:2] != "bw" else 2)
     ]
-    if misshapen or len(found["bw.k"]) != len(found["fw.k"]) or found["fw.k"].shape[1] % 4:
+    if misshapen or len(matched["bw.k"]) != len(matched["fw.k"]) or matched["fw.k"].shape[1] % 4:
         raise FaceDiffError(f"{source}: its network has another form than DeepSpeech 0.1.0; expected {RELEASE}")
-    cells = found["fw.k"].shape[1] // 4
+    cells = matched["fw.k"].shape[1] // 4
     sizes = dict(
         zip(
             SIZES,
-            [*found["h1"].shape, found["h2"].shape[1], found["h3"].shape[1], cells, *found["h6"].shape],
+            [*matched["h1"].shape, matched["h2"].shape[1], matched["h3"].shape[1], cells, *matched["h6"].shape],
             strict=True,
         )
     )
-    made: dict[str, Tensor] = {}
+    state: dict[str, Tensor] = {}
     for number, layer in DENSE.items():
-        made[f"{layer}.weight"] = found[f"h{number}"].T
-        made[f"{layer}.bias"] = found[f"b{number}"]
+        state[f"{layer}.weight"] = matched[f"h{number}"].T
+        state[f"{layer}.bias"] = matched[f"b{number}"]
     for direction, end in (("fw", ""), ("bw", "_reverse")):
-        kernel = gates_as_torch(found[f"{direction}.k"].T, cells)
-        bias = gates_as_torch(found[f"{direction}.b"], cells).clone()
+        kernel = gates_as_torch(matched[f"{direction}.k"].T, cells)
+        bias = gates_as_torch(matched[f"{direction}.b"], cells).clone()
         # TensorFlow's cell adds 1 to the forget gate when it runs.
         bias[cells : 2 * cells] += 1.0
-        made[f"recurrent.weight_ih_l0{end}"] = kernel[:, : sizes["third"]]
-        made[f"recurrent.weight_hh_l0{end}"] = kernel[:, sizes["third"] :]
-        made[f"recurrent.bias_ih_l0{end}"] = bias
-        made[f"recurrent.bias_hh_l0{end}"] = torch.zeros_like(bias)
+        state[f"recurrent.weight_ih_l0{end}"] = kernel[:, : sizes["third"]]
+        state[f"recurrent.weight_hh_l0{end}"] = kernel[:, sizes["third"] :]
+        state[f"recurrent.bias_ih_l0{end}"] = bias
+        state[f"recurrent.bias_hh_l0{end}"] = torch.zeros_like(bias)
     with torch.device("meta"):
         own = DeepSpeech(checked_sizes(sizes)).state_dict()
-    for name, value in made.items():
+    for name, value in state.items():
         if value.shape != own[name].shape:
             raise FaceDiffError(
                 f"{source}: its {name} has the shape {tuple(value.shape)}, expected {tuple(own[name].shape)}; the "
@@ -229,7 +229,7 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
             )
         if not bool(value.isfinite().all()):
             raise FaceDiffError(f"{source}: its {name} holds NaN or infinity; the file is damaged")
-    return {name: value.float().contiguous() for name, value in made.items()}, sizes, left
+    return {name: value.float().contiguous() for name, value in state.items()}, sizes, left
 
 
 def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
@@ -244,15 +244,15 @@ def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
     Raises:
         ArgumentError: if they are others than expected.
     """
-    known = {name: sizes.get(name) for name in SIZES}
+    stated = {name: sizes.get(name) for name in SIZES}
     sizes = {name: size for name, size in sizes.items() if name != "_name_or_path"}
-    fits = all(isinstance(size, int) and not isinstance(size, bool) and 0 < size <= 1 << 16 for size in known.values())
-    if not fits or set(sizes) != set(SIZES) or known["inputs"] % CEPSTRA or known["inputs"] // CEPSTRA % 2 == 0:  # type: ignore[operator]
+    fits = all(isinstance(size, int) and not isinstance(size, bool) and 0 < size <= 1 << 16 for size in stated.values())
+    if not fits or set(sizes) != set(SIZES) or stated["inputs"] % CEPSTRA or stated["inputs"] // CEPSTRA % 2 == 0:  # type: ignore[operator]
         raise ArgumentError(
             {"config": quoted(dict(sizes))},
             f"expected the sizes {', '.join(SIZES)}, of which inputs is an odd multiple of {CEPSTRA}",
         )
-    return {name: int(size) for name, size in known.items() if size is not None}
+    return {name: int(size) for name, size in stated.items() if size is not None}
 
 
 # The encoder.
@@ -337,6 +337,6 @@ class DeepSpeechEncoder(AudioEncoder):
         high = torch.minimum(low + 1, lengths.cpu()[:, None] - 1).to(features.device)
         share = (places - low)[..., None].to(features)
         rows = torch.arange(features.shape[0], device=features.device)[:, None]
-        made = torch.lerp(features[rows, low.to(features.device)], features[rows, high], share)
-        made = made if self.out is None else self.out(made)
-        return made * frame_mask(steps, made.shape[1])[..., None]
+        resampled = torch.lerp(features[rows, low.to(features.device)], features[rows, high], share)
+        resampled = resampled if self.out is None else self.out(resampled)
+        return resampled * frame_mask(steps, resampled.shape[1])[..., None]

@@ -75,8 +75,8 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
     if kinds and not array.size:
         raise FaceDiffError(f"{name}: holds no numbers, its shape is {array.shape}; write it again")
     if kinds and array.dtype.kind not in kinds:
-        wanted = "floating-point numbers" if kinds == "f" else "numbers"
-        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {wanted}")
+        expected = "floating-point numbers" if kinds == "f" else "numbers"
+        raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {expected}")
     return array
 
 
@@ -91,15 +91,15 @@ def open_vertices(
         FaceDiffError: if the file is unreadable, of another shape, empty, or not of floating-point numbers.
     """
     array = open_array(path, kinds="f", mode=mode)
-    found = vertices_of(array.shape)
-    if found is None or n_vertices not in (None, found):
-        wanted = "(frames, 3 * vertices)" if n_vertices is None else f"(frames, {3 * n_vertices})"
-        raise FaceDiffError(f"{path}: has shape {array.shape}, expected {wanted} or (frames, vertices, 3)")
+    count = vertices_of(array.shape)
+    if count is None or n_vertices not in (None, count):
+        expected = "(frames, 3 * vertices)" if n_vertices is None else f"(frames, {3 * n_vertices})"
+        raise FaceDiffError(f"{path}: has shape {array.shape}, expected {expected} or (frames, vertices, 3)")
     LIMITS.check("frames", len(array), path)
-    LIMITS.check("vertices", found, path)
+    LIMITS.check("vertices", count, path)
     if not array.flags.c_contiguous:
         LIMITS.check("bytes", array.nbytes, path)  # columns first: taken apart, the array is copied into memory
-    return array.reshape(len(array), found, 3)
+    return array.reshape(len(array), count, 3)
 
 
 def vertices_of(shape: tuple[int, ...]) -> int | None:

@@ -188,13 +188,13 @@ class FileTask:
         if record is None:
             return "it is not known how it was made" if self.output.exists() else ""
         before = record.get("recipe") or {}
-        known = before.get("files") or {}
+        recorded = before.get("files") or {}
         if before.get("command") != list(self.recipe.command):
             return "the options have changed"
         for path, digest in self.recipe.files.items():
-            if known.get(path) != digest:
+            if recorded.get(path) != digest:
                 return f"{path} has changed"
-        if known.keys() != self.recipe.files.keys():
+        if recorded.keys() != self.recipe.files.keys():
             return "the options have changed"
         if not self._same_source(record["speech"]):
             return "the recording has changed"
@@ -211,13 +211,13 @@ class FileTask:
         parts += [recipe.get("files")] if isinstance(recipe, dict) else []
         return record if parts and all(isinstance(part, dict) for part in parts) else None
 
-    def _same_source(self, known: Mapping[str, Any]) -> bool:
+    def _same_source(self, recorded: Mapping[str, Any]) -> bool:
         """By path, size and time; where path or time differ, by the content. What could not be read is tried again."""
         stat = _stat(self.source)
-        if not known.get("sha256"):
+        if not recorded.get("sha256"):
             return False
-        return all(known.get(name) == value for name, value in stat.items()) or (
-            known.get("bytes") == stat.get("bytes") is not None and known.get("sha256") == _digest(self.source)
+        return all(recorded.get(name) == value for name, value in stat.items()) or (
+            recorded.get("bytes") == stat.get("bytes") is not None and recorded.get("sha256") == _digest(self.source)
         )
 
 

@@ -61,7 +61,7 @@ LOGGERS = ("distributed", "distributed.client", "distributed.worker", "tornado.a
 
 
 @dataclass(frozen=True)
-class Run:
+class ClusterRun:
     """What workers must know of a run; the same for all of its tasks."""
 
     name: str  # unique
@@ -134,7 +134,7 @@ def run_on_cluster(
             seen |= stack.enter_context(token(writes))
         name = f"facediff-{secrets.token_hex(8)}"
         facts = (name, os.getcwd(), search_path(), own_environment(), seen)
-        cluster = Cluster(client, scheduler, Run(*facts, cloudpickle.dumps(work)), workers)
+        cluster = Cluster(client, scheduler, ClusterRun(*facts, cloudpickle.dumps(work)), workers)
         stack.callback(cluster.leave)
         yield from cluster.results(tasks)
 
@@ -221,7 +221,7 @@ class Cluster:
         most: workers that are used at a time; all if None.
     """
 
-    def __init__(self, client: Any, scheduler: str, run: Run, most: int | None) -> None:  # noqa: ANN401
+    def __init__(self, client: Any, scheduler: str, run: ClusterRun, most: int | None) -> None:  # noqa: ANN401
         self.client, self.scheduler, self.run = client, scheduler, run
         self.most = most or sys.maxsize
         self.known: tuple[float, list[str]] = 0.0, []  # when the workers were last asked for, and which there were
@@ -305,26 +305,26 @@ class Cluster:
         Raises:
             FaceDiffError: if the scheduler is gone, or a worker cannot take part.
         """
-        asked, found = self.known
-        if time.monotonic() - asked < REFRESH and self.met.issuperset(found):
-            return found
+        asked, addresses = self.known
+        if time.monotonic() - asked < REFRESH and self.met.issuperset(addresses):
+            return addresses
         try:
-            found = list(self.client.nthreads())
-            new = [worker for worker in found if worker not in self.met]
+            addresses = list(self.client.nthreads())
+            new = [worker for worker in addresses if worker not in self.met]
             answers = self.client.run(meet, self.run, workers=new, on_error="return") if new else {}
         except (OSError, TimeoutError, ValueError, RuntimeError, asyncio.CancelledError) as error:
             raise FaceDiffError(f"--scheduler {self.scheduler}: {LOST}") from error
         for worker, answer in answers.items():
             if isinstance(answer, OSError | TimeoutError):  # just gone
-                found.remove(worker)
+                addresses.remove(worker)
                 continue
             if isinstance(answer, BaseException):
                 answer = f"has no facediff {__version__} ({reason(answer)}); {SAME}"
             if answer:
                 raise FaceDiffError(f"worker {worker} of --scheduler {self.scheduler} {answer}")
             self.met.add(worker)
-        self.known = time.monotonic(), found
-        return found
+        self.known = time.monotonic(), addresses
+        return addresses
 
     def check_patience(self, alone_since: float | None, workers: Sequence[str]) -> float | None:
         """Since when there has been no worker.
@@ -380,8 +380,8 @@ def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # no
     Raises:
         FaceDiffError: if SLURM is not here, or an option is wrong or missing.
     """
-    found = _clusters.get(scheduler)
-    if found is None:
+    cluster = _clusters.get(scheduler)
+    if cluster is None:
         options = slurm_options(scheduler)
         if shutil.which("sbatch") is None:
             raise FaceDiffError(f"--scheduler {scheduler}: there is no program sbatch; run facediff where SLURM is")
@@ -390,20 +390,20 @@ def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # no
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of a dashboard at another port
-                found = dask_jobqueue.SLURMCluster(**options)
-                found.job_script()
+                cluster = dask_jobqueue.SLURMCluster(**options)
+                cluster.job_script()
         except (ValueError, TypeError, OSError, RuntimeError) as error:
             raise FaceDiffError(f"--scheduler {scheduler}: {reason(error)}; see docs/cluster.md") from error
-        _clusters[scheduler] = found
+        _clusters[scheduler] = cluster
         atexit.register(close_cluster, scheduler)
-    per_job = found._dummy_job.worker_processes
-    found.scale(n=max(per_job, min(workers or per_job, tasks)))
+    per_job = cluster._dummy_job.worker_processes
+    cluster.scale(n=max(per_job, min(workers or per_job, tasks)))
     try:
-        check_jobs(found)
+        check_jobs(cluster)
     except (OSError, RuntimeError) as error:
         close_cluster(scheduler)
         raise FaceDiffError(f"--scheduler {scheduler}: a job cannot be started ({reason(error)})") from error
-    return found
+    return cluster
 
 
 def check_jobs(cluster: Any) -> None:  # noqa: ANN401
@@ -423,16 +423,16 @@ def check_jobs(cluster: Any) -> None:  # noqa: ANN401
 
 def close_cluster(scheduler: str) -> None:
     """Cancel the jobs of a cluster."""
-    found = _clusters.pop(scheduler, None)
-    if found is not None:
+    cluster = _clusters.pop(scheduler, None)
+    if cluster is not None:
         # Jobs that were refused are not there to be cancelled, which dask-jobqueue would insist on.
-        for name, job in list(found.workers.items()):
+        for name, job in list(cluster.workers.items()):
             if job.status.name == "created":
-                found._created.discard(job)
-                found.worker_spec.pop(name, None)
-                found.workers.pop(name, None)
+                cluster._created.discard(job)
+                cluster.worker_spec.pop(name, None)
+                cluster.workers.pop(name, None)
         with quiet(), suppress(Exception):
-            found.close(timeout=5)
+            cluster.close(timeout=5)
 
 
 def slurm_options(scheduler: str) -> dict[str, Any]:
@@ -452,7 +452,7 @@ def slurm_options(scheduler: str) -> dict[str, Any]:
     from dask_jobqueue.core import Job, JobQueueCluster
     from dask_jobqueue.slurm import SLURMJob
 
-    known = {
+    names = {
         name
         for owner in (SLURMJob, Job, JobQueueCluster)
         for name in inspect.signature(owner.__init__).parameters
@@ -463,8 +463,8 @@ def slurm_options(scheduler: str) -> dict[str, Any]:
     for word in filter(None, re.split(r",(?![^\[]*\])", scheduler.partition(":")[2])):
         name, equals, value = word.partition("=")
         name = name.strip().replace("-", "_")
-        if name not in known or not equals:
-            raise FaceDiffError(f"--scheduler {scheduler}: there is no option {name!r}: {choices(name, sorted(known))}")
+        if name not in names or not equals:
+            raise FaceDiffError(f"--scheduler {scheduler}: there is no option {name!r}: {choices(name, sorted(names))}")
         # A walltime such as 01:30:00 is a number to YAML.
         try:
             options[name] = value if re.fullmatch(r"[\d:-]+:[\d:]+", value) else yaml.safe_load(value)
@@ -481,7 +481,7 @@ def slurm_options(scheduler: str) -> dict[str, Any]:
 # The workers. Everything below runs in the processes of the cluster.
 
 
-def meet(run: Run, dask_worker: Any = None) -> str:  # noqa: ANN401 - Dask names its workers so
+def meet(run: ClusterRun, dask_worker: Any = None) -> str:  # noqa: ANN401 - Dask names its workers so
     """Take note of a run; why this worker cannot take part in it, else an empty text."""
     python = platform.python_version().rpartition(".")[0]
     if getattr(run, "version", "") != __version__:
@@ -524,13 +524,13 @@ def do_task(name: str, task: bytes) -> tuple[str, bytes]:
     if host is None:
         return "unknown", worker.address.encode()
 
-    def wanted() -> bool:
+    def is_wanted() -> bool:
         state = worker.state.tasks.get(key)
         running = worker.status.name in ("running", "paused")
         return running and not host.closed and state is not None and state.state in ("executing", "long-running")
 
     try:
-        return host.do(task, wanted)
+        return host.do(task, is_wanted)
     finally:
         worker.loop.add_callback(worker.loop.call_later, IDLE, rest, worker.address, name)
 
@@ -569,26 +569,26 @@ class Host:
         turn: taken while a task is done.
     """
 
-    def __init__(self, run: Run, turn: _Turn) -> None:
+    def __init__(self, run: ClusterRun, turn: _Turn) -> None:
         self.run, self.turn = run, turn
         self.pool: ProcessPoolExecutor | None = None
         self.closed = False
         self.active = time.monotonic()
 
-    def do(self, task: bytes, wanted: Callable[[], bool]) -> tuple[str, bytes]:
+    def do(self, task: bytes, is_wanted: Callable[[], bool]) -> tuple[str, bytes]:
         """Do a task, for as long as it is wanted; one that kills its process is tried once more."""
         while not self.turn.lock.acquire(timeout=POLL):
-            if not wanted():
+            if not is_wanted():
                 return "unwanted", b""
         try:
             for _ in range(2):
                 try:
                     if self.pool is None:
                         self.pool = start_process()
-                        problem = self.wait(start(self.pool, settle, self.run), wanted)
+                        problem = self.wait(start(self.pool, settle, self.run), is_wanted)
                         if problem:
                             return "refused", problem
-                    result = self.wait(start(self.pool, do_here, task), wanted)
+                    result = self.wait(start(self.pool, do_here, task), is_wanted)
                     return ("unwanted", b"") if result is None else ("done", result)
                 except BrokenProcessPool:
                     self.close()
@@ -597,13 +597,13 @@ class Host:
             self.active = time.monotonic()
             self.turn.lock.release()
 
-    def wait(self, future: Future[bytes], wanted: Callable[[], bool]) -> bytes | None:
+    def wait(self, future: Future[bytes], is_wanted: Callable[[], bool]) -> bytes | None:
         """The result of the process; None if it is not wanted any more, whereupon the process is ended."""
         while True:
             try:
                 return future.result(timeout=POLL)
             except TimeoutError:
-                if not wanted():
+                if not is_wanted():
                     self.end(future)
                     return None
 
@@ -647,7 +647,7 @@ def start(pool: ProcessPoolExecutor, function: Callable[..., bytes], *arguments:
 _work: Callable[[Any], Any] | None = None
 
 
-def settle(run: Run) -> bytes:
+def settle(run: ClusterRun) -> bytes:
     """Take up a run in this process; why that is impossible, else an empty text."""
     global _work
     try:

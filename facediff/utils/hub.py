@@ -40,16 +40,16 @@ def hub_id(source: str | os.PathLike[str]) -> tuple[str, str | None] | None:
         (('ada/talking-face', 'v1'), None, None)
     """
     text = os.fspath(source)
-    found = _ID.fullmatch(text)
-    if found is None or os.path.lexists(text) or found["name"].endswith((".ckpt", ".pt", ".pth", ".safetensors")):
+    match = _ID.fullmatch(text)
+    if match is None or os.path.lexists(text) or match["name"].endswith((".ckpt", ".pt", ".pth", ".safetensors")):
         return None
-    return found["name"], found["revision"]
+    return match["name"], match["revision"]
 
 
 def is_hub_name(text: str) -> bool:
     """Whether a text can name a model on the hub, without a revision."""
-    found = _ID.fullmatch(text)
-    return found is not None and found["revision"] is None
+    match = _ID.fullmatch(text)
+    return match is not None and match["revision"] is None
 
 
 def check_model_source(source: str | os.PathLike[str], option: str = "") -> None:
@@ -140,13 +140,13 @@ def fetch(name: str, revision: str | None = None) -> Path:
         raise MissingExtraError("huggingface_hub", "hub", f"fetching the model {name}") from error
     shown = name if revision is None else f"{name}@{revision}"
     with _hub_errors(shown, "fetched"), _progress():
-        words: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
+        options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
         try:
-            planned = snapshot_download(name, dry_run=True, **words)
+            planned = snapshot_download(name, dry_run=True, **options)
         except DryRunError:
             planned = []  # the hub does not answer, or refuses: the cache may have it, or the reason follows
         LIMITS.check("bytes", sum(file.file_size or 0 for file in planned), shown)
-        folder = Path(snapshot_download(name, **words))
+        folder = Path(snapshot_download(name, **options))
     for part in (CONFIG, WEIGHTS, ASSETS):
         if not (folder / part).is_file():
             raise FaceDiffError(

@@ -92,9 +92,9 @@ def in_words(licences: Iterable[Licence]) -> str:
         >>> in_words([Licence("corpus puppet", "Apache-2.0", "allowed")])
         'corpus puppet: Apache-2.0; commercial use allowed'
     """
-    found = list(licences)
-    names = "; ".join(f"{each.of}: {each.name}" for each in found) or "unknown"
-    return f"{names}; commercial use {commercial_use(found)}"
+    labels = list(licences)
+    names = "; ".join(f"{label.of}: {label.name}" for label in labels) or "unknown"
+    return f"{names}; commercial use {commercial_use(labels)}"
 
 
 def licence_metadata(licences: Iterable[Licence]) -> dict[str, str]:
@@ -104,8 +104,8 @@ def licence_metadata(licences: Iterable[Licence]) -> dict[str, str]:
         >>> licence_metadata([Licence("corpus puppet", "Apache-2.0", "allowed")])
         {'licence': 'corpus puppet: Apache-2.0; commercial use allowed', 'commercial_use': 'allowed'}
     """
-    found = list(licences)
-    return {"licence": in_words(found), "commercial_use": commercial_use(found)}
+    labels = list(licences)
+    return {"licence": in_words(labels), "commercial_use": commercial_use(labels)}
 
 
 def known_licence(name: str) -> Commercial:
@@ -124,10 +124,10 @@ def require_cleared(source: object, licences: Iterable[Licence]) -> None:
     Raises:
         FaceDiffError: naming the model and what is in the way.
     """
-    found = list(licences)
-    if commercial_use(found) == "allowed":
+    labels = list(licences)
+    if commercial_use(labels) == "allowed":
         return
-    reasons = "; ".join(str(each) for each in found if each.commercial != "allowed") or "it states no licence"
+    reasons = "; ".join(str(label) for label in labels if label.commercial != "allowed") or "it states no licence"
     raise OptionError.naming(
         f"{source}: not cleared for commercial use ({reasons}), and only cleared models were asked for. Choose a model "
         f"whose data allow it, or omit {{commercial_only}} where its terms fit your use"
@@ -143,7 +143,7 @@ def read_licences(source: object, state: object) -> tuple[Licence, ...]:
     fields = set(Licence.__dataclass_fields__)
     if not isinstance(state, list | tuple) or len(state) > MOST:
         raise FaceDiffError(f"{source}: its licences are {quoted(state)}; expected a list. The file is damaged")
-    found = []
+    labels = []
     for entry in state:
         good = isinstance(entry, Mapping) and entry.keys() == fields
         if not good or not all(isinstance(text, str) and is_plain_text(text) for text in entry.values()):
@@ -155,8 +155,8 @@ def read_licences(source: object, state: object) -> tuple[Licence, ...]:
                 f"{source}: the licence of {quoted(entry['of'])} says of commercial use {quoted(entry['commercial'])}; "
                 f"expected {', '.join(get_args(Commercial))}"
             )
-        found.append(Licence(**entry))
-    return tuple(found)
+        labels.append(Licence(**entry))
+    return tuple(labels)
 
 
 def network_licences(options: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - plain data of any form

@@ -45,19 +45,19 @@ class Limits:
         Raises:
             FaceDiffError: if a variable is not a positive number.
         """
-        given: dict[str, float] = {}
+        limits: dict[str, float] = {}
         for field in fields(cls):
             variable = f"FACEDIFF_MAX_{field.name.upper()}"
             text = environment.get(variable)
             if text is None:
                 continue
             try:
-                given[field.name] = float(text)
+                limits[field.name] = float(text)
             except ValueError:
-                given[field.name] = math.nan
-            if not given[field.name] > 0:
+                limits[field.name] = math.nan
+            if not limits[field.name] > 0:
                 raise FaceDiffError(f"{variable}={text}: not a valid limit; expected a positive number")
-        return cls(**given)
+        return cls(**limits)
 
     def check(self, what: str, count: float, source: object) -> None:
         """Refuse a count above a limit.
@@ -167,23 +167,23 @@ def check_number(
     return number
 
 
-def check_format(source: object, found: object, expected: str | int) -> None:
+def check_format(source: object, stated: object, expected: str | int) -> None:
     """Refuse a file of another format than this version writes, above all a later one.
 
     Args:
         source: the file, for the message.
-        found: the file's mark of its format; a text that ends in a number (``facediff take 1``), or a number.
+        stated: the file's mark of its format; a text that ends in a number (``facediff take 1``), or a number.
         expected: the mark that this version writes.
 
     Raises:
         FaceDiffError: naming both.
     """
-    if type(found) is type(expected) and found == expected:
+    if type(stated) is type(expected) and stated == expected:
         return
-    ours, theirs = _split_format(expected), _split_format(found)
+    ours, theirs = _split_format(expected), _split_format(stated)
     later = ours is not None and theirs is not None and theirs[0] == ours[0] and theirs[1] > ours[1]
     advice = "it was written by a later version, update facediff" if later else "write the file again"
-    raise FaceDiffError(f"{source}: its format is {quoted(found)}; expected {expected!r}; {advice}")
+    raise FaceDiffError(f"{source}: its format is {quoted(stated)}; expected {expected!r}; {advice}")
 
 
 def _split_format(mark: object) -> tuple[str, int] | None:
@@ -241,5 +241,5 @@ def check_nesting(
             count += len(held)
             if count > LIMITS.entries:
                 LIMITS.check("entries", count, source)
-            inner += [each for each in held if type(each) not in _LEAVES]
+            inner += [part for part in held if type(part) not in _LEAVES]
         level, depth = inner, depth + 1

@@ -250,10 +250,10 @@ class _Reconstructor:
 
     __slots__ = ()
 
-    def __call__(self, wanted: object, base: object, state: object) -> StandIn:
-        if not (isinstance(wanted, type) and issubclass(wanted, StandIn)):
+    def __call__(self, kind: object, base: object, state: object) -> StandIn:
+        if not (isinstance(kind, type) and issubclass(kind, StandIn)):
             raise pickle.UnpicklingError("it creates an object in an unknown way")
-        return wanted()
+        return kind()
 
 
 FOR_STAND_INS: dict[tuple[str, str], Any] = {

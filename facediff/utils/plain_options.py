@@ -90,13 +90,13 @@ def read_component(source: str, name: str, value: object, components: Components
             f"{source}: its {name} is {quoted(value)}; expected a component with its class and options; it was not "
             f"loaded"
         )
-    found = components[name](value["class_path"]) if is_path(value["class_path"]) else None
-    if found is None:
+    component = components[name](value["class_path"]) if is_path(value["class_path"]) else None
+    if component is None:
         raise unknown_class(source, name, value["class_path"])
     options = value.get("init_args", {})
     if not isinstance(options, dict):
         raise FaceDiffError(f"{source}: the options of its {name} are {quoted(options)}; expected a dict")
-    return partial(found, **read_options(source, found, options, components))
+    return partial(component, **read_options(source, component, options, components))
 
 
 def unknown_class(source: object, role: str, named: object) -> FaceDiffError:
@@ -123,7 +123,7 @@ def parameters(owner: type) -> dict[str, Any]:
 
     A parameter without a hint, or whose hint cannot be resolved here, has Any.
     """
-    found: dict[str, Any] = {}
+    hints_by_name: dict[str, Any] = {}
     for cls in owner.__mro__:
         init = vars(cls).get("__init__")
         if not inspect.isfunction(init):
@@ -134,10 +134,10 @@ def parameters(owner: type) -> dict[str, Any]:
             hints = {}
         own = list(inspect.signature(init).parameters.values())[1:]
         named = [p for p in own if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
-        found = {p.name: hints.get(p.name, Any) for p in named} | found
+        hints_by_name = {p.name: hints.get(p.name, Any) for p in named} | hints_by_name
         if all(p.kind is not p.VAR_KEYWORD for p in own):
             break
-    return found
+    return hints_by_name
 
 
 def fits(value: object, hint: Any) -> bool:  # noqa: ANN401 - a type hint

@@ -114,7 +114,7 @@ def provenance_of(content: object, name: object) -> Provenance:
     if not isinstance(content, dict):
         raise FaceDiffError(f"{name}: holds no JSON object; {REMEDY}")
     check_format(name, content.get("format", FORMAT), FORMAT)
-    made: dict[str, Any] = {}
+    kept: dict[str, Any] = {}
     kinds: dict[str, type] = {"components": dict, "versions": dict, "seed": int, "steps": int, "parameters": int}
     for key in Provenance.__dataclass_fields__:
         value = content.get(key)
@@ -123,10 +123,10 @@ def provenance_of(content: object, name: object) -> Provenance:
         kind = kinds.get(key, str)
         fits = isinstance(value, kind) and not isinstance(value, bool)
         if kind is dict and fits:
-            fits = all(isinstance(each, str) for item in value.items() for each in item)
+            fits = all(isinstance(text, str) for item in value.items() for text in item)
         if not fits:
             raise FaceDiffError(f"{name}: {key} is {quoted(value)}; {REMEDY}")
-        made[key] = value
-    if "model" not in made:
+        kept[key] = value
+    if "model" not in kept:
         raise FaceDiffError(f"{name}: names no model; {REMEDY}")
-    return Provenance(**made)
+    return Provenance(**kept)

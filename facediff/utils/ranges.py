@@ -75,8 +75,8 @@ class Range:
             return f"from {low} to {'below ' if self.below else ''}{high}"
         ends = [f"above {low}" if self.above else f"at least {low}"] if low else []
         ends += [f"below {high}" if self.below else f"at most {high}"] if high else []
-        words = " and ".join(ends)
-        return f"of {words}" if words.startswith("at") else words
+        text = " and ".join(ends)
+        return f"of {text}" if text.startswith("at") else text
 
     __repr__ = __str__  # the help of Lightning's commands shows type hints as Python does
 
@@ -115,8 +115,8 @@ def _plain(number: float) -> str:
 
 def range_of(hint: Any) -> Range | None:  # noqa: ANN401 - a type hint
     """The range that a type hint declares, anywhere in it: also in ``Annotated[…] | None`` or a list."""
-    found: Range | None = next((extra for extra in extras_of(hint) if isinstance(extra, Range)), None)
-    return found
+    declared: Range | None = next((extra for extra in extras_of(hint) if isinstance(extra, Range)), None)
+    return declared
 
 
 def extras_of(hint: Any) -> Iterator[Any]:  # noqa: ANN401
@@ -140,7 +140,7 @@ def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # n
         expected = [mismatch(part, value, limits) for part in inner]
         return None if None in expected else " or ".join(word for word in expected if word)
     if origin is Literal:
-        fits = any(type(value) is type(known) and value == known for known in inner)
+        fits = any(type(value) is type(choice) and value == choice for choice in inner)
         return None if fits else f"one of {', '.join(map(str, inner))}"
     if hint in (int, float):
         kind = Integral if hint is int else Real
@@ -161,17 +161,17 @@ def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # n
     if getattr(hint, "_is_protocol", False):  # of what makes a component
         return None if callable(value) else "a component's class"
     plain_types = {bool: (bool,), str: (str, PathLike), types.NoneType: (types.NoneType,)}
-    words = {bool: "true or false", str: "text", types.NoneType: "null"}
-    return None if hint not in words or isinstance(value, plain_types[hint]) else words[hint]
+    expectations = {bool: "true or false", str: "text", types.NoneType: "null"}
+    return None if hint not in expectations or isinstance(value, plain_types[hint]) else expectations[hint]
 
 
-def check_fields(made: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
+def check_fields(instance: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
     """Refuse a dataclass's fields outside the ranges of their type hints; for ``__post_init__``. None is allowed.
 
     Raises:
         FaceDiffError: naming the class, the field and the range.
     """
-    _check(type(made), {field.name: getattr(made, field.name) for field in dataclasses.fields(made)})
+    _check(type(instance), {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)})
 
 
 def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
@@ -180,7 +180,8 @@ def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a data
     Raises:
         OptionError: naming the option and the range.
     """
-    for name, hint in _all_hints(type(options)).items():
+    owner: Any = type(options)
+    for name, hint in _all_hints(owner).items():
         value = getattr(options, name)
         if value is not None and (expected := mismatch(hint, value)) is not None:
             problem = "out of range" if isinstance(value, Real) and range_of(hint) is not None else "not valid"
@@ -227,12 +228,12 @@ def _check(owner: Any, values: Mapping[str, Any]) -> None:  # noqa: ANN401 - a c
 @functools.cache
 def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401
     module = vars(sys.modules[owner.__module__])
-    found: dict[str, Any] = {}
+    hints: dict[str, Any] = {}
     for name, hint in owner.__annotations__.items():
         with suppress(NameError):  # imported for type checkers only, so it is no number
             alone = SimpleNamespace(__annotations__={name: hint})
-            found |= typing.get_type_hints(alone, module, include_extras=True)
-    return found
+            hints |= typing.get_type_hints(alone, module, include_extras=True)
+    return hints
 
 
 # The numbers that several commands and functions take. Upper ends are far above what is useful, and low enough that

@@ -70,7 +70,7 @@ class Storage:
 
 
 @dataclass(frozen=True)
-class Outline:
+class TensorOutline:
     """In place of a tensor: what it takes in memory."""
 
     bytes: int
@@ -86,7 +86,7 @@ class PlainOrderedDict(OrderedDict[Any, Any]):
 
 
 class OutlineReader(pickle._Unpickler):  # C's unpickler reserves whatever memory a file asks for
-    """Reads ``data.pkl`` with an :class:`Outline` in place of every tensor; makes nothing but plain data.
+    """Reads ``data.pkl`` with an :class:`TensorOutline` in place of every tensor; makes nothing but plain data.
 
     Args:
         stream: the pickle.
@@ -133,17 +133,17 @@ class OutlineReader(pickle._Unpickler):  # C's unpickler reserves whatever memor
             raise pickle.UnpicklingError(f"its numbers {quoted(key)} are fewer or more than it declares")
         return Storage(length * kind.bytes, kind.bytes)
 
-    def _tensor(self, storage: Storage, *form: Declared) -> Outline:
+    def _tensor(self, storage: Storage, *form: Declared) -> TensorOutline:
         offset, shape, stride, _, hooks, *metadata = form
         return self._outline(storage, storage.item, offset, shape, stride, [hooks, *metadata])
 
-    def _tensor_of_type(self, storage: Storage, *form: Declared) -> Outline:
+    def _tensor_of_type(self, storage: Storage, *form: Declared) -> TensorOutline:
         offset, shape, stride, _, hooks, kind, *metadata = form
         return self._outline(storage, kind.bytes, offset, shape, stride, [hooks, *metadata])
 
     def _outline(
         self, storage: Storage, item: int, offset: Declared, shape: Declared, stride: Declared, more: list[Any]
-    ) -> Outline:
+    ) -> TensorOutline:
         plain = isinstance(storage, Storage) and isinstance(shape, tuple) and isinstance(stride, tuple)
         if not plain or any(more) or len(shape) != len(stride):
             raise pickle.UnpicklingError("it holds a tensor in an unknown form")
@@ -155,11 +155,11 @@ class OutlineReader(pickle._Unpickler):  # C's unpickler reserves whatever memor
         if max(count, last) * item > storage.bytes:
             raise pickle.UnpicklingError("it holds a tensor that is larger than its numbers")
         self.bytes += count * item
-        return Outline(count * item)
+        return TensorOutline(count * item)
 
     @staticmethod
     def _parameter(data: object, gradient: object, hooks: object) -> object:
-        if not isinstance(data, Outline) or hooks:
+        if not isinstance(data, TensorOutline) or hooks:
             raise pickle.UnpicklingError("it holds a parameter in an unknown form")
         return data
 
@@ -294,7 +294,7 @@ def check_numbers(value: object) -> None:
             waiting += item
         elif isinstance(item, int) and item.bit_length() > 64:
             raise pickle.UnpicklingError("it holds a whole number of more than 64 bits")
-        elif not isinstance(item, Outline | bool | int | float | str | bytes | NumberType | None):
+        elif not isinstance(item, TensorOutline | bool | int | float | str | bytes | NumberType | None):
             raise pickle.UnpicklingError(f"it holds a {type(item).__name__}")
 
 
@@ -323,22 +323,22 @@ def read_state_dict(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as stream:
             outline = read_outline(stream, path, ForeignReader)
-            found = state_of(outline)
-            if not found:
+            outlines = state_of(outline)
+            if not outlines:
                 raise FaceDiffError(f"{path}: holds no tensors by name; {AUTHORS}")
             with zipfile.ZipFile(stream) as archive:
-                read = {each.key: archive.read(each.entry) for each in found.values()}
+                contents = {stored.key: archive.read(stored.entry) for stored in outlines.values()}
     except FaceDiffError:
         raise
     except Exception as error:  # whatever a damaged or hostile file makes the readers raise, the reason is the file
         reason = next(iter(str(error).strip().splitlines()), "") if isinstance(error, pickle.UnpicklingError) else ""
         detail = reason if 0 < len(reason) < 120 else "it is damaged or cut short"
         raise FaceDiffError(f"{path}: not a checkpoint that can be read safely ({detail}); {AUTHORS}") from error
-    made: dict[str, Any] = {}
-    for name, each in found.items():
-        numbers = torch.frombuffer(bytearray(read[each.key]), dtype=getattr(torch, each.type))
-        made[name.removeprefix("module.")] = numbers.as_strided(each.shape, each.stride, each.offset).clone()
-    return made
+    tensors: dict[str, Any] = {}
+    for name, stored in outlines.items():
+        numbers = torch.frombuffer(bytearray(contents[stored.key]), dtype=getattr(torch, stored.type))
+        tensors[name.removeprefix("module.")] = numbers.as_strided(stored.shape, stored.stride, stored.offset).clone()
+    return tensors
 
 
 def state_of(content: object) -> dict[str, StoredTensor]:
@@ -349,13 +349,13 @@ def state_of(content: object) -> dict[str, StoredTensor]:
     if own:
         return own
     for wrapper in ("state_dict", "model", "model_state_dict"):
-        if found := state_of(content.get(wrapper)):
-            return found
+        if inner := state_of(content.get(wrapper)):
+            return inner
     return {}
 
 
 @dataclass(frozen=True)
-class StoredTensor(Outline):
+class StoredTensor(TensorOutline):
     """In place of a tensor: where its numbers lie in the archive."""
 
     key: str
@@ -472,8 +472,10 @@ class ForeignReader(OutlineReader):
             return NamedType(STORAGES[name], STORED[name])
         if module == "torch._utils" and name in self._rebuild:
             return self._rebuild[name]
-        known = self.names.get((module, name))
-        return known if known is not None else ForeignKind("Foreign", (Foreign,), {"module": module, "name": name})
+        stand_in = self.names.get((module, name))
+        return (
+            stand_in if stand_in is not None else ForeignKind("Foreign", (Foreign,), {"module": module, "name": name})
+        )
 
     def _instantiate(self, kind: Any, arguments: Any) -> None:  # noqa: ANN401 - the oldest way to call
         """Call what a pickle names."""
@@ -488,10 +490,10 @@ class ForeignReader(OutlineReader):
 
     def _outline(
         self, storage: Storage, item: int, offset: Declared, shape: Declared, stride: Declared, more: list[Any]
-    ) -> Outline:
+    ) -> TensorOutline:
         # Hooks and other additions are objects of nobody's here.
-        made = super()._outline(storage, item, offset, shape, stride, [])
+        checked = super()._outline(storage, item, offset, shape, stride, [])
         if not isinstance(storage, StoredNumbers):
             raise pickle.UnpicklingError("it holds a tensor in an unknown form")
         entry = f"{self.folder}/data/{storage.key}"
-        return StoredTensor(made.bytes, storage.key, entry, storage.type, offset, shape, stride)
+        return StoredTensor(checked.bytes, storage.key, entry, storage.type, offset, shape, stride)

@@ -31,11 +31,11 @@ def nearest_distances(points: Array, others: Array, limit: float = np.inf) -> Ar
 def nearest_by_chunks(points: Array, others: Array, limit: float = np.inf) -> Array:
     """The same by all distances."""
     rows = max(1, CHUNK // max(1, len(others)))
-    found = np.empty(len(points))
+    nearest = np.empty(len(points))
     for begin in range(0, len(points), rows):
         apart = points[begin : begin + rows, None] - others[None]
-        found[begin : begin + rows] = np.sqrt(np.square(apart).sum(-1).min(1))
-    return np.where(found < limit, found, np.inf)
+        nearest[begin : begin + rows] = np.sqrt(np.square(apart).sum(-1).min(1))
+    return np.where(nearest < limit, nearest, np.inf)
 
 
 def solve_block_chain(diagonal: Array, coupling: Array, right: Array) -> Array:
@@ -50,16 +50,16 @@ def solve_block_chain(diagonal: Array, coupling: Array, right: Array) -> Array:
         the solution (T, K).
     """
     frames, count = right.shape
-    found = np.array(right, np.float64)
+    solution = np.array(right, np.float64)
     inverses = np.empty((frames, count, count))
     for t in range(frames):  # elimination, block by block
         block = diagonal[t]
         if t:
             link = coupling[t - 1]
             block = block - link[:, None] * inverses[t - 1] * link
-            found[t] -= link * (inverses[t - 1] @ found[t - 1])
+            solution[t] -= link * (inverses[t - 1] @ solution[t - 1])
         inverses[t] = np.linalg.inv(block)
     for t in reversed(range(frames)):
-        after = coupling[t] * found[t + 1] if t + 1 < frames else 0.0
-        found[t] = inverses[t] @ (found[t] - after)
-    return found
+        after = coupling[t] * solution[t + 1] if t + 1 < frames else 0.0
+        solution[t] = inverses[t] @ (solution[t] - after)
+    return solution

@@ -146,7 +146,7 @@ def test_a_folder_may_grow_but_not_lack_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("field", "value"), [("version", "0.0.1"), ("python", "2.7"), ("folder", "/not/there")])
 def test_workers_of_another_version_or_without_the_folder_refuse(field: str, value: str) -> None:
-    run = cluster.Run("name", os.getcwd(), (), {}, {}, b"")
+    run = cluster.ClusterRun("name", os.getcwd(), (), {}, {}, b"")
     worker: Any = type("Worker", (), {"address": "tcp://nowhere:1"})
     assert cluster.meet(run, worker) == ""
     cluster._hosts.clear()

@@ -131,10 +131,10 @@ class OffsetModel(AutoregressiveModel):
         style, memory = self.conditions(batch, frames)
         truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
         if self.teacher_forcing:
-            made = self.network.teacher_forced(style, memory, truth)
+            predicted = self.network.teacher_forced(style, memory, truth)
         else:
-            made = self.network.generate(style, memory, self.loop)
-        return (made - truth).square(), frames
+            predicted = self.network.generate(style, memory, self.loop)
+        return (predicted - truth).square(), frames
 
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
@@ -142,11 +142,11 @@ class OffsetModel(AutoregressiveModel):
         """Frame by frame; nothing is random."""
         self.check_length(frames, batch.names[0])
         style, memory = self.conditions(batch, frames)
-        made = self.network.generate(style, memory, self.loop)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+        motion = self.network.generate(style, memory, self.loop)
+        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
 
 
-class KeysValues(NamedTuple):
+class ProjectedKeysValues(NamedTuple):
     """What attention has made of some positions, both (batch, heads, positions, head_dim)."""
 
     key: Tensor
@@ -176,25 +176,25 @@ class ProjectedAttention(nn.Module):
         dim = x.shape[-1]
         return self._split(F.linear(x, self.project.weight[:dim], self.project.bias[:dim]))
 
-    def keys_values(self, x: Float[Tensor, "batch positions dim"]) -> KeysValues:
+    def keys_values(self, x: Float[Tensor, "batch positions dim"]) -> ProjectedKeysValues:
         """The second and the last third."""
         dim = x.shape[-1]
         key, value = F.linear(x, self.project.weight[dim:], self.project.bias[dim:]).chunk(2, -1)
-        return KeysValues(self._split(key), self._split(value))
+        return ProjectedKeysValues(self._split(key), self._split(value))
 
-    def attend(self, query: Tensor, context: KeysValues, bias: Tensor | None = None) -> Tensor:
+    def attend(self, query: Tensor, context: ProjectedKeysValues, bias: Tensor | None = None) -> Tensor:
         """The attention itself, whose scores get ``bias``, and the map of its result."""
         dropout = self.dropout if self.training else 0.0
         bias = None if bias is None else bias.to(query.dtype)
         mixed = F.scaled_dot_product_attention(query, context.key, context.value, attn_mask=bias, dropout_p=dropout)
         return self.out(mixed.transpose(1, 2).flatten(2))
 
-    def attend_own(self, query: Tensor, context: KeysValues) -> Tensor:
+    def attend_own(self, query: Tensor, context: ProjectedKeysValues) -> Tensor:
         """Each position attends to its own moment alone: the context's positions divided among the queries."""
         batch, heads, frames, width = query.shape
         # The same as a mask that leaves only these positions, without the table of all others.
         queries = query.transpose(1, 2).reshape(batch * frames, heads, 1, width)
-        own = KeysValues(
+        own = ProjectedKeysValues(
             *(part.view(batch, heads, frames, -1, width).transpose(1, 2).flatten(0, 1) for part in context)
         )
         return self.attend(queries, own).view(batch, frames, -1)
@@ -221,7 +221,7 @@ class DecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(3))
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, speech: KeysValues, past: KeysValues, bias: Tensor | None) -> Tensor:
+    def forward(self, x: Tensor, speech: ProjectedKeysValues, past: ProjectedKeysValues, bias: Tensor | None) -> Tensor:
         """Frames ``x`` (B, T, dim) that see the positions of ``past`` as the ``bias`` (heads, T, P) lets them.
 
         Args:
@@ -238,7 +238,7 @@ class DecoderLayer(nn.Module):
         return self.norms[2](x + self.dropout(hidden))
 
 
-class MotionDecoder(nn.Module):
+class PeriodicDecoder(nn.Module):
     """The decoder: tokens of frames, and the speech that they go with, to one vector for each frame.
 
     Args:
@@ -298,12 +298,12 @@ class Continuation:
         frames: how many will be made.
     """
 
-    def __init__(self, decoder: MotionDecoder, speech: list[KeysValues], frames: int) -> None:
+    def __init__(self, decoder: PeriodicDecoder, speech: list[ProjectedKeysValues], frames: int) -> None:
         self.decoder, self.speech, self.frame = decoder, speech, 0
         self._keys: list[list[Tensor]] = [[] for _ in decoder.layers]
         self._values: list[list[Tensor]] = [[] for _ in decoder.layers]
         self._positions, self._room = decoder.positions(frames), frames
-        self._kept: list[KeysValues] | None = None
+        self._kept: list[ProjectedKeysValues] | None = None
 
     def step(self, token: Float[Tensor, "batch 1 dim"]) -> Float[Tensor, "batch 1 dim"]:
         """The next frame; its position is added to the token here."""
@@ -311,28 +311,28 @@ class Continuation:
         x, bias = decoder.dropout(token + self._positions[at]), decoder.bias(1, at)
         for number, layer in enumerate(decoder.layers):
             past = self._with(number, layer.self_attention.keys_values(x))  # type: ignore[union-attr, operator]
-            speech = KeysValues(*(part[:, :, at * steps : (at + 1) * steps] for part in self.speech[number]))
+            speech = ProjectedKeysValues(*(part[:, :, at * steps : (at + 1) * steps] for part in self.speech[number]))
             x = layer(x, speech, past, bias)
         self.frame += 1
         return x
 
-    def _with(self, number: int, new: KeysValues) -> KeysValues:
+    def _with(self, number: int, new: ProjectedKeysValues) -> ProjectedKeysValues:
         """Keys and values of a layer up to the present frame."""
         if torch.is_grad_enabled():  # what a gradient goes through must not be written over
             keys, values = self._keys[number], self._values[number]
             keys.append(new.key)
             values.append(new.value)
-            return KeysValues(torch.cat(keys, 2), torch.cat(values, 2))
+            return ProjectedKeysValues(torch.cat(keys, 2), torch.cat(values, 2))
         if self._kept is None:
             batch, heads, _, width = new.key.shape
             self._kept = [
-                KeysValues(*(new.key.new_empty(batch, heads, self._room, width) for _ in range(2)))
+                ProjectedKeysValues(*(new.key.new_empty(batch, heads, self._room, width) for _ in range(2)))
                 for _ in self.decoder.layers
             ]
         kept = self._kept[number]
         for store, part in zip(kept, new, strict=True):
             store[:, :, self.frame : self.frame + 1] = part
-        return KeysValues(*(store[:, :, : self.frame + 1] for store in kept))
+        return ProjectedKeysValues(*(store[:, :, : self.frame + 1] for store in kept))
 
 
 def periodic_positions(
@@ -375,15 +375,15 @@ class SpokenDecoder(nn.Module):
         dim = int(decoder["dim"])
         self.audio_map = nn.Linear(audio_width, dim)
         self.motion_in = nn.Linear(3 * n_vertices, dim)
-        self.decoder = MotionDecoder(**decoder)
+        self.decoder = PeriodicDecoder(**decoder)
 
     def after_motion(
         self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
     ) -> Float[Tensor, "batch frames dim"]:
         """The decoder's result for every frame from motion (B, T, 3V) of the frame before it, zero before the first."""
         before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
-        made: Tensor = self.decoder(self.motion_in(before) + style[:, None], memory)
-        return made
+        features: Tensor = self.decoder(self.motion_in(before) + style[:, None], memory)
+        return features
 
 
 class AutoregressiveNetwork(SpokenDecoder):
@@ -442,11 +442,11 @@ class AutoregressiveNetwork(SpokenDecoder):
         with torch.autocast(memory.device.type, enabled=False):
             turn = first.weight @ last.weight
             shift = first.weight @ last.bias + first.bias
-        state, token, made = self.decoder.start(memory), style[:, None], []
+        state, token, features = self.decoder.start(memory), style[:, None], []
         for _ in range(frames):
-            made.append(state.step(token))
-            token = F.linear(made[-1], turn, shift) + style[:, None]
-        return self.motion_out(torch.cat(made, 1))
+            features.append(state.step(token))
+            token = F.linear(features[-1], turn, shift) + style[:, None]
+        return self.motion_out(torch.cat(features, 1))
 
 
 # What the authors' checkpoints of these methods share.

@@ -94,10 +94,10 @@ class PublishedModel(AnimationModel):
         self.pairs = self.frame_rate == 25.0 if alignment == "auto" else alignment == "pairs"
         self.audio_encoder, self.audio_width = make_encoder(audio_encoder or self.published_encoder, audio_dim)
 
-    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+    def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, with the published audio encoder where none was given."""
-        chosen = given.get("audio_encoder")
-        super().keep_hyperparameters({**given, "audio_encoder": chosen or self.published_encoder})
+        chosen = arguments.get("audio_encoder")
+        super().keep_hyperparameters({**arguments, "audio_encoder": chosen or self.published_encoder})
 
     @classmethod
     def encoder_settings(cls) -> dict[str, Any]:
@@ -182,8 +182,8 @@ class PublishedModel(AnimationModel):
     def weights_of(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identities"]:
         """One-hot rows of identities; of an unknown speaker (−1) :meth:`unknown_weights`."""
         places = torch.arange(len(self.identities), device=identity.device)
-        known = (identity[:, None] == places).float()
-        return torch.where(identity[:, None] >= 0, known, self.unknown_weights().to(known))
+        one_hot = (identity[:, None] == places).float()
+        return torch.where(identity[:, None] >= 0, one_hot, self.unknown_weights().to(one_hot))
 
     def unknown_weights(self) -> Float[Tensor, " identities"]:
         """The weights of an unknown speaker."""
@@ -214,16 +214,16 @@ class PublishedModel(AnimationModel):
         """
         frames = torch.tensor([max(1, own) for own in self.tested_frames(batch)], device=batch.audio.device)
         seeds = [zlib.crc32(name.encode()) + seed for name in batch.names]
-        made = self.generate_frames(batch, frames, seeds=seeds, progress=progress)
-        return held(made, frames, batch.frame_lengths)
+        motion = self.generate_frames(batch, frames, seeds=seeds, progress=progress)
+        return held(motion, frames, batch.frame_lengths)
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> BatchMotion:
         """Several samples of one clip; a method without noise makes one."""
         count = len(seeds) if self.samples else 1
         frames = torch.tensor([max(1, self.frames_of(int(clip.audio_lengths[0])))] * count, device=clip.audio.device)
         clips = clip if count == 1 else clip.select([0] * count)
-        made = self.generate_frames(clips, frames, seeds=list(seeds)[:count], progress=progress)
-        motion = held(made, frames, clip.frame_lengths.expand(count))
+        generated = self.generate_frames(clips, frames, seeds=list(seeds)[:count], progress=progress)
+        motion = held(generated, frames, clip.frame_lengths.expand(count))
         return motion if self.samples else motion.expand(len(seeds), -1, -1, -1)
 
 
@@ -253,8 +253,8 @@ class DirectModel(PublishedModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """All frames in one pass; nothing is random."""
-        made = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+        motion = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
+        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
 
     @property
     def heard_steps(self) -> int:
@@ -297,8 +297,8 @@ class DirectMotion(nn.Module):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """In the unit of the corpus; the identity is an index, or −1."""
         model = self.model
-        made = model.decode(features, model.weights_of(identity), None)
-        return made.view(*made.shape[:2], model.n_vertices, 3) / model.scale
+        motion = model.decode(features, model.weights_of(identity), None)
+        return motion.view(*motion.shape[:2], model.n_vertices, 3) / model.scale
 
 
 def direct_graphs(model: DirectModel) -> Graphs:
@@ -350,22 +350,22 @@ def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEn
     Raises:
         ArgumentError: if its channels are not stated, and it does not know them by itself.
     """
-    made = component_class(factory)
-    if dim is None and not fits(None, parameters(made)["dim"]):
+    encoder_class = component_class(factory)
+    if dim is None and not fits(None, parameters(encoder_class)["dim"]):
         raise ArgumentError(
-            {"audio_dim": dim}, f"{made.__name__} does not state its channels by itself; give them, e.g. 64"
+            {"audio_dim": dim}, f"{encoder_class.__name__} does not state its channels by itself; give them, e.g. 64"
         )
     encoder = factory(dim=dim)  # type: ignore[arg-type]
     width: int = getattr(encoder, "width", dim or 0)
     return encoder, width
 
 
-def held(motion: BatchMotion, frames: Int[Tensor, " batch"], wanted: Int[Tensor, " batch"]) -> BatchMotion:
+def held(motion: BatchMotion, frames: Int[Tensor, " batch"], lengths: Int[Tensor, " batch"]) -> BatchMotion:
     """Motion of ``wanted`` frames of each clip: cut, or with its last frame held; zero on padding."""
-    longest = int(wanted.max())
+    longest = int(lengths.max())
     places = torch.arange(longest, device=motion.device)[None].minimum(frames[:, None] - 1)
     rows = torch.arange(len(motion), device=motion.device)[:, None]
-    return motion[rows, places] * frame_mask(wanted, longest)[..., None, None]
+    return motion[rows, places] * frame_mask(lengths, longest)[..., None, None]
 
 
 def masked_mean(values: Float[Tensor, "batch frames ..."], frames: Int[Tensor, " batch"]) -> Float[Tensor, ""]:

@@ -172,10 +172,10 @@ class CodeTalker(AutoregressiveModel):
             decoder=self.decoder_options,
         )
 
-    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+    def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, without the prior's file: the checkpoint holds the prior itself."""
         deaf = {"audio_encoder": NoSpeech, "audio_dim": 1} if self.stage == "prior" else {}
-        super().keep_hyperparameters({**given, **deaf, "prior": None})
+        super().keep_hyperparameters({**arguments, **deaf, "prior": None})
 
     def personal_modules(self) -> list[nn.Module]:
         """The predictor's table of speakers; a prior knows none."""
@@ -229,25 +229,25 @@ class CodeTalker(AutoregressiveModel):
         from facediff.utils.licences import merged
 
         try:
-            found = load_model(path)
+            trained = load_model(path)
         except FaceDiffError as error:
             raise FaceDiffError(f"--model.prior {error}") from error
-        if not isinstance(found, CodeTalker):
+        if not isinstance(trained, CodeTalker):
             raise FaceDiffError(
-                f"--model.prior {path}: is a checkpoint of {type(found).__name__}; expected one of CodeTalker, trained "
-                f"with model.stage=prior"
+                f"--model.prior {path}: is a checkpoint of {type(trained).__name__}; expected one of CodeTalker, "
+                f"trained with model.stage=prior"
             )
-        mine, theirs = self.prior_facts(), found.prior_facts()
+        mine, theirs = self.prior_facts(), trained.prior_facts()
         for name, value in theirs.items():
             if mine[name] != value:
                 raise FaceDiffError(
                     f"--model.prior {path}: its {name} is {value}, and this model has {mine[name]}; give the options "
                     f"with which the prior was trained"
                 )
-        self.prior.load_state_dict(found.prior.state_dict())
-        self.licences = merged(self.licences, found.licences)
+        self.prior.load_state_dict(trained.prior.state_dict())
+        self.licences = merged(self.licences, trained.licences)
         # The codes stand for motion as it was scaled when they were learnt.
-        self._assets = replace(found.assets, identities=self.identities)
+        self._assets = replace(trained.assets, identities=self.identities)
 
     def prior_facts(self) -> dict[str, object]:
         """What two models must agree on to have the same prior, by the names of the options."""
@@ -302,9 +302,9 @@ class CodeTalker(AutoregressiveModel):
                     before = self.motion_of(self.network.in_parallel(style, memory, before), frames)
         features = self.network.in_parallel(style, memory, before)
         with torch.no_grad():
-            wanted = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
+            true_codes = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
         error = masked_mean((self.motion_of(features, frames) - truth).square(), frames)
-        distance = masked_mean((features - wanted).square(), frames)
+        distance = masked_mean((features - true_codes).square(), frames)
         return {"reconstruction": error, "features": distance, "loss": error + self.feature_weight * distance}
 
     def motion_of(self, features: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
@@ -321,8 +321,8 @@ class CodeTalker(AutoregressiveModel):
         style, memory = self.conditions(batch, frames)
         generate = self.literal if self.loop == "literal" else self.cached
         values, fed_back = generate(style, memory, int(frames.max()), progress or iter)
-        made = torch.stack(fed_back, 1) if self.output == "fed_back" else self.prior.decode_clips(values, frames)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+        motion = torch.stack(fed_back, 1) if self.output == "fed_back" else self.prior.decode_clips(values, frames)
+        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
 
     def cached(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
         """Codes (B, T, width) and the frames that were fed back, with what does not change kept.
@@ -393,8 +393,8 @@ class CodeTalker(AutoregressiveModel):
             return super().generate_clips(batch, seed=seed, progress=progress)
         frames = batch.frame_lengths
         tokens = self.prior.encode_clips((batch.motion * self.scale).flatten(2), frames)
-        made = self.prior.decode_clips(self.prior.quantise(tokens).values, frames)
-        return made.view(*made.shape[:2], self.n_vertices, 3) / self.scale
+        motion = self.prior.decode_clips(self.prior.quantise(tokens).values, frames)
+        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
         """One motion for all seeds."""

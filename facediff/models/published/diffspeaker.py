@@ -26,9 +26,9 @@ from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, S
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
 from facediff.models.published.autoregressive import (
-    KeysValues,
     Period,
     ProjectedAttention,
+    ProjectedKeysValues,
     decoder_sizes,
     periodic_positions,
     read_period,
@@ -191,7 +191,7 @@ class DiffSpeaker(DiffusionModel):
         cached = heard.cached_features or ()
         return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden", *cached)
 
-    def conditions(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Conditions:
+    def conditions(self, batch: Batch, frames: Int[Tensor, " batch"]) -> SpeakerConditions:
         """What the network is conditioned on in every step."""
         valid = frame_mask(frames, int(frames.max())) if bool((frames != frames.max()).any()) else None
         heard = self.network.audio_map(self.hear(batch, frames))
@@ -215,10 +215,10 @@ class DiffSpeaker(DiffusionModel):
         clean = (batch.motion * self.scale).flatten(2) * mask
         signal = self.signal.to(clean)[step].view(-1, 1, 1)
         noisy = signal.sqrt() * clean + (1 - signal).sqrt() * noise * mask
-        made = self.network.motion_out(
+        predicted = self.network.motion_out(
             self.network(self.network.motion_in(noisy), step, self.conditions(batch, frames))
         )
-        error = (made - clean) * mask
+        error = (predicted - clean) * mask
         change = error[:, 1:] - error[:, :-1]
         if self.loss_mean == "frames":
             position, velocity = masked_mean(error.square(), frames), masked_mean(change.square(), frames - 1)
@@ -252,10 +252,10 @@ class DiffSpeaker(DiffusionModel):
         steps = step_shares(self.signal, self.sampling_steps, self.scheduler)
         for number in progress(range(len(steps))) if progress is not None else range(len(steps)):
             step, of_clean, of_noisy = steps[number]
-            made = network(space.embed(state), torch.full((len(batch),), step, device=state.device), conditions)
-            state = of_clean * space.clean(made) + of_noisy * state
+            hidden = network(space.embed(state), torch.full((len(batch),), step, device=state.device), conditions)
+            state = of_clean * space.clean(hidden) + of_noisy * state
             features, weight, left = (
-                of_clean * made + of_noisy * features,
+                of_clean * hidden + of_noisy * features,
                 of_clean + of_noisy * weight,
                 of_noisy * left,
             )
@@ -279,16 +279,16 @@ def step_shares(signal: Float[Tensor, " steps"], count: int, scheduler: Schedule
         scheduler: see :class:`DiffSpeaker`.
     """
     stride = len(signal) // count
-    found = []
+    shares = []
     for place in reversed(range(count)):
         step = min(place * stride + 1, len(signal) - 1)  # the published offset of 1
         now, after = float(signal[step]), float(signal[max(step - stride, 0)])
         noise = math.sqrt(1 - after)
         if scheduler == "published":
-            found.append((step, math.sqrt(after) + noise, 0.0))
+            shares.append((step, math.sqrt(after) + noise, 0.0))
         else:
-            found.append((step, math.sqrt(after) - noise * math.sqrt(now / (1 - now)), noise / math.sqrt(1 - now)))
-    return found
+            shares.append((step, math.sqrt(after) - noise * math.sqrt(now / (1 - now)), noise / math.sqrt(1 - now)))
+    return shares
 
 
 def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
@@ -300,7 +300,7 @@ def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
     return torch.cat([motion[:, :1], torch.where(inner, mean, motion[:, 1:-1]), motion[:, -1:]], 1)
 
 
-class Conditions:
+class SpeakerConditions:
     """What a clip's motion is conditioned on, and what is constant over the denoising steps.
 
     Args:
@@ -311,7 +311,11 @@ class Conditions:
     """
 
     def __init__(
-        self, style: Tensor, speech: list[KeysValues], positions: Tensor, bias: Float[Tensor, "... frames keys"]
+        self,
+        style: Tensor,
+        speech: list[ProjectedKeysValues],
+        positions: Tensor,
+        bias: Float[Tensor, "... frames keys"],
     ) -> None:
         self.style, self.speech, self.positions, self.bias = style, speech, positions, bias
 
@@ -340,7 +344,7 @@ class AdaptedLayer(nn.Module):
         self,
         x: Float[Tensor, "batch frames dim"],
         tokens: Float[Tensor, "batch 2 dim"],
-        speech: KeysValues,
+        speech: ProjectedKeysValues,
         bias: Tensor,
     ) -> Float[Tensor, "batch frames dim"]:
         """Frames after the layer.
@@ -352,11 +356,11 @@ class AdaptedLayer(nn.Module):
             bias: added to the scores of the tokens and the frames.
         """
         normed, own = self.norms[0](x), self.self_attention
-        frames = KeysValues(*map(joined, own.keys_values(tokens), own.keys_values(normed)))
+        frames = ProjectedKeysValues(*map(joined, own.keys_values(tokens), own.keys_values(normed)))
         x = x + self.dropout(own.attend(own.queries(normed), frames, bias))
         heard, count = self.cross_attention, x.shape[1]
         # Each frame has the two tokens and one moment of speech to attend to, side by side.
-        moments = KeysValues(
+        moments = ProjectedKeysValues(
             *(
                 torch.cat([token[:, :, None].expand(-1, -1, count, -1, -1), part[:, :, :, None]], 3).flatten(2, 3)
                 for token, part in zip(heard.keys_values(tokens), speech, strict=True)
@@ -422,7 +426,7 @@ class DiffSpeakerNetwork(nn.Module):
         memory: Float[Tensor, "batch frames dim"],
         identities: Float[Tensor, "batch identities"],
         valid: Bool[Tensor, "batch frames"] | None,
-    ) -> Conditions:
+    ) -> SpeakerConditions:
         """What is constant over the denoising steps.
 
         Args:
@@ -436,10 +440,10 @@ class DiffSpeakerNetwork(nn.Module):
         bias = F.pad(mutual_bias(frames, self.num_heads, self.period, device=memory.device), (2, 0))
         if valid is not None:
             bias = bias.masked_fill(~F.pad(valid, (2, 0), value=True)[:, None, None], -torch.inf)
-        return Conditions(self.style(identities), speech, positions, bias)
+        return SpeakerConditions(self.style(identities), speech, positions, bias)
 
     def forward(
-        self, mapped: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: Conditions
+        self, mapped: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: SpeakerConditions
     ) -> Float[Tensor, "batch frames dim"]:
         """From noisy motion after ``motion_in`` to what ``motion_out`` makes clean motion of."""
         x = self.dropout(mapped + conditions.positions)
@@ -496,11 +500,11 @@ class SpeakerStep(nn.Module):
         """The prediction, and the features that it is made of."""
         model, network, space = self.model, self.model.network, self.model.space()
         conditions = network.conditions(features, model.weights_of(identity), None)
-        made = network(space.embed(state[..., : space.width]), step, conditions)
+        hidden = network(space.embed(state[..., : space.width]), step, conditions)
         if model.sampling_space == "vertices":
-            return space.clean(made), made
-        ones = torch.ones_like(made[..., :1])
-        return torch.cat([space.clean(made), made, ones, torch.zeros_like(ones)], -1), made
+            return space.clean(hidden), hidden
+        ones = torch.ones_like(hidden[..., :1])
+        return torch.cat([space.clean(hidden), hidden, ones, torch.zeros_like(ones)], -1), hidden
 
 
 class SpeakerStart(nn.Module):
@@ -531,12 +535,12 @@ class SpeakerMotion(nn.Module):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """In the unit of the corpus; ``noise`` is what sampling started from, if anything is left of it."""
         model, last = self.model, self.model.network.motion_out
-        made = sample
+        coordinates = sample
         if model.sampling_space == "folded":
             features = sample[..., model.dim : -2]
-            made = nn.functional.linear(features, last.weight) + sample[..., -2:-1] * last.bias
-            made = made if noise is None else made + sample[..., -1:] * noise
-        motion = made.view(*made.shape[:2], model.n_vertices, 3) / model.scale
+            coordinates = nn.functional.linear(features, last.weight) + sample[..., -2:-1] * last.bias
+            coordinates = coordinates if noise is None else coordinates + sample[..., -1:] * noise
+        motion = coordinates.view(*coordinates.shape[:2], model.n_vertices, 3) / model.scale
         return smoothed_whole(motion) if model.smooth else motion
 
 
@@ -555,14 +559,14 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
     batch, frames, dim = features.shape
     folded, coordinates = model.sampling_space == "folded", 3 * model.n_vertices
     width = 2 * dim + 2 if folded else coordinates
-    given = conditions_of(features, model)
-    del given["template"]
+    inputs = conditions_of(features, model)
+    del inputs["template"]
     state, noise = torch.zeros(batch, frames, width), torch.zeros(batch, frames, coordinates)
     step = Graph(
         "step",
         SpeakerStep(model),
-        {**given, "state": state, "step": zeros(batch)},
-        {**{name: CONDITIONS[name] for name in given}, "state": FRAMES, "step": BATCH},
+        {**inputs, "state": state, "step": zeros(batch)},
+        {**{name: CONDITIONS[name] for name in inputs}, "state": FRAMES, "step": BATCH},
         ("prediction", "kept"),
     )
     steps = step_shares(model.signal, model.sampling_steps, model.scheduler)

@@ -128,11 +128,13 @@ class FaceDiffuser(DiffusionModel):
 
     def tested_frames(self, batch: Batch) -> list[int]:
         """As many as the truth has where speech lasts as long, as the published test does."""
-        found = []
-        for samples, wanted in zip(batch.audio_lengths.tolist(), batch.frame_lengths.tolist(), strict=True):
-            own = wanted if int(samples / SAMPLE_RATE * self.frame_rate) >= wanted else self.frames_of(samples)
-            found.append(min(own, self.steps_of(samples) // 2) if self.pairs else own)
-        return found
+        counts = []
+        for samples, true_frames in zip(batch.audio_lengths.tolist(), batch.frame_lengths.tolist(), strict=True):
+            own = (
+                true_frames if int(samples / SAMPLE_RATE * self.frame_rate) >= true_frames else self.frames_of(samples)
+            )
+            counts.append(min(own, self.steps_of(samples) // 2) if self.pairs else own)
+        return counts
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Speech features, two steps side by side for each frame."""
@@ -161,8 +163,8 @@ class FaceDiffuser(DiffusionModel):
         noisy = self.posterior.add_noise(clean, noise[:, :longest], step)
         network = self.network
         audio = network.audio_map(self.hear(batch, frames))
-        made = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
-        error = F.huber_loss(network.motion_out(made) + rest, clean, reduction="none")
+        hidden = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
+        error = F.huber_loss(network.motion_out(hidden) + rest, clean, reduction="none")
         return masked_mean(error, frames)
 
     def rest(self, template: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch 1 coordinates"]:
@@ -191,20 +193,20 @@ class FaceDiffuser(DiffusionModel):
         state = space.noise(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
         if self.skip_steps:
             state = state * posterior.noise_share(last)
-        made = speech
+        hidden = speech
         for step in progress(range(last, -1, -1)) if progress is not None else range(last, -1, -1):
             if self.encode_speech == "every_step" and step < last:
                 speech = network.audio_map(self.hear(batch, frames))
             steps = torch.full((len(batch),), step, device=state.device)
-            made = network(space.embed(state), steps, speech, style)
+            hidden = network(space.embed(state), steps, speech, style)
             if step:
                 of_clean, of_noisy, of_noise = posterior.shares(step)
-                state = of_clean * space.clean(made) + of_noisy * state
+                state = of_clean * space.clean(hidden) + of_noisy * state
                 state = state + of_noise * space.noise(noise(state))
         # At the last step nothing but the prediction of clean motion is left.
-        motion = (network.motion_out(made) + rest - (batch.template * self.scale).flatten(1)[:, None]) / self.scale
+        motion = (network.motion_out(hidden) + rest - (batch.template * self.scale).flatten(1)[:, None]) / self.scale
         if self.noised == "offsets":
-            motion = network.motion_out(made) / self.scale
+            motion = network.motion_out(hidden) / self.scale
         return motion.view(*motion.shape[:2], self.n_vertices, 3)
 
 
@@ -317,8 +319,8 @@ class DiffuserStep(nn.Module):
         """Where vertices are noised with the face, the template is a part of what is predicted."""
         model, network = self.model, self.model.network
         space = model.space(model.rest(template))
-        made = network(space.embed(state), step, features, network.style(model.weights_of(identity)))
-        return space.clean(made), made
+        hidden = network(space.embed(state), step, features, network.style(model.weights_of(identity)))
+        return space.clean(hidden), hidden
 
 
 class DiffuserStart(nn.Module):
@@ -344,8 +346,8 @@ class LastMap(nn.Module):
 
     def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames vertices 3"]:
         """In the unit of the corpus."""
-        made = self.model.network.motion_out(sample)
-        return made.view(*made.shape[:2], self.model.n_vertices, 3) / self.model.scale
+        coordinates = self.model.network.motion_out(sample)
+        return coordinates.view(*coordinates.shape[:2], self.model.n_vertices, 3) / self.model.scale
 
 
 def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
@@ -363,8 +365,8 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     last = Graph("motion", LastMap(model), {"sample": features}, {"sample": FRAMES}, ("offsets",))
     visited = list(range(model.steps - model.skip_steps - 1, -1, -1))
     table = []
-    for each in visited:
-        of_clean, of_noisy, of_noise = model.posterior.shares(each) if each else (1.0, 0.0, 0.0)
+    for number in visited:
+        of_clean, of_noisy, of_noise = model.posterior.shares(number) if number else (1.0, 0.0, 0.0)
         table.append([of_noisy, of_clean, 0.0, 0.0, of_noise])
     parts = [speech, step, last]
     if model.skip_steps:

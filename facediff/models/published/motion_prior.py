@@ -24,7 +24,7 @@ PriorScale = Literal["width", "heads"]
 """Whose root the attention's scores are divided by: the width of the layer, or that of one head."""
 
 
-class Block(nn.Module):
+class PriorBlock(nn.Module):
     """Self-attention over all frames, then a feed-forward layer; each normalises its input and is added.
 
     Args:
@@ -44,12 +44,12 @@ class Block(nn.Module):
         self.first, self.second = nn.Linear(dim, hidden_dim), nn.Linear(hidden_dim, dim)
 
     def forward(
-        self, x: Float[Tensor, "batch frames dim"], wanted: int | None = None
-    ) -> Float[Tensor, "batch wanted dim"]:
-        """The frames, or only the last ``wanted`` of them, which attend to all."""
+        self, x: Float[Tensor, "batch frames dim"], newest: int | None = None
+    ) -> Float[Tensor, "batch newest dim"]:
+        """The frames, or only the last ``newest`` of them, which attend to all."""
         normed, dim = self.attention_norm(x), x.shape[-1]
-        last = slice(0 if wanted is None else x.shape[1] - wanted, None)
-        if wanted is None:
+        last = slice(0 if newest is None else x.shape[1] - newest, None)
+        if newest is None:
             query, key, value = self.project(normed).chunk(3, -1)
         else:
             query = F.linear(normed[:, last], self.project.weight[:dim])
@@ -90,12 +90,12 @@ class Half(nn.Module):
         self.leak, self.positions = leak, positions
         self.smooth = nn.Conv1d(dim, dim, kernel, padding=kernel // 2, padding_mode="replicate")
         self.embed = nn.Linear(dim, dim)
-        self.blocks = nn.ModuleList(Block(dim, num_heads, hidden_dim, scale) for _ in range(num_layers))
+        self.blocks = nn.ModuleList(PriorBlock(dim, num_heads, hidden_dim, scale) for _ in range(num_layers))
 
     def forward(
-        self, x: Float[Tensor, "batch frames dim"], wanted: int | None = None
-    ) -> Float[Tensor, "batch wanted dim"]:
-        """All frames of clips of one length; or only the last ``wanted`` frames of the result."""
+        self, x: Float[Tensor, "batch frames dim"], newest: int | None = None
+    ) -> Float[Tensor, "batch newest dim"]:
+        """All frames of clips of one length; or only the last ``newest`` frames of the result."""
         frames, dim = x.shape[1:]
         smooth = F.leaky_relu(self.smooth(x.transpose(1, 2)), self.leak)
         # Instance normalisation: over a clip's frames, for each channel. Written as a layer norm over time, which takes
@@ -105,7 +105,7 @@ class Half(nn.Module):
         x = x + periodic_positions(count, dim, count, device=x.device)
         for block in self.blocks[:-1]:
             x = block(x)
-        return self.blocks[-1](x, wanted)
+        return self.blocks[-1](x, newest)
 
 
 class Codes(NamedTuple):

@@ -139,10 +139,10 @@ class SelfTalk(DirectModel):
             if lip_vertices is not None:
                 self.reader = self._make_reader(self.text, lip_vertices)
 
-    def keep_hyperparameters(self, given: dict[str, Any]) -> None:
+    def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, with the recogniser's configuration in place of its source."""
         config = {} if self.text is None else self.text.network.config.to_dict()
-        super().keep_hyperparameters({**given, "text_config": config})
+        super().keep_hyperparameters({**arguments, "text_config": config})
 
     def make_parts(self, assets: Assets) -> None:
         """Make the lip reader for the corpus's lips, if it was given no vertices of its own."""
@@ -167,9 +167,9 @@ class SelfTalk(DirectModel):
         """Speech features of each frame; where speech comes in pairs, two hidden states side by side."""
         rule: StepRule = "hidden_cut" if self.pairs else "features"
         cached = heard.cached_features or ()
-        each = self.heard_steps
-        hidden = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, each * frames, rule, *cached)
-        return hidden.reshape(hidden.shape[0], hidden.shape[1] // each, each * hidden.shape[2])
+        steps = self.heard_steps
+        hidden = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, steps * frames, rule, *cached)
+        return hidden.reshape(hidden.shape[0], hidden.shape[1] // steps, steps * hidden.shape[2])
 
     # Training.
 
@@ -178,27 +178,27 @@ class SelfTalk(DirectModel):
         frames = self.trained_frames(batch)
         longest = int(frames.max())
         truth = (batch.motion * self.scale).flatten(2)[:, :longest]
-        made = self.network(self.hear(batch, frames), frames)
-        error = made - truth
-        found = {
+        motion = self.network(self.hear(batch, frames), frames)
+        error = motion - truth
+        terms = {
             "reconstruction": masked_mean(error.square(), frames),
             "velocity": masked_mean(error.diff(dim=1).square(), (frames - 1).clamp_min(0)),
         }
-        loss = self.vertex_weight * found["reconstruction"] + self.velocity_weight * found["velocity"]
+        loss = self.vertex_weight * terms["reconstruction"] + self.velocity_weight * terms["velocity"]
         if self.text is not None and self.reader is not None:
             heard = self.text(batch.audio, batch.audio_lengths)
-            read = self.reader(made, frames, heard.steps)
-            found["consistency"] = masked_mean((read.features - heard.features).square(), heard.steps)
-            found["ctc"] = ctc(read.letters, heard.transcripts(), heard.steps, self.text.blank)
-            loss = loss + self.consistency_weight * found["consistency"] + self.ctc_weight * found["ctc"]
-        return {**found, "loss": loss}
+            read = self.reader(motion, frames, heard.steps)
+            terms["consistency"] = masked_mean((read.features - heard.features).square(), heard.steps)
+            terms["ctc"] = ctc(read.letters, heard.transcripts(), heard.steps, self.text.blank)
+            loss = loss + self.consistency_weight * terms["consistency"] + self.ctc_weight * terms["ctc"]
+        return {**terms, "loss": loss}
 
     # Inference.
 
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """By the decoder, which knows no speakers."""
-        made: Tensor = self.network(features, frames)
-        return made
+        motion: Tensor = self.network(features, frames)
+        return motion
 
     def lip_steps_of(self, frames: int) -> int:
         """Steps at 50 a second for which the lip reader reads so many frames."""
@@ -268,8 +268,8 @@ class SelfTalkNetwork(nn.Module):
         """Speech is what is decoded, and what is attended to; every frame sees all of it, and no frame its number."""
         tokens = self.audio_map(speech)
         padding = None if frames is None else padding_of(frames, tokens.shape[1])
-        made = self.decoder(tokens, tokens, tgt_key_padding_mask=padding, memory_key_padding_mask=padding)
-        moved: Tensor = self.motion_out(made)
+        features = self.decoder(tokens, tokens, tgt_key_padding_mask=padding, memory_key_padding_mask=padding)
+        moved: Tensor = self.motion_out(features)
         return moved
 
 
@@ -336,7 +336,7 @@ class LipReader(nn.Module):
         """Read offsets of all vertices, each clip in so many steps."""
         mapped = self.lip_map(motion[..., self.columns])
         counts = zip(mapped, frames.tolist(), steps.tolist(), strict=True)
-        parts = [interpolate_ends(clip[None, :count], wanted)[0] for clip, count, wanted in counts]
+        parts = [interpolate_ends(clip[None, :count], length)[0] for clip, count, length in counts]
         x = nn.utils.rnn.pad_sequence(parts, batch_first=True)
         padding = padding_of(steps, x.shape[1])
         features = self.transformer(
@@ -345,7 +345,7 @@ class LipReader(nn.Module):
         return Read(features, self.lm_head(features))
 
 
-class Heard(NamedTuple):
+class Transcription(NamedTuple):
     """What a recogniser hears: hidden states (batch, steps, dim), likeliest letters (batch, steps), valid steps."""
 
     features: Tensor
@@ -355,8 +355,8 @@ class Heard(NamedTuple):
 
     def transcripts(self) -> list[Tensor]:
         """Each clip's letters without repeats and then without blanks, as CTC reads them."""
-        found = (row[:count].unique_consecutive() for row, count in zip(self.letters, self.steps.tolist(), strict=True))
-        return [letters[letters != self.blank] for letters in found]
+        rows = (row[:count].unique_consecutive() for row, count in zip(self.letters, self.steps.tolist(), strict=True))
+        return [letters[letters != self.blank] for letters in rows]
 
 
 class TextNetwork(nn.Module):
@@ -382,11 +382,11 @@ class TextNetwork(nn.Module):
         return self
 
     @torch.no_grad()
-    def forward(self, audio: Waves, audio_lengths: Lengths) -> Heard:
+    def forward(self, audio: Waves, audio_lengths: Lengths) -> Transcription:
         """Hear speech, each clip by itself."""
         features, steps = by_length(standardise(audio, audio_lengths), audio_lengths, self._hidden)
         letters: Tensor = self.network.lm_head(features).argmax(-1)
-        return Heard(features, letters, steps, self.blank)
+        return Transcription(features, letters, steps, self.blank)
 
     def _hidden(self, wave: Tensor) -> Tensor:
         # At least one step, however short the speech is.
@@ -426,7 +426,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     weights.move_all("audio_feature_map.", "network.audio_map.")
     weights.move_all("transformer_decoder.", "network.decoder.")
     weights.move_all("vertice_map_r.", "network.motion_out.")
-    made: dict[str, Any] = {
+    options: dict[str, Any] = {
         "audio_encoder": encoder,
         "dim": dim,
         "num_layers": count_layers(weights, "transformer_decoder.layers."),
@@ -436,8 +436,8 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     if facts.model_options.get("lip_reader") != "text":
         for prefix in LIP_PARTS:
             weights.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")
-        return made
-    return {**made, **convert_reader(weights, facts)}
+        return options
+    return {**options, **convert_reader(weights, facts)}
 
 
 def convert_reader(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
@@ -447,8 +447,8 @@ def convert_reader(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str,
         FaceDiffError: if the vertices that the lip reader sees are not given; no file holds them.
     """
     _, columns = weights.shape("lip_map.weight")
-    given = facts.model_options.get("lip_vertices")
-    if given is None and columns != 3 * facts.n_vertices:
+    lip_vertices = facts.model_options.get("lip_vertices")
+    if lip_vertices is None and columns != 3 * facts.n_vertices:
         raise OptionError.naming(
             f"{{option}} lip_reader=text: no file holds the {columns // 3} vertices that the lip reader sees; give "
             f"them in the authors' order as {{option}} lip_vertices=[0,1,...], or omit the option, which animation "
@@ -465,7 +465,7 @@ def convert_reader(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str,
     for part in LIP_PARTS[1:]:
         weights.move_all(part, f"reader.{part}")
     return {
-        "lip_vertices": list(range(facts.n_vertices)) if given is None else given,
+        "lip_vertices": list(range(facts.n_vertices)) if lip_vertices is None else lip_vertices,
         "lip_layers": count_layers(weights, "transformer.encoder.layers."),
         "lip_feed_forward_dim": hidden,
         "text_config": config,

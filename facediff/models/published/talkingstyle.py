@@ -128,14 +128,16 @@ class SpeakerStyle(nn.Module):
 
     def forward(self, weights: Float[Tensor, "batch identities"]) -> Float[Tensor, "batch dim"]:
         """Styles of speakers, or of mixtures of them."""
-        each = self.second(weights)[..., None]
+        components = self.second(weights)[..., None]
         if self.over == "one_key":
             # The softmax over one key is 1: what is left of the attention are the maps of its values.
             width = self.LIFTED
             into, shift = self.attention.in_proj_weight[2 * width :], self.attention.in_proj_bias[2 * width :]
-            mixed = self.attention.out_proj(F.linear(self.value(each), into, shift))
+            mixed = self.attention.out_proj(F.linear(self.value(components), into, shift))
         else:
-            mixed, _ = self.attention(self.query(each), self.key(each), self.value(each), need_weights=False)
+            mixed, _ = self.attention(
+                self.query(components), self.key(components), self.value(components), need_weights=False
+            )
         return torch.relu(self.first(weights) + self.head(self.norm(mixed))[..., 0])
 
 

@@ -89,14 +89,14 @@ class Voca(DirectModel):
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """The linear shapes start as principal components of the training motion, without an offset."""
-        wanted = self.network.expression.in_features if self.shapes == "principal" else 0
-        found = super().measure(data, max(at_least, wanted))
-        if found is not None and wanted:
+        components = self.network.expression.in_features if self.shapes == "principal" else 0
+        principal = super().measure(data, max(at_least, components))
+        if principal is not None and components:
             with torch.no_grad():
-                weight, count = self.network.expression.weight, min(wanted, len(found))
-                weight[:, :count] = found[:count].T.to(weight)
+                weight, count = self.network.expression.weight, min(components, len(principal))
+                weight[:, :count] = principal[:count].T.to(weight)
                 self.network.expression.bias.zero_()
-        return found
+        return principal
 
     # Frames.
 
@@ -117,14 +117,14 @@ class Voca(DirectModel):
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames channels rows"]:
         """The window of speech around each frame; what lies before or after the speech is zero."""
-        each, rows = self.rows_per_frame, self.row_counts(heard.audio_lengths)
+        step, rows = self.rows_per_frame, self.row_counts(heard.audio_lengths)
         cached = heard.cached_features or ()
-        made = self.audio_encoder.at_rate(heard.audio, heard.audio_lengths, rows, self.frame_rate * each, *cached)
-        before, most = self.speech_window // 2, int(frames.max()) if not exporting() else made.shape[1] // each
+        features = self.audio_encoder.at_rate(heard.audio, heard.audio_lengths, rows, self.frame_rate * step, *cached)
+        before, most = self.speech_window // 2, int(frames.max()) if not exporting() else features.shape[1] // step
         # A graph has as many rows for each frame, of which the last ones may not be valid; they are zero.
-        missing = (most - 1) * each - made.shape[1] if not exporting() else -each
+        missing = (most - 1) * step - features.shape[1] if not exporting() else -step
         after = max(0, missing + self.speech_window - before)
-        return sliding(F.pad(made, (0, 0, before, after)), self.speech_window, each, most)
+        return sliding(F.pad(features, (0, 0, before, after)), self.speech_window, step, most)
 
     def row_counts(self, samples: Int[Tensor, " batch"]) -> Int[Tensor, " batch"]:
         """Rows of speech of clips, at least one."""
@@ -145,9 +145,9 @@ class Voca(DirectModel):
         mask = frame_mask(frames, windows.shape[1])
         clips = mask.nonzero()[:, 0]
         valid = self.mixed(windows[mask], weights[clips])
-        made = valid.new_zeros(*mask.shape, valid.shape[-1])
-        made[mask] = valid
-        return made
+        padded = valid.new_zeros(*mask.shape, valid.shape[-1])
+        padded[mask] = valid
+        return padded
 
     def mixed(
         self, windows: Float[Tensor, "frames channels rows"], weights: Float[Tensor, "frames identities"]
@@ -182,18 +182,21 @@ class Voca(DirectModel):
 
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """Each frame from its own window."""
-        made = self.of_all(features, weights) if frames is None else self.coefficients(features, weights, frames)
-        offsets: Tensor = self.network.expression(made)
+        if frames is None:
+            coefficients = self.of_all(features, weights)
+        else:
+            coefficients = self.coefficients(features, weights, frames)
+        offsets: Tensor = self.network.expression(coefficients)
         return offsets
 
     def of_all(
         self, windows: Float[Tensor, "batch frames channels rows"], weights: Float[Tensor, "batch identities"]
     ) -> Float[Tensor, "batch frames components"]:
         """Coefficients without padding, of every speaker, then mixed: nothing depends on the values of the weights."""
-        count, each = weights.shape[1], windows.flatten(0, 1)
-        speakers = torch.eye(count, device=weights.device)[:, None].expand(-1, each.shape[0], -1)
-        made = self.network(each.repeat(count, 1, 1), speakers.flatten(0, 1)).view(count, *windows.shape[:2], -1)
-        return torch.einsum("bk,kbtc->btc", weights, made)
+        count, flat = weights.shape[1], windows.flatten(0, 1)
+        speakers = torch.eye(count, device=weights.device)[:, None].expand(-1, flat.shape[0], -1)
+        mixed = self.network(flat.repeat(count, 1, 1), speakers.flatten(0, 1)).view(count, *windows.shape[:2], -1)
+        return torch.einsum("bk,kbtc->btc", weights, mixed)
 
 
 class VocaNetwork(nn.Module):
@@ -258,8 +261,8 @@ class VocaNetwork(nn.Module):
             x = torch.relu(x)
         # Row by row, as TensorFlow lays it out.
         flat = x.transpose(1, 2).flatten(1)
-        made: Tensor = self.coefficients(torch.tanh(self.dense(flat) + self.late_style(speaker)))
-        return made
+        coefficients: Tensor = self.coefficients(torch.tanh(self.dense(flat) + self.late_style(speaker)))
+        return coefficients
 
 
 def padded_same(x: Float[Tensor, "*channels rows"], taps: int) -> Float[Tensor, "*channels padded"]:
@@ -392,15 +395,15 @@ def count_vertices(weights: AuthorsWeights, *, scope: str) -> int:
     return weights.shape(f"{scope}{SHAPES}weights")[1] // 3
 
 
-for each in SCOPES:
+for prefix in SCOPES:
     register(
         Recogniser(
             method="Voca",
-            marks=(f"{each}{ENCODER}conv1/weights", f"{each}{ENCODER}fc1/weights", f"{each}{SHAPES}weights"),
+            marks=(f"{prefix}{ENCODER}conv1/weights", f"{prefix}{ENCODER}fc1/weights", f"{prefix}{SHAPES}weights"),
             unless=(),
-            convert=partial(convert, scope=each),
-            vertices=partial(count_vertices, scope=each),
-            count=partial(count_identities, scope=each),
+            convert=partial(convert, scope=prefix),
+            vertices=partial(count_vertices, scope=prefix),
+            count=partial(count_identities, scope=prefix),
             frame_rate=PUBLISHED_RATE,
             graph="deepspeech",
             licence="Max Planck licence for non-commercial scientific research",

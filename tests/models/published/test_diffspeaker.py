@@ -179,7 +179,7 @@ def test_the_table_of_positions_may_be_missing_but_not_another(tmp_path: Path) -
     whole = model_of(state, tmp_path, "vocaset").animate(speech, identity="A").vertices
     table = state.pop("denoiser.PPE.pe")
     assert torch.equal(model_of(state, tmp_path, "vocaset").animate(speech, identity="A").vertices, whole)
-    for wrong, named in ((table + 0.1, "PPE.pe"), (published.positions(5025, 16, 25)[None], "--dataset")):
+    for wrong, named in ((table + 0.1, "PPE.pe"), (published.positions(5025, 16, 25)[None], "dataset vocaset")):
         torch.save(state | {"denoiser.PPE.pe": wrong}, tmp_path / "author.pth")
         with pytest.raises(FaceDiffError, match=named):
             import_checkpoint(
