@@ -129,7 +129,7 @@ class ControlledFace:
         if lids is not None:
             eyes.lids()
         if balls is not None and not eyes.eyeballs:
-            raise FaceDiffError(f"{balls}: {eyes.source} does not say which vertices are the eyeballs; add them")
+            raise OptionError.naming(f"{balls}: {eyes.source} does not say which vertices are the eyeballs; add them")
         return eyes
 
     def refuse_whole_animation(self) -> None:

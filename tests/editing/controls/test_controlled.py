@@ -1,0 +1,103 @@
+"""Animation controls from the command line to the changed animation."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from facediff.animation import Animation
+from facediff.animation.options import AnimationControls
+from facediff.cli.parsing import parameters_of, parse
+from facediff.editing.controlled import apply_controls
+from facediff.editing.controls import check_controls
+from facediff.editing.expressiveness import scale_regions
+from facediff.editing.eyes import Eyes
+from facediff.editing.procedural import add_blinks, add_gaze, add_sway
+from facediff.errors import FaceDiffError
+
+
+def parsed(*words: str) -> AnimationControls:
+    """The controls that the words of a command line ask for."""
+    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"]
+    check_controls(controls)
+    return controls
+
+
+def with_controls(*, controls: AnimationControls) -> None:
+    """A command that has the controls only."""
+
+
+def test_nothing_is_on_by_default(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(3)
+    assert apply_controls(animation, parsed()) is animation
+
+
+def test_editing_is_imported_only_where_it_is_asked_for() -> None:
+    program = (
+        "import sys, facediff.pipelines.folder, facediff.export\n"
+        "from facediff.editing.controls import AnimationControls\n"
+        "assert AnimationControls().is_off\n"
+        "print(*(name for name in sys.modules if name.startswith('facediff.editing.')))"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert run.stdout.split() == ["facediff.editing.controls"]
+
+
+def test_all_options_in_their_order(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
+    animation = make_animation(200, jaw_open=0.4, lids_close=0.1)
+    controls = parsed("--expressiveness", "upper_face=1.5", "--blinks", "20", "--gaze", "--sway", "3")
+    made = apply_controls(animation, controls, seed=7)
+    by_hand = scale_regions(animation, {"upper_face": 1.5}, eyes)
+    by_hand = add_blinks(add_gaze(by_hand, eyes, degrees=4, seed=7), eyes, rate=20, seed=7)
+    by_hand = add_sway(by_hand, degrees=3, seed=7)
+    np.testing.assert_allclose(made.vertices, by_hand.vertices, atol=1e-6)
+    assert (
+        made.metadata
+        == by_hand.metadata
+        == {
+            "identity": "F1",
+            "edited": "expressiveness (upper_face 1.5)",
+            "procedural": "gaze (4 degrees, seed 7); blinks (20 a minute, seed 7); head sway (3 degrees, seed 7)",
+        }
+    )
+    own = apply_controls(animation, parsed("--blinks", "--controls-seed", "3"), seed=7)
+    assert own.metadata["procedural"] == "blinks (17 a minute, seed 3)"
+    assert apply_controls(animation, parsed("--sway"), seed=9).metadata["procedural"] == "head sway (2 degrees, seed 9)"
+    with pytest.raises(FaceDiffError, match="F1: its head sways already"):
+        apply_controls(made, parsed("--blinks"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--expressiveness", "a lot"], "expressiveness a lot: expected a factor"),
+        (["--blinks", "0"], "--blinks 0: "),
+        (["--blinks", "speech.wav"], "--blinks speech.wav: "),
+        (["--gaze", "50"], "--gaze 50: "),
+        (["--sway", "0"], "--sway 0: "),
+        (["--eyes", "none.json"], "eyes none.json: no such file"),
+        (["--controls-seed", "-1"], "--controls-seed -1: "),
+        (["--directing-seed", "1"], "--controls-seed"),
+    ],
+)
+def test_words_are_checked_before_anything_is_made(words: list[str], sentence: str) -> None:
+    with pytest.raises(FaceDiffError) as caught:
+        parsed(*words)
+    assert sentence in str(caught.value)
+
+
+def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable[..., Animation]) -> None:
+    animation = replace(make_animation(2), faces=None)
+    for option in ("--blinks", "--gaze"):
+        with pytest.raises(FaceDiffError, match=f"{option[2:]}: needs to know where lids and eyeballs are.*give eyes"):
+            apply_controls(animation, parsed(option))
+    assert (
+        apply_controls(animation, parsed("--sway", "--expressiveness", "1.2"))
+        .metadata["procedural"]
+        .startswith("head sway")
+    )
