@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -283,9 +284,7 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
         path: the file.
         n_vertices: vertices of the mesh; those of the first face if None.
     """
-    loaded = load_pickle(path)
-    if not isinstance(loaded, dict):
-        raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, got {type(loaded).__name__}")
+    loaded = load_template_dict(path)
     if n_vertices is None:
         size = np.size(next(iter(loaded.values()), ()))
         if not size or size % 3:
@@ -303,7 +302,15 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
     return templates
 
 
-def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
+def load_template_dict(path: Path) -> dict[Any, Any]:
+    """The dict in ``templates.pkl``, whose entries are still to be checked by :func:`as_template`."""
+    loaded = load_pickle(path)
+    if not isinstance(loaded, dict):
+        raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, got {type(loaded).__name__}")
+    return loaded
+
+
+def as_template(value: object, n_vertices: int, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
     """One entry of ``templates.pkl`` as a neutral face (V, 3).
 
     Raises:
@@ -319,7 +326,7 @@ def as_template(value: object, n_vertices: int) -> npt.NDArray[np.float32]:
     if entry.shape not in ((3 * n_vertices,), (n_vertices, 3)):
         raise ValueError(f"has shape {entry.shape}, expected ({n_vertices}, 3)")
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-        array = np.array(entry.reshape(n_vertices, 3), np.float32)
+        array = np.array(entry.reshape(n_vertices, 3), dtype)
     bad = np.count_nonzero(~(np.abs(array) <= COORDINATE).all(axis=1))
     if bad:
         raise ValueError(

@@ -16,7 +16,6 @@ from facediff.data.check.report import Findings, counted, few, number, relative
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import surface_area
 from facediff.utils.checksums import sha256
-from facediff.utils.pickles import load_pickle
 
 if TYPE_CHECKING:
     from facediff.data.corpus import Corpus
@@ -118,15 +117,13 @@ def check_account(manifest: Mapping[str, Any], findings: Findings) -> None:
 
 def check_templates(root: Path, view: View, findings: Findings) -> tuple[dict[str, Array], dict[str, Any]]:
     """Check ``templates.pkl``; returns its usable templates (V, 3) by subject, and the report's section."""
-    from facediff.data.corpus import as_template
+    from facediff.data.corpus import as_template, load_template_dict
 
     path = root / "templates.pkl"
     section: dict[str, Any] = {"file": None, "subjects": [], "broken": [], "blob": None, "origin": None, "areas": None}
     templates: dict[str, Array] = {}
     with findings.guard("templates_unreadable", path, root):
-        loaded = load_pickle(path)
-        if not isinstance(loaded, dict):
-            raise FaceDiffError(f"expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+        loaded = load_template_dict(path)
         section["file"] = path.name
         for subject, value in loaded.items():
             try:

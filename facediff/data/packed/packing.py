@@ -40,6 +40,7 @@ from facediff.data.packed.layout import (
 )
 from facediff.data.packed.shards import shard_key
 from facediff.data.packed.stores import is_packed
+from facediff.data.prepare.runner import refuse_foreign, version
 from facediff.data.storage import MOTION_FOLDERS, motion_path, refuse_out_of_range
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.speech.audio import open_sound
@@ -284,7 +285,7 @@ class PackingPlan:
                 dtype.name, rows[own], width, chunk, min(chunks, rows[own] // chunk), ()
             )
         record = Record(
-            made_by=_version(),
+            made_by=version(),
             corpus=view.corpus,
             n_vertices=view.n_vertices,
             frame_rate=rate,
@@ -365,12 +366,6 @@ def _other_files(root: Path) -> tuple[str, ...]:
     return tuple(paths)
 
 
-def _version() -> str:
-    from facediff.data.prepare.runner import version
-
-    return version()
-
-
 def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str | None, quiet: bool) -> PackingReport:
     if (out / METADATA).is_file():
         return _finished(plan, out)
@@ -382,9 +377,7 @@ def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str
                 f"folder"
             )
     else:
-        others = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
-        if others:
-            raise FaceDiffError(f"{out}: holds other files ({', '.join(others[:3])}); choose a new folder")
+        refuse_foreign(out, "facediff data pack")
         write_json(out / STATE, begun)
     remove_partial(out, recursive=True)
     tasks = [task for task in plan.tasks() if not (out / task.target).is_file()]

@@ -151,7 +151,7 @@ def prepare(
         manifest = _read_record(out / MANIFEST)
         begun = _read_record(out / STATE) or manifest
         if begun is None:
-            _refuse_foreign(out)
+            refuse_foreign(out, "facediff data prepare")
         recorded = {} if manifest is None else manifest.get("files", {})
         finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out, recorded))}
         if manifest is not None and not (out / STATE).exists() and _is_complete(plan, finished, out, manifest):
@@ -300,12 +300,13 @@ def _refuse_other_recipe(plan: PreparationPlan, out: Path, record: dict[str, Any
         )
 
 
-def _refuse_foreign(out: Path) -> None:
+def refuse_foreign(out: Path, command: str) -> None:
+    """Refuse to write into a folder with files that ``command`` has not written."""
     others = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
     if others:
         raise FaceDiffError(
             f"{out}: holds other files ({', '.join(others[:3])}{' …' if len(others) > 3 else ''}) and was not begun by "
-            f"`facediff data prepare`; choose a new folder"
+            f"`{command}`; choose a new folder"
         )
 
 

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.corpus import as_template, load_template_dict
 from facediff.data.prepare.motion import resample_frames
 from facediff.data.prepare.runner import (
     Job,
@@ -29,7 +30,7 @@ from facediff.data.prepare.runner import (
     write_templates,
 )
 from facediff.errors import FaceDiffError
-from facediff.utils.arrays import in_range, open_vertices
+from facediff.utils.arrays import open_vertices
 from facediff.utils.pickles import load_pickle
 
 RAW_RATE = 60
@@ -79,7 +80,7 @@ def plan(
     vertices, templates_file = _need(raw, VERTICES), _need(raw, TEMPLATES)
     row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
     n_vertices = open_vertices(vertices).shape[1]
-    templates = _read_templates(templates_file, n_vertices, vertices)
+    templates = _read_templates(templates_file, n_vertices)
     extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
     region_files = find_regions(raw, regions)
     missing = _missing_extras([*extras, *region_files])
@@ -215,21 +216,13 @@ def _nested(path: Path) -> dict[str, dict[str, Any]]:
     return {str(subject): {str(key): value for key, value in inner.items()} for subject, inner in loaded.items()}
 
 
-def _read_templates(path: Path, n_vertices: int, vertices: Path) -> dict[str, Array]:
-    loaded = load_pickle(path)
-    if not isinstance(loaded, dict):
-        raise FaceDiffError(f"{path}: expected a dict from subject to (V, 3) array, got {type(loaded).__name__}")
+def _read_templates(path: Path, n_vertices: int) -> dict[str, Array]:
     templates = {}
-    for subject, value in loaded.items():
-        array = np.asarray(value)
-        if array.dtype.kind != "f" or array.size != 3 * n_vertices:
-            raise FaceDiffError(
-                f"{path}: the template of {subject} has shape {array.shape} and holds {array.dtype}, but the frames of "
-                f"{vertices} have {n_vertices} vertices; expected the same mesh everywhere"
-            )
-        if not in_range(array):
-            raise FaceDiffError(f"{path}: the template of {subject} holds NaN or infinity; get the file again")
-        templates[str(subject)] = array.reshape(-1, 3).astype(np.float64)
+    for subject, value in load_template_dict(path).items():
+        try:
+            templates[str(subject)] = as_template(value, n_vertices, np.float64)
+        except ValueError as error:
+            raise FaceDiffError(f"{path}: the template of {subject} {error}; get the file again") from error
     return templates
 
 
