@@ -140,6 +140,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
     def __iter__(self) -> Iterator[list[Pick]]:
         """This process's batches of the current epoch."""
+        # Every process computes the batches of all and takes its share: the seed alone keeps them in agreement.
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
         done = self.resume_batch if self.epoch == self.resume_epoch else 0
         for place in range(self.rank + done * self.num_replicas, len(batches), self.num_replicas):

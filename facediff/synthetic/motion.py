@@ -98,7 +98,7 @@ def generate_weights(
         Weights (frames, controls) in the order of `facediff.synthetic.rig.CONTROLS` at the middle of each frame.
     """
     effect = MOOD_EFFECTS[mood]
-    margin = 0.2
+    margin = 0.2  # seconds beyond both ends, so that smoothing has no border effect within the clip
     times = np.arange(-margin, frames / FRAME_RATE + margin, 1.0 / _FINE_RATE)
     tracks = {name: np.zeros_like(times) for name in CONTROLS}
     _speech(tracks, segments, times, style, effect, random)
@@ -119,6 +119,7 @@ def _speech(
     random: np.random.Generator,
 ) -> None:
     """Add the motion of jaw and lips, which follows the phonemes."""
+    # The mouth runs ahead of the sound by `lead`: sampling the gestures later in time plays them earlier.
     weights = articulate(segments, times + style.lead, spread=style.slack)
     wander = 1.0 + 0.03 * _drift(times, random)
     for column, control in enumerate(SPEECH_CONTROLS):
@@ -126,6 +127,7 @@ def _speech(
         # Lips that press, or that touch the teeth, do so in every mood; only large shapes are emphasised.
         emphasis = effect.articulation if control in _GAINS else 1.0
         tracks[control] += gain * emphasis * wander * weights[:, column]
+    # Closures may not run ahead as far as vowels do, or a frame with the sound of a b would show open lips.
     tracks["lip_closure"] += close_lips(segments, times + np.clip(style.lead, -0.008, 0.008))
     for control in ("upper_lip_raise", "lower_lip_drop", "lower_lip_tuck"):
         # Lips that meet cannot show the teeth at the same time.

@@ -16,7 +16,7 @@ from facediff.data.check.layouts import (
     SPLITS,
     STATE,
     CorpusFolder,
-    View,
+    CorpusView,
     facexhubert_names,
     identify,
     is_rate,
@@ -124,10 +124,10 @@ def check(
 
 def _check_corpus(
     report: CheckReport,
-    view: View,
+    view: CorpusView,
     folder: CorpusFolder,
     manifest: dict[str, Any],
-    examine_all: Callable[[Rules, View, CorpusFolder], list[ClipFacts]],
+    examine_all: Callable[[Rules, CorpusView, CorpusFolder], list[ClipFacts]],
 ) -> None:
     from facediff.data.corpus import Corpus
 
@@ -189,7 +189,7 @@ def _check_corpus(
     report.subjects = _count_subjects(view, clips, frames, templates)
 
 
-def _clips(opened: Corpus | None, view: View, folder: CorpusFolder, findings: Findings) -> dict[str, Clip]:
+def _clips(opened: Corpus | None, view: CorpusView, folder: CorpusFolder, findings: Findings) -> dict[str, Clip]:
     """The clips that training would read; by their names alone if the folder cannot be opened."""
     names = [name for name in folder.names if name in folder.motions and name in folder.sounds]
     clips = {name: clip for name in names if (clip := view.parse(name)) is not None}
@@ -201,7 +201,7 @@ def _clips(opened: Corpus | None, view: View, folder: CorpusFolder, findings: Fi
 
 
 def _examine_all(
-    rules: Rules, view: View, folder: CorpusFolder, *, workers: int | None, scheduler: str | None, progress: bool
+    rules: Rules, view: CorpusView, folder: CorpusFolder, *, workers: int | None, scheduler: str | None, progress: bool
 ) -> list[ClipFacts]:
     tasks = [
         ClipFiles(name, clip.identity, folder.motions.get(name), folder.sounds.get(name))
@@ -231,7 +231,7 @@ def _examine_all(
 # Findings about names and pairs of files.
 
 
-def _check_names(view: View, folder: CorpusFolder, clips: Mapping[str, Clip], findings: Findings) -> None:
+def _check_names(view: CorpusView, folder: CorpusFolder, clips: Mapping[str, Clip], findings: Findings) -> None:
     """Report names not of the corpus's form, subjects in no split, and files that are not read."""
     unknown = [name for name in folder.names if view.parse(name) is None]
     hubert = facexhubert_names(unknown) if view.corpus == "biwi" else []
@@ -262,7 +262,7 @@ def _check_names(view: View, folder: CorpusFolder, clips: Mapping[str, Clip], fi
         findings.note("stray_file", folder.strays[0], message)
 
 
-def _without_split(view: View, clips: Mapping[str, Clip]) -> list[str]:
+def _without_split(view: CorpusView, clips: Mapping[str, Clip]) -> list[str]:
     """Clips of subjects that are in none of the corpus's splits."""
     identities = set(view.identities)
     identities |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
@@ -272,7 +272,7 @@ def _without_split(view: View, clips: Mapping[str, Clip]) -> list[str]:
     return [name for name, clip in clips.items() if clip.identity not in identities]
 
 
-def _check_both_files(view: View, folder: CorpusFolder, findings: Findings) -> None:
+def _check_both_files(view: CorpusView, folder: CorpusFolder, findings: Findings) -> None:
     for files, others, what, kind in (
         (folder.sounds, folder.motions, "speech without motion", "motion_missing"),
         (folder.motions, folder.sounds, "motion without speech", "sound_missing"),
@@ -314,7 +314,7 @@ def _check_sound_forms(facts: Iterable[ClipFacts], findings: Findings) -> None:
 
 
 def _check_frame_rate(
-    view: View, stored: float, facts: Sequence[ClipFacts], findings: Findings, *, recorded: bool
+    view: CorpusView, stored: float, facts: Sequence[ClipFacts], findings: Findings, *, recorded: bool
 ) -> bool:
     """Whether the lengths of the speech agree with the frame rate; one finding if most clips disagree."""
     rates = [clip.frames / clip.seconds for clip in facts if clip.frames is not None and clip.seconds]
@@ -353,7 +353,7 @@ def _check_copies(facts: Iterable[ClipFacts], findings: Findings) -> None:
 
 
 def _count_splits(
-    view: View, clips: Mapping[str, Clip], frames: Mapping[str, int], findings: Findings
+    view: CorpusView, clips: Mapping[str, Clip], frames: Mapping[str, int], findings: Findings
 ) -> list[dict[str, Any]]:
     """One row for each split of each of the ways in which a corpus is split."""
     rows: list[dict[str, Any]] = []
@@ -384,12 +384,12 @@ def _count_splits(
     return rows
 
 
-def _amount(view: View, names: Iterable[str], frames: Mapping[str, int]) -> dict[str, Any]:
+def _amount(view: CorpusView, names: Iterable[str], frames: Mapping[str, int]) -> dict[str, Any]:
     total = sum(frames.get(name, 0) for name in names)
     return {"frames": total, "seconds": round(total / view.frame_rate, 3)}
 
 
-def _report_missing(view: View, clips: Mapping[str, Clip], findings: Findings) -> None:
+def _report_missing(view: CorpusView, clips: Mapping[str, Clip], findings: Findings) -> None:
     incomplete = False
     for split, names in view.expected.items():
         missing = [name for name in names if name not in clips]
@@ -407,7 +407,7 @@ def _report_missing(view: View, clips: Mapping[str, Clip], findings: Findings) -
         findings.note("obtain", view.corpus, view.obtain)
 
 
-def _compare_check_figure(view: View, rows: Iterable[Mapping[str, Any]], findings: Findings) -> None:
+def _compare_check_figure(view: CorpusView, rows: Iterable[Mapping[str, Any]], findings: Findings) -> None:
     if view.corpus not in CHECK_FIGURES:
         return
     split, *figure = CHECK_FIGURES[view.corpus]
@@ -429,7 +429,7 @@ def _compare_check_figure(view: View, rows: Iterable[Mapping[str, Any]], finding
 
 
 def _count_subjects(
-    view: View, clips: Mapping[str, Clip], frames: Mapping[str, int], templates: Mapping[str, object]
+    view: CorpusView, clips: Mapping[str, Clip], frames: Mapping[str, int], templates: Mapping[str, object]
 ) -> list[dict[str, Any]]:
     """One row for each subject that has clips or a template: those that are trained on first, in their order."""
     names_of: dict[str, list[str]] = {}

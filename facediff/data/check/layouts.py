@@ -83,7 +83,7 @@ class CorpusFolder:
 
 
 @dataclass(frozen=True)
-class View:
+class CorpusView:
     """The facts about a corpus that the check needs, from its data module or from a person's own folder."""
 
     corpus: str
@@ -109,7 +109,7 @@ def identify(
     corpus: str | None,
     split: str | None,
     manifest: dict[str, Any],
-) -> View | None:
+) -> CorpusView | None:
     """The corpus that a folder holds; None, with a finding, if it holds none or is not recognised.
 
     ``recorded`` is the corpus that ``manifest.json`` or ``prepare.json`` names, ``corpus`` the one that the user names,
@@ -124,7 +124,7 @@ def identify(
         findings.error("raw", file, message)
         return None
     if module is None and isinstance(manifest.get("person"), str):
-        view: View | None = None
+        view: CorpusView | None = None
         with findings.guard("manifest_unreadable", root / MANIFEST, root):
             view = _view_of_person(manifest, n_vertices)
         return view
@@ -148,7 +148,7 @@ def identify(
     return None
 
 
-def view_of(root: Path, corpus: str | None) -> View:
+def view_of(root: Path, corpus: str | None) -> CorpusView:
     """Recognise a corpus folder.
 
     Args:
@@ -323,7 +323,7 @@ def _own_names(module: Module) -> bool:
 # The facts that the check needs.
 
 
-def _view_of_module(module: Module, root: Path, split: str | None) -> View:
+def _view_of_module(module: Module, root: Path, split: str | None) -> CorpusView:
     parameter = inspect.signature(module).parameters.get("split")
     hint: Any = None if parameter is None else get_type_hints(module.__init__).get("split")
     ways: list[str | None] = list(get_args(hint)) if get_origin(hint) is Literal else [None]
@@ -334,7 +334,7 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> View:
             if names
             else f"--split: {module.corpus_name} is split in one way only; omit the option"
         )
-    return View(
+    return CorpusView(
         corpus=module.corpus_name,
         data_module=f"{module.__module__}.{module.__qualname__}",
         n_vertices=module.n_vertices,
@@ -369,7 +369,7 @@ def is_rate(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and 1 <= value <= 10_000
 
 
-def _view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> View:
+def _view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> CorpusView:
     """A person's folder, as ``facediff data import-person`` writes it, through its own ``manifest.json``."""
     from facediff.data.corpus import parse_name
 
@@ -381,7 +381,7 @@ def _view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> View:
         recorded = clip.attributes.get("split")
         return "test_a" if recorded == "test" else recorded
 
-    return View(
+    return CorpusView(
         corpus="person",
         data_module=None,
         n_vertices=vertices,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.check.clip import Array
-from facediff.data.check.layouts import MANIFEST, STATE, View
+from facediff.data.check.layouts import MANIFEST, STATE, CorpusView
 from facediff.data.check.report import Findings, counted, few, number, relative
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import surface_area
@@ -115,7 +115,7 @@ def check_account(manifest: Mapping[str, Any], findings: Findings) -> None:
 # Templates, the neutral faces.
 
 
-def check_templates(root: Path, view: View, findings: Findings) -> tuple[dict[str, Array], dict[str, Any]]:
+def check_templates(root: Path, view: CorpusView, findings: Findings) -> tuple[dict[str, Array], dict[str, Any]]:
     """Check ``templates.pkl``; returns its usable templates (V, 3) by subject, and the report's section."""
     from facediff.data.corpus import as_template, load_template_dict
 
@@ -140,7 +140,7 @@ def check_templates(root: Path, view: View, findings: Findings) -> tuple[dict[st
     return templates, section
 
 
-def _origin(view: View, blob: str, findings: Findings) -> str | None:
+def _origin(view: CorpusView, blob: str, findings: Findings) -> str | None:
     """The project that the templates come from; None for corpora without circulating copies."""
     circulating = TEMPLATES.get(view.corpus)
     if circulating is None:
@@ -158,7 +158,7 @@ def _origin(view: View, blob: str, findings: Findings) -> str | None:
 
 
 def check_areas(
-    view: View, unit: object, templates: dict[str, Array], faces: npt.NDArray[np.int32], findings: Findings
+    view: CorpusView, unit: object, templates: dict[str, Array], faces: npt.NDArray[np.int32], findings: Findings
 ) -> dict[str, float] | None:
     """Surface area of every template, which defines the unit of some corpora and must be one there; None in others.
 
@@ -181,7 +181,7 @@ def check_areas(
 # Mesh and regions.
 
 
-def check_mesh(root: Path, view: View, findings: Findings) -> tuple[npt.NDArray[np.int32] | None, str | None]:
+def check_mesh(root: Path, view: CorpusView, findings: Findings) -> tuple[npt.NDArray[np.int32] | None, str | None]:
     """Check the mesh file; returns its faces (F, 3) if they can be used, and its path relative to the folder."""
     from facediff.mesh import read_mesh
 
@@ -207,13 +207,13 @@ def check_mesh(root: Path, view: View, findings: Findings) -> tuple[npt.NDArray[
     return faces, relative(path, root)
 
 
-def check_regions(root: Path, view: View, findings: Findings) -> dict[str, dict[str, Any] | None]:
+def check_regions(root: Path, view: CorpusView, findings: Findings) -> dict[str, dict[str, Any] | None]:
     """Check which vertices the regions are, region by region; None for one that cannot be used."""
     return {name: _check_region(root, view, name, sources, findings) for name, sources in view.region_sources.items()}
 
 
 def _check_region(
-    root: Path, view: View, name: str, sources: Sequence[str], findings: Findings
+    root: Path, view: CorpusView, name: str, sources: Sequence[str], findings: Findings
 ) -> dict[str, Any] | None:
     from facediff.data.corpus import find_region
 

@@ -52,7 +52,7 @@ from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.units import metres_per_unit
 
 if TYPE_CHECKING:
-    from facediff.data.check.layouts import View
+    from facediff.data.check.layouts import CorpusView
 
 Exact = Literal["test", "none"]
 """Clips that are stored without loss: those that scores are computed from, or none."""
@@ -102,7 +102,7 @@ class PackingReport:
 
 
 @dataclass(frozen=True)
-class Part:
+class ShardPart:
     """Frames of a clip that lie in a shard.
 
     Attributes:
@@ -121,7 +121,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Task:
+class PackingTask:
     """One file to write: a shard of motion, or the encoded speech of a clip.
 
     Attributes:
@@ -133,7 +133,7 @@ class Task:
 
     target: str
     coding: str = ""
-    parts: tuple[Part, ...] = ()
+    parts: tuple[ShardPart, ...] = ()
     sound: Path | None = None
 
     def __str__(self) -> str:
@@ -241,7 +241,7 @@ class PackingPlan:
             millimetres = 1.0
         rate = float(manifest.get("frame_rate") or view.stored_frame_rate)
         chunk = max(1, round(rate * chunk_seconds))
-        step = 2 * MARGIN * tolerance / millimetres
+        step = 2 * MARGIN * tolerance / millimetres  # rounding to whole steps errs by half a step at most
         coding = "int16" if step * millimetres * np.iinfo(np.int16).max >= ROOM else "int32"
         templates = read_templates(root / "templates.pkl", view.n_vertices)
         clips, arrays, left_out, size, seen = {}, {}, [], 0, hashlib.sha256()
@@ -270,6 +270,7 @@ class PackingPlan:
             own = coding if tolerance and name not in kept else vertices.dtype.name
             nothing = PackedSound(0, (), "flac", 16_000, 1, 1, 16)
             clips[name] = PackedClip(name, clip.identity, own, vertices.dtype.name, rows[own], len(vertices), nothing)
+            # Each clip begins at a chunk of its own, so that reading a window decodes no other clip.
             rows[own] += -(-len(vertices) // chunk) * chunk
             for file in (path, sounds[name]):
                 facts = file.stat()
@@ -309,11 +310,11 @@ class PackingPlan:
             "clips": {name: [clip.coding, clip.frames] for name, clip in record.clips.items()},
         }
 
-    def tasks(self) -> Iterator[Task]:
+    def tasks(self) -> Iterator[PackingTask]:
         """A task for every shard of motion, and for every clip's speech."""
         for name, facts in self.record.arrays.items():
             shard_rows = facts.chunk * facts.chunks
-            parts: dict[int, list[Part]] = {}
+            parts: dict[int, list[ShardPart]] = {}
             for clip in self.record.clips.values():
                 if name != f"motion_{clip.coding}":
                     continue
@@ -323,19 +324,19 @@ class PackingPlan:
                         max(clip.first, shard * shard_rows),
                         min(clip.first + clip.frames, (shard + 1) * shard_rows),
                     )
-                    part = Part(path, clip.identity, low - shard * shard_rows, low - clip.first, high - clip.first)
+                    part = ShardPart(path, clip.identity, low - shard * shard_rows, low - clip.first, high - clip.first)
                     parts.setdefault(shard, []).append(part)
             for shard in range(-(-facts.rows // shard_rows)):
-                yield Task(
+                yield PackingTask(
                     f"{name}/{shard_key(shard, facts.width)}",
                     name.removeprefix("motion_"),
                     tuple(parts.get(shard, ())),
                 )
         for clip in self.record.clips.values():
-            yield Task(f"{PARTS}/{clip.name}", sound=self.root / "wav" / f"{clip.name}.wav")
+            yield PackingTask(f"{PARTS}/{clip.name}", sound=self.root / "wav" / f"{clip.name}.wav")
 
 
-def scored_clips(root: Path, view: View) -> frozenset[str]:
+def scored_clips(root: Path, view: CorpusView) -> frozenset[str]:
     """Clips that scores are computed from: the test splits and the style references of their clips."""
     from facediff.data.check.layouts import by_name, instance
 
@@ -380,6 +381,7 @@ def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str
         refuse_foreign(out, "facediff data pack")
         write_json(out / STATE, begun)
     remove_partial(out, recursive=True)
+    # Every task writes one file, which appears whole or not at all: a file that exists is finished.
     tasks = [task for task in plan.tasks() if not (out / task.target).is_file()]
     work = partial(_write, out, plan.root, plan.record)
     results = run_tasks(
@@ -428,6 +430,7 @@ def _report(plan: PackingPlan, record: Record, out: Path, written: int) -> Packi
 
 def _finish(plan: PackingPlan, out: Path) -> Record:
     """Join the encoded speech, add files and templates, and write the record last."""
+    # Speech is encoded in parallel to one file a clip; its place in the common array is known only now.
     clips, place = {}, 0
     for name, clip in plan.record.clips.items():
         with (out / PARTS / name).open("rb") as stream:
@@ -473,7 +476,7 @@ def _clear(out: Path) -> None:
 # Tasks: run in worker processes, each writes one file.
 
 
-def _write(out: Path, root: Path, record: Record, task: Task) -> None:
+def _write(out: Path, root: Path, record: Record, task: PackingTask) -> None:
     if task.sound is not None:
         content = encode_speech(task.sound)
     else:
@@ -501,7 +504,7 @@ def _write(out: Path, root: Path, record: Record, task: Task) -> None:
 
 
 def _quantised(
-    part: Part,
+    part: ShardPart,
     vertices: npt.NDArray[np.floating],
     template: npt.NDArray[np.float32],
     record: Record,
@@ -530,7 +533,7 @@ def _quantised(
 
 
 def _exact(
-    part: Part,
+    part: ShardPart,
     vertices: npt.NDArray[np.floating],
     template: npt.NDArray[np.float32],
     record: Record,

@@ -62,6 +62,7 @@ class PackedCorpus:
         text = store.whole(METADATA)
         self.source = store.source
         self.record: Record = read_record(text, self.source)
+        # The record holds the size and place of everything, so its hash identifies the content for caches.
         self.identity = hashlib.sha256(text).hexdigest()[:40]
         self.store: ByteStore = open_store(source, self.identity)
         self._arrays = {name: ShardedArray(self.store, name, facts) for name, facts in self.record.arrays.items()}
@@ -152,6 +153,7 @@ class PackedCorpus:
         sound = self.record.clips[name].sound
         piece_samples = PIECE_SECONDS * sound.rate
         places = np.cumsum([sound.first, *sound.pieces])
+        # libsndfile left-aligns FLAC samples in 32 bits; the shift at the end gives the recorded values back.
         samples = np.empty((stop - first, sound.channels), np.int32)
         for number in range(first // piece_samples, -(-stop // piece_samples)):
             encoded = self._arrays["speech"].read(int(places[number]), int(places[number + 1])).tobytes()
@@ -213,8 +215,9 @@ class PackedMotion:
         rows_by_chunk = chunks_of(picks, self.array.facts.chunk)
         begin = self.clip.first // self.array.facts.chunk
         tasks: list[tuple[int, memoryview]] = []
+        # Neighbouring chunks are fetched together: in a store at an address each request costs a round trip.
         try:
-            for run in _neighbours(sorted(rows_by_chunk)):
+            for run in _consecutive(sorted(rows_by_chunk)):
                 fetched = self.array.fetch(begin + run[0], begin + run[-1] + 1)
                 tasks += zip(run, fetched, strict=True)
 
@@ -273,7 +276,7 @@ class PackedMotion:
         return rows.view(np.dtype(self.clip.coding)).reshape(self.frames, -1, 3)
 
 
-def _neighbours(numbers: Sequence[int]) -> list[list[int]]:
+def _consecutive(numbers: Sequence[int]) -> list[list[int]]:
     """Groups of consecutive numbers."""
     groups: list[list[int]] = []
     for number in numbers:

@@ -144,7 +144,7 @@ def into_coordinates(face: Array, best: Similarity, fixed_scale: float | None) -
 
 
 @dataclass(frozen=True)
-class Stabilised:
+class StabilisedMotion:
     """Frames without head motion; lengths are in the motion's unit."""
 
     frames: npt.NDArray[np.floating]  # (T, V, 3), in the pose of the face
@@ -169,7 +169,7 @@ def read_stable(source: str, n_vertices: int) -> Indices:
     return np.array(region.indices, np.int64)
 
 
-def stabilise(motion: FaceSequence, face: Array, stable: Indices, scratch: Path) -> Stabilised:
+def stabilise(motion: FaceSequence, face: Array, stable: Indices, scratch: Path) -> StabilisedMotion:
     """Align every frame with the median face (V, 3); parameters without head motion stay as they are."""
     count = len(motion.frames)
     if motion.has_head_motion:
@@ -183,7 +183,7 @@ def stabilise(motion: FaceSequence, face: Array, stable: Indices, scratch: Path)
     speed = _speed(frames)
     if speed.max() < STILL * face_size(face):
         raise FaceDiffError("the motion is still: every frame is the same face; expected the frames of a video")
-    return Stabilised(frames, face, stable, turns, shifts, float(np.sqrt(np.square(residuals).mean())), speed)
+    return StabilisedMotion(frames, face, stable, turns, shifts, float(np.sqrt(np.square(residuals).mean())), speed)
 
 
 def middle_face(motion: FaceSequence, stable: Indices) -> Array:
@@ -227,7 +227,7 @@ def _speed(frames: npt.NDArray[np.floating]) -> Array:
 
 
 @dataclass(frozen=True)
-class Template:
+class TemplateFile:
     """A neutral face (V, 3) that was given, and its file."""
 
     path: Path
@@ -235,7 +235,7 @@ class Template:
 
 
 @dataclass(frozen=True)
-class Neutral:
+class NeutralFace:
     """A neutral face (V, 3)."""
 
     face: Array
@@ -246,25 +246,25 @@ class Neutral:
 
 def choose_neutral(
     motion: FaceSequence,
-    stabilised: Stabilised,
-    template: Template | None,
+    stabilised: StabilisedMotion,
+    template: TemplateFile | None,
     speech: npt.NDArray[np.float32],
     frame_rate: float,
-) -> Neutral:
+) -> NeutralFace:
     """The neutral face that was given, else the source's own, else one found in the frames without head motion."""
     if template is not None:
-        return Neutral(template.vertices, _onto_template(stabilised, template), str(template.path))
+        return NeutralFace(template.vertices, _onto_template(stabilised, template), str(template.path))
     unmoved = Similarity(np.eye(3), np.zeros(3))
     if motion.template is not None:
-        return Neutral(motion.template, unmoved, "the model's shape without expression")
+        return NeutralFace(motion.template, unmoved, "the model's shape without expression")
     covered = max(1, min(len(stabilised.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
     chosen = neutral_frames(loudness(speech, covered, frame_rate), stabilised.speed[:covered]).tolist()
     face = np.median(stabilised.frames[chosen], axis=0).astype(np.float64)
     source = f"median of {len(chosen)} silent and still frames (counted from 0): {spans(chosen)}"
-    return Neutral(face, unmoved, source, chosen)
+    return NeutralFace(face, unmoved, source, chosen)
 
 
-def _onto_template(stabilised: Stabilised, template: Template) -> Similarity:
+def _onto_template(stabilised: StabilisedMotion, template: TemplateFile) -> Similarity:
     """The rigid motion from the stabilised frames to a template, by the stable vertices."""
     face, target = stabilised.face[stabilised.stable], template.vertices[stabilised.stable]
     ratio = robust_align(face, target, scale=True).scale
@@ -283,7 +283,7 @@ def _onto_template(stabilised: Stabilised, template: Template) -> Similarity:
     return rigid
 
 
-def read_template(path: Path, target: TargetCorpus) -> Template:
+def read_template(path: Path, target: TargetCorpus) -> TemplateFile:
     """A neutral face from .obj, .ply or .npy."""
     suffix, faces, count = path.suffix.lower(), None, target.n_vertices
     vertices: Array
@@ -304,7 +304,7 @@ def read_template(path: Path, target: TargetCorpus) -> Template:
     if not np.isfinite(vertices).all():
         raise FaceDiffError(f"{path}: holds NaN or infinity; expected a neutral face")
     check_faces(path, faces, target)
-    return Template(path, vertices)
+    return TemplateFile(path, vertices)
 
 
 def loudness(speech: Speech, frames: int, frame_rate: float) -> Array:

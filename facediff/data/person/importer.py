@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT
 from facediff.data.person.fitting import (
-    Neutral,
+    NeutralFace,
     Speech,
-    Stabilised,
+    StabilisedMotion,
     TargetCorpus,
     check_faces,
     choose_neutral,
@@ -124,11 +124,11 @@ def import_person(
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedSpeaker:
     """A speaker's frames on the way into the corpus."""
 
-    stabilised: Stabilised  # frames without head motion, still in the motion's coordinates
-    neutral: Neutral
+    stabilised: StabilisedMotion  # frames without head motion, still in the motion's coordinates
+    neutral: NeutralFace
     place: Similarity  # from the neutral face's coordinates to the corpus's
     measured_scale: float  # scale of the best similarity between the neutral face and the corpus's mean face
     residual: float  # what that similarity leaves, as a share of the face's size
@@ -146,7 +146,7 @@ def _fit(
     template: Path | None,
     stable: str | None,
     scale: float | None,
-) -> Fitted:
+) -> FittedSpeaker:
     """Remove the head's motion, find the neutral face, and find the way into the corpus's coordinates."""
     own_template = None if template is None else read_template(template, target)
     chosen = None if stable is None else read_stable(stable, target.n_vertices)
@@ -163,7 +163,7 @@ def _fit(
         neutral = choose_neutral(read, stabilised, own_template, speech, frame_rate)
         best, residual = lay_onto_corpus(source, neutral.face, target)
     place = into_coordinates(neutral.face, best, scale)
-    return Fitted(stabilised, neutral, place, best.scale, residual, compared)
+    return FittedSpeaker(stabilised, neutral, place, best.scale, residual, compared)
 
 
 def _check_output(path: Path) -> None:
@@ -328,7 +328,7 @@ def _report(
     name: str,
     read: FaceSequence,
     target: TargetCorpus,
-    fitted: Fitted,
+    fitted: FittedSpeaker,
     clips: list[EntryClip],
     frame_rate: float,
     stable: str | None,

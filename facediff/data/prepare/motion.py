@@ -132,7 +132,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Parameters:
+class FlameParameters:
     """Mean shape (S,), expression (T, E) and rotation of the jaw (T, 3), axis-angle in radians, of a clip."""
 
     shape: Array
@@ -140,7 +140,7 @@ class Parameters:
     jaw: Array
 
 
-def read_parameters(path: Path) -> Parameters:
+def read_parameters(path: Path) -> FlameParameters:
     """Read a clip's parameters: ``shape_pose_cam.hdf5`` of EMOTE (flat or by hickle), or ProbTalk3D's ``.npy``.
 
     The shape is the mean over all frames with equal weights, since these files do not say how well the face was seen
@@ -160,7 +160,7 @@ def read_parameters(path: Path) -> Parameters:
     if len(parts["jaw"]) != frames or len(parts["shape"]) not in (1, frames):
         counts = ", ".join(f"{len(values)} of {name}" for name, values in parts.items())
         raise FaceDiffError(f"{path}: its frames do not agree ({counts}); get it again")
-    return Parameters(parts["shape"].mean(axis=0), parts["exp"], parts["jaw"])
+    return FlameParameters(parts["shape"].mean(axis=0), parts["exp"], parts["jaw"])
 
 
 def _read_array(path: Path) -> dict[str, Array]:

@@ -161,6 +161,8 @@ def prepare(
         _refuse_strays(plan, out)
         pending = [job for job in plan.jobs if job.name not in finished]
         _check_space(plan, pending, out)
+        # A run may be killed at any time, so the state marks the folder as unfinished before the first clip appears,
+        # and is removed only once the manifest is written: readers refuse a folder with a state and without a manifest.
         write_json(out / STATE, plan.recipe)
         remove_partial(out, recursive=True)
         places = {"scheduler": scheduler, "writes": out, "reads": reads}
@@ -261,6 +263,7 @@ def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mappin
 
 def _is_complete(plan: PreparationPlan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
     """Whether the manifest records just this plan, carried out without a failure, and all its files are there."""
+    # A newer version of facediff accepts a complete folder of an older one; it only refuses to continue it.
     expected = {name: value for name, value in plan.recipe.items() if name not in ("facediff", "format")}
     expected |= {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
     return (
@@ -324,6 +327,7 @@ def _check_space(plan: PreparationPlan, pending: list[Job], out: Path) -> None:
     frame_counts = [job.frames for job in pending if job.frames is not None]
     if not frame_counts:
         return
+    # Some frame counts are known only once a clip is read; these clips are taken to be of mean length.
     frames = sum(frame_counts) / len(frame_counts) * len(pending)
     need = frames * (3 * plan.n_vertices * plan.dtype.itemsize + 2 * 16_000 / plan.frame_rate)
     free = shutil.disk_usage(out).free

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.check import CheckReport
-from facediff.data.check.layouts import MANIFEST, View, identify, list_folder, read_record
+from facediff.data.check.layouts import MANIFEST, CorpusView, identify, list_folder, read_record
 from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import Mesh
@@ -65,7 +65,7 @@ def draw_regions(
     return list(lines.values())
 
 
-def find_view(root: Path, corpus: str | None) -> View:
+def find_view(root: Path, corpus: str | None) -> CorpusView:
     """What a folder is, as ``facediff data check`` recognises it."""
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
