@@ -227,7 +227,7 @@ HARMLESS: list[tuple[str, Plant, set[str], str]] = [
     ("sound copied", lambda r: shutil.copy(sound(r), sound(r, "B_e07")), {"sound_copied"}, "wav/B_e07.wav"),
     ("wav without npy", lambda r: motion(r).unlink(), {"motion_missing"}, "speech without motion"),
     ("npy without wav", lambda r: sound(r).unlink(), {"sound_missing"}, "motion without speech"),
-    ("a stranger", add_stranger, {"unknown_subject"}, "no split of tiny knows (Z)"),
+    ("an unseen subject", add_stranger, {"unknown_subject"}, "in no split of tiny (Z)"),
     ("no mesh", lambda r: (r / "tiny.ply").unlink(), {"mesh_missing"}, "templates/tiny.ply"),
     ("leftover", lambda r: (r / "wav" / ".A_e01.partial-7.wav").write_text(""), {"leftover"}, "half-written"),
     ("failed clips", lambda r: write_manifest(r, failed={"A_e09": "no sound"}), {"prepare_failed"}, "A_e09: no sound"),

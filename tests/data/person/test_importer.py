@@ -301,7 +301,7 @@ def damaged(known: Person, kind: str) -> Array:
     elif kind == "short":
         frames = frames[:20]
     elif kind == "whole numbers":
-        return frames.astype(int)  # type: ignore[no-any-return]
+        return frames.astype(int)
     return frames
 
 
