@@ -26,12 +26,12 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     Raises:
         FaceDiffError: if the model has other identities.
     """
-    known = model.identities
-    count = len(identities) - len(known)
-    if count < 0 or identities[count:] != known:
+    trained = model.identities
+    count = len(identities) - len(trained)
+    if count < 0 or identities[count:] != trained:
         raise FaceDiffError(
-            f"the checkpoint knows {', '.join(known)}, which is not the end of {', '.join(identities)}: adapt it with "
-            f"the corpus and the identities that it was trained on"
+            f"the checkpoint was trained on {', '.join(trained)}, which is not the end of {', '.join(identities)}: "
+            f"adapt it with the corpus and the identities that it was trained on"
         )
     if not count:
         return model
@@ -45,7 +45,7 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
 
 
 def with_audio_encoder(model: AnimationModel, encoder: dict[str, Any]) -> AnimationModel:
-    """The same model with another audio encoder, which has learnt nothing yet.
+    """The same model with another, untrained audio encoder.
 
     Args:
         model: a trained model.

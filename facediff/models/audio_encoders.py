@@ -429,8 +429,8 @@ def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:
 def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """Encode clips of equal length together, without their padding; the padded results and their lengths."""
     if exporting():
-        made = encode(padded)  # graphs take clips of one length, see ``takes_padding``
-        return made, torch.full_like(lengths, 1) * made.shape[1]
+        encoded = encode(padded)  # graphs take clips of one length, see ``takes_padding``
+        return encoded, torch.full_like(lengths, 1) * encoded.shape[1]
     # HuBERT normalises over time, so padding would change its features.
     parts: dict[int, Tensor] = {}
     for length in sorted(set(lengths.tolist())):
@@ -605,8 +605,8 @@ RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
 def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - one of transformers' configurations
     """A configuration from plain data, of which only options that every such configuration has are taken."""
     # A configuration may name code on the hub (an attention kernel, a model class) in keys of its own.
-    known = kind().to_dict()
-    return kind.from_dict({key: value for key, value in config.items() if key in known})
+    options = kind().to_dict()
+    return kind.from_dict({key: value for key, value in config.items() if key in options})
 
 
 def check_source(source: str, option: str = SOURCE) -> None:

@@ -15,11 +15,11 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 from facediff.errors import ArgumentError
 from facediff.models.layers import (
     Attention,
+    AttentionContext,
     FeedForward,
     FrameMask,
     Frames,
     Heads,
-    KeysValues,
     Layers,
     Rotation,
     Share,
@@ -107,7 +107,7 @@ class StyleTransformer(Decoder):
     ) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(
-            Block(dim, style_dim, num_heads, feed_forward_factor * dim, dropout) for _ in range(num_layers)
+            DecoderBlock(dim, style_dim, num_heads, feed_forward_factor * dim, dropout) for _ in range(num_layers)
         )
         self.norm = nn.LayerNorm(dim) if final_norm else nn.Identity()
 
@@ -131,15 +131,15 @@ class StyleTransformer(Decoder):
 
     def prepare(self, style: Tokens, mask: FrameMask) -> DecoderConstants:
         """Each block's products of the style tokens, and the rotary positions that all blocks share."""
-        tokens = [block.style_attention.prepare(style) for block in cast(Sequence[Block], self.blocks)]
+        tokens = [block.style_attention.prepare(style) for block in cast(Sequence[DecoderBlock], self.blocks)]
         return DecoderConstants(tokens, needed_mask(mask), self._rotation(mask.shape[1]))
 
     def _rotation(self, frames: int) -> Rotation | None:
-        blocks = cast(Sequence[Block], self.blocks)
+        blocks = cast(Sequence[DecoderBlock], self.blocks)
         return blocks[0].time_attention.rotation(frames) if len(blocks) else None
 
 
-class Block(nn.Module):
+class DecoderBlock(nn.Module):
     """Rotary self-attention over time, cross-attention to the style tokens, feed-forward; pre-norm, residual."""
 
     def __init__(self, dim: int, style_dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
@@ -176,7 +176,7 @@ class TokenProducts(NamedTuple):
     values: Tensor
 
 
-PreparedTokens = TokenProducts | KeysValues
+PreparedTokens = TokenProducts | AttentionContext
 """What an attention to a few tokens makes of them."""
 
 
@@ -195,7 +195,7 @@ class TokenAttention(Attention):
             if context_mask is not None:
                 return super().forward(x, context, context_mask, rotation)
             context = self.prepare(context, rotation)
-        if isinstance(context, KeysValues):
+        if isinstance(context, AttentionContext):
             return self.attend(self.queries(x, rotation), context)
         # One product for all heads; the softmax is over each head's own tokens.
         scores = x @ context.keys + context.offset
@@ -209,9 +209,9 @@ class TokenAttention(Attention):
         # The scores (W_q x + b_q)·k and the mixture Σ_k a_k W_o v_k are the same numbers in another order. For fewer
         # than ``dim`` pairs of head and token, two narrow products replace two of ``dim`` by ``dim`` per frame.
         dim = self.query.in_features
-        key, value = found = self.keys_values(context, rotation)
+        key, value = pairs = self.keys_values(context, rotation)
         if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
-            return found
+            return pairs
         key = key / math.sqrt(key.shape[-1])
         # The maps by head, (heads, head_dim, dim); the bias of W_q becomes the offset, that of W_o is added last.
         into = self.query.weight.view(self.num_heads, -1, dim)

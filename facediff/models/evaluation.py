@@ -1,4 +1,4 @@
-"""What a test scores: the model, two faces that never move, and the model given another sentence's speech."""
+"""Scores of a test: the model, two faces that never move, and the model given another sentence's speech."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ released test scripts do. ``adapted``: their own, which the model must have been
 def conditioned(
     batch: Batch, policy: IdentityPolicy, identities: Sequence[str], references: Mapping[str, Reference | Style]
 ) -> list[tuple[str, Batch]]:
-    """The batches to score in place of one, each with the name of the identity that its unseen speakers get.
+    """Copies of a batch, one per identity that unseen speakers are conditioned on, with that identity's name.
 
     A clip of a training identity comes once. ``identities`` are in the order of the identity index.
 
     Raises:
         FaceDiffError: if the policy is ``adapted`` and a speaker is unseen, or an identity has no style reference.
     """
-    known = [clip for clip, index in enumerate(batch.identity.tolist()) if index >= 0]
-    unknown = [clip for clip in range(len(batch)) if clip not in known]
+    seen = [clip for clip, index in enumerate(batch.identity.tolist()) if index >= 0]
+    unknown = [clip for clip in range(len(batch)) if clip not in seen]
     if not unknown or policy == "style_only":
         return [("", batch)]
     if policy == "adapted":
@@ -60,13 +60,13 @@ def conditioned(
             f"unseen_identity=adapted: clip {batch.names[unknown[0]]} is of {batch.identity_names[unknown[0]]}, whom "
             f"the model was not trained on; adapt it with `facediff adapt`, or choose another policy"
         )
-    found = [("", batch.select(known))] if known else []
+    views = [("", batch.select(seen))] if seen else []
     unseen = batch.select(unknown)
     for index, name in enumerate(identities):
         if name not in references:
             raise FaceDiffError(f"unseen_identity=each_seen: the model holds no style reference of {name}")
-        found.append((name, with_identity(unseen, index, references[name])))
-    return found
+        views.append((name, with_identity(unseen, index, references[name])))
+    return views
 
 
 def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Batch:
@@ -90,8 +90,8 @@ def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Bat
 
 
 METHODS = ("model", "still", "mean_face", "shuffled")
-"""Who is scored: the model; a face that never moves from its template, or from the mean of its speaker's training
-clips; the model given another sentence's speech."""
+"""Methods that are scored: the model; a face that never moves from its template, or from the mean of its speaker's
+training clips; the model given another sentence's speech."""
 
 ENERGY_REGIONS = ("lips", "upper_face")
 """Regions by whose energy scores the best checkpoint is chosen."""
@@ -183,7 +183,9 @@ class Evaluation:
         self._speakers = sorted(assets.templates)
         methods = METHODS if self.splits != ["val"] else METHODS[:1]
         self.metrics = {
-            split: {each: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for each in methods}
+            split: {
+                method: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for method in methods
+            }
             for split in self.splits
         }
         context = self._context(model, regions, device, data) if self.requests else Context()
@@ -278,8 +280,8 @@ class Evaluation:
     def _styles(model: Inference) -> dict[int, Reference | Style]:
         """Styles of the training identities that have a stored reference, by index."""
         assets = model.assets
-        known = [(place, name) for place, name in enumerate(assets.identities) if name in assets.references]
-        return {place: model.default_style(name) for place, name in known}
+        referenced = [(place, name) for place, name in enumerate(assets.identities) if name in assets.references]
+        return {place: model.default_style(name) for place, name in referenced}
 
     def score(self, model: Inference, split: str, batch: Batch, identity: str = "") -> None:
         """Generate a batch's motion, and whatever else metrics need of the model, and add its scores.
@@ -302,7 +304,7 @@ class Evaluation:
             if self.energies:
                 self._add_energies(inputs["samples"][:, : len(self._validation_seeds)], batch)
             if "conditions" in self.needs:
-                views = [with_identity(batch, place, each) for place, each in self._styles(model).items()]
+                views = [with_identity(batch, place, style) for place, style in self._styles(model).items()]
                 inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
             if "style" in self.needs:
                 inputs["embeddings"] = model.encode_style(motion, batch.mask)
@@ -348,11 +350,11 @@ class Evaluation:
         scores: dict[str, Metric] = {**metrics.scores()}
         inputs = self._inputs(motion, batch) | dict(inputs or {}) if self.requests else {}
         for name, metric in self.chosen[split][method].items():
-            given = inputs
+            own_inputs = inputs
             if "samples" in inputs and hasattr(metric, "n_samples"):
-                given = inputs | {"samples": inputs["samples"][:, : metric.n_samples]}
+                own_inputs = inputs | {"samples": inputs["samples"][:, : metric.n_samples]}
             try:
-                feed(metric.to(motion.device), given)
+                feed(metric.to(motion.device), own_inputs)
             except ValueError as error:
                 raise FaceDiffError(f"metric {name}: {error}") from error
             scores[name] = metric
@@ -364,7 +366,7 @@ class Evaluation:
             if isinstance(metric, SequenceMetric) and metric.latest is not None
         }
         for place, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
-            own = {name: each[place] for name, each in values.items()}
+            own = {name: scores_of_clips[place] for name, scores_of_clips in values.items()}
             facts = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
             self._sequences.append({**facts, **self._attributes(clip), **own})
 
@@ -380,10 +382,14 @@ class Evaluation:
         """Refuse to group scores by what no clip of the splits has."""
         if self.score_by and self._data is not None:
             clips = [clip for split in self.splits for clip in self._data.clips(split)]
-            known = sorted({name for clip in clips for name in clip.attributes})
+            attributes = sorted({name for clip in clips for name in clip.attributes})
             for name in self.score_by:
-                if name not in known:
-                    offered = choices(name, known) if known else "its clips have no attributes; list them in clips.csv"
+                if name not in attributes:
+                    offered = (
+                        choices(name, attributes)
+                        if attributes
+                        else "its clips have no attributes; list them in clips.csv"
+                    )
                     raise ArgumentError({"model.score_by": name}, f"no clip has it: {offered}", located=True)
 
     def groups(self, split: str) -> list[dict[str, Any]]:
@@ -400,12 +406,12 @@ class Evaluation:
             for name, metric in scores.items()
             if isinstance(metric, SequenceMetric) and type(metric).clip_weight is SequenceMetric.clip_weight
         }
-        found: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+        groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
         for row in rows:
-            found.setdefault((row["method"], *(row[name] or "" for name in self.score_by)), []).append(row)
+            groups.setdefault((row["method"], *(row[name] or "" for name in self.score_by)), []).append(row)
         table = []
-        for key in sorted(found, key=lambda key: (METHODS.index(key[0]), key[1:])):
-            members, line = found[key], dict(zip(("method", *self.score_by), key, strict=True))
+        for key in sorted(groups, key=lambda key: (METHODS.index(key[0]), key[1:])):
+            members, line = groups[key], dict(zip(("method", *self.score_by), key, strict=True))
             means: dict[str, float | None] = {}
             for name, pooling in pooled.items():
                 valued = [row for row in members if row.get(name) is not None]
@@ -453,19 +459,19 @@ class Evaluation:
         For validation ``val/energy`` too, by which the best checkpoint is chosen: the energy score of lips and upper
         face, each over that of a still face. No mean face can win it.
         """
-        found: dict[str, float] = {}
+        scalars: dict[str, float] = {}
         for row in self.rows(split):
             prefix = split if row["method"] == "model" else f"{split}/{row['method']}"
             names = [*map(str, self.metrics[split]["model"]), *self.chosen[split]["model"]]
-            found |= {f"{prefix}/{name}": row[name] for name in names if row[name] is not None}
+            scalars |= {f"{prefix}/{name}": row[name] for name in names if row[name] is not None}
         if (energy := self._energy()) is not None:
-            found[f"{split}/energy"] = energy
+            scalars[f"{split}/energy"] = energy
         for metrics in self.metrics[split].values():
             metrics.reset()
         for chosen in self.chosen[split].values():
             for metric in chosen.values():
                 metric.reset()
-        return found
+        return scalars
 
     def rows(self, split: str) -> list[dict[str, Any]]:
         """One row per method: scores, and what they were taken over; collective under several processes.

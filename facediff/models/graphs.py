@@ -284,8 +284,8 @@ def style_graphs(model: GraphedModel, width: int) -> list[Graph]:
     batch, frames = 2, 50
     motion = torch.randn(batch, frames, model.n_vertices, 3, generator=torch.Generator().manual_seed(0))
     inputs = {"motion": motion, "mask": torch.ones(batch, frames, dtype=torch.bool)}
-    made = Graph("style", StyleGraph(model), inputs, dict.fromkeys(inputs, FRAMES), ("style",))
-    return [made] if width else []
+    graph = Graph("style", StyleGraph(model), inputs, dict.fromkeys(inputs, FRAMES), ("style",))
+    return [graph] if width else []
 
 
 def results_of(graph: Graph) -> Any:  # noqa: ANN401 - a tensor, or a tuple of them

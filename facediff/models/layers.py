@@ -40,7 +40,7 @@ Rotation = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
 
 
-class KeysValues(NamedTuple):
+class AttentionContext(NamedTuple):
     """What an attention makes of its context, both (batch, heads, keys, head_dim)."""
 
     key: Tensor
@@ -155,14 +155,14 @@ def recurrent_nodes(
     for layer in range(network.num_layers):
         bias = torch.cat([stacked(f"bias_ih_l{layer}"), stacked(f"bias_hh_l{layer}")], 1)
         weights = stacked(f"weight_ih_l{layer}"), stacked(f"weight_hh_l{layer}"), bias
-        made = torch.onnx.ops.symbolic(
+        outputs = torch.onnx.ops.symbolic(
             "LSTM" if lstm else "GRU",
             (x, *weights),
             attributes,  # type: ignore[arg-type]
             dtype=x.dtype,
             shape=(x.shape[0], len(ends), x.shape[1], network.hidden_size),
         )
-        x = made.transpose(1, 2).flatten(2)  # directions side by side
+        x = outputs.transpose(1, 2).flatten(2)  # directions side by side
     return x.transpose(0, 1)
 
 
@@ -268,15 +268,15 @@ class Attention(nn.Module):
 
     def keys_values(
         self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
-    ) -> KeysValues:
+    ) -> AttentionContext:
         """All that ``context`` is needed for."""
         key, value = (self._split(part) for part in self.key_value(context).chunk(2, dim=-1))
-        return KeysValues(key if self.rotary is None else self.rotary(key, rotation), value)
+        return AttentionContext(key if self.rotary is None else self.rotary(key, rotation), value)
 
     def attend(
         self,
         query: Float[Tensor, "batch heads frames head_dim"],
-        context: KeysValues,
+        context: AttentionContext,
         context_mask: Bool[Tensor, "batch keys"] | None = None,
     ) -> Frames:
         """The attention itself, and the map of its result."""

@@ -152,11 +152,11 @@ def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
     logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
     chances = logits.log_softmax(1)
     counts = same.sum(1)
-    # Nobody has two styles, or all styles are of one identity: there is nothing to choose between.
+    # No identity has two styles, or all styles are of one identity: there is nothing to contrast.
     if not counts.any() or bool(same.logical_or(own).all()):
         return styles.new_zeros(())
-    each = -chances.where(same, 0.0).sum(1) / counts.clamp_min(1)
-    return each[counts > 0].mean()
+    clip_losses = -chances.where(same, 0.0).sum(1) / counts.clamp_min(1)
+    return clip_losses[counts > 0].mean()
 
 
 def style_identity_loss(logits: Float[Tensor, "clips identities"], identity: Int[Tensor, " clips"]) -> Scalar:

@@ -56,13 +56,13 @@ def fused_losses(
     Returns:
         the four terms by name, without gradient, and their weighted sum ``loss``.
     """
-    wanted = torch.is_grad_enabled() and any(
+    differentiated = torch.is_grad_enabled() and any(
         part is not None and part.requires_grad for part in (features, weight, bias)
     )
     autocast = torch.is_autocast_enabled(features.device.type) and torch.get_autocast_dtype(features.device.type)
     low = torch.bfloat16 if autocast == torch.bfloat16 else weight.dtype
     factors = [weights[name] for name in TERMS]
-    blocks = _Blocks(features, weight, truth, mask, region, factors, scale, wanted)
+    blocks = _Blocks(features, weight, truth, mask, region, factors, scale, differentiated)
     with torch.autocast(features.device.type, enabled=False):
         total, terms = _FusedLosses.apply(features.to(weight.dtype), weight, bias, blocks, low)  # type: ignore[no-untyped-call]
     return {**dict(zip(TERMS, terms.unbind(), strict=True)), "loss": total}
@@ -82,7 +82,7 @@ class _FusedLosses(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         frames = features.flatten(0, 1)
         frames_low, terms = frames.to(low), features.new_zeros(4, dtype=_sum_dtype(features.device))
-        needed = ctx.needs_input_grad if blocks.wanted else (False, False, False)
+        needed = ctx.needs_input_grad if blocks.differentiated else (False, False, False)
         of_frames = torch.zeros_like(frames) if needed[0] else None
         of_weight = torch.empty_like(weight) if needed[1] else None
         of_bias = torch.empty_like(bias) if bias is not None and needed[2] else None
@@ -134,7 +134,7 @@ class _Blocks:
         region: upper-face vertices.
         factors: weights of the terms.
         scale: factor on the truth.
-        wanted: whether gradients are wanted.
+        differentiated: whether gradients are differentiated.
 
     Attributes:
         rows: the coordinates of each block.
@@ -149,9 +149,9 @@ class _Blocks:
         region: Tensor,
         factors: list[float],
         scale: float,
-        wanted: bool,
+        differentiated: bool,
     ) -> None:
-        self.truth, self.factors, self.scale, self.wanted = truth.flatten(2), factors, scale, wanted
+        self.truth, self.factors, self.scale, self.differentiated = truth.flatten(2), factors, scale, differentiated
         self.valid = mask[..., None].to(weight.dtype)
         self.count = self.valid.sum(1, keepdim=True).clamp_min(1)
         # What each difference of order 0, 1 and 2 counts in its mean over valid frames and coordinates.
@@ -183,11 +183,11 @@ class _Blocks:
         gap = prediction.sub_(truth, alpha=self.scale)
         change = gap[:, 1:] - gap[:, :-1]
         bend = change[:, 1:] - change[:, :-1]
-        found = [_huber_and_slope(x, share) for x, share in zip((gap, change, bend), self.shares, strict=True)]
-        values = torch.stack([*(value for value, _ in found), face]).to(_sum_dtype(prediction.device))
-        if not self.wanted:
+        pairs = [_huber_and_slope(x, share) for x, share in zip((gap, change, bend), self.shares, strict=True)]
+        values = torch.stack([*(value for value, _ in pairs), face]).to(_sum_dtype(prediction.device))
+        if not self.differentiated:
             return values, None
-        slope, of_change, of_bend = (one for _, one in found)
+        slope, of_change, of_bend = (slope for _, slope in pairs)
         slope *= self.factors[0]
         of_change *= self.factors[1]
         # A difference x_{t+1} − x_t passes its gradient to both frames, with opposite signs.
@@ -201,11 +201,11 @@ class _Blocks:
 
     def _face(self, prediction: Tensor, truth: Tensor, upper: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
         """L_face of a block's upper-face vertices, and its gradient there (B, T, R, 3)."""
-        moved, wanted = (motion.view(*motion.shape[:2], -1, 3)[:, :, upper] for motion in (prediction, truth))
+        moved, true = (motion.view(*motion.shape[:2], -1, 3)[:, :, upper] for motion in (prediction, truth))
         length = torch.linalg.vector_norm(moved, dim=-1)
         off, spread = self._spread(length)
-        _, wanted_spread = self._spread(torch.linalg.vector_norm(wanted, dim=-1))
-        gap = spread - self.scale * wanted_spread
+        _, true_spread = self._spread(torch.linalg.vector_norm(true, dim=-1))
+        gap = spread - self.scale * true_spread
         # dσ/d|x| = (|x| − mean) / (frames σ) and d|x|/dx = x / |x|; both are 0 where they are not defined.
         pull = off * (gap.sign() * shares / (self.count * spread).where(spread > 0, torch.inf))
         pull = pull / length.where(length > 0, torch.inf)

@@ -116,29 +116,30 @@ def card(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) ->
 
 def metadata(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) -> dict[str, Any]:
     """The metadata of the card, by the hub's names; ``commercial_use`` and ``corpus`` are ours."""
-    weights = next((each for each in licences if each.of == "weights"), Licence("weights"))
+    weights = next((label for label in licences if label.of == "weights"), Licence("weights"))
     identifier = weights.name.lower()
-    known = identifier in KNOWN
     parent = model.provenance.get("parent", "")
-    found: dict[str, Any] = {"license": identifier if known else "unknown" if identifier == "unknown" else "other"}
-    if found["license"] == "other":
-        found["license_name"] = re.sub(r"[^a-z0-9.]+", "-", identifier).strip("-")[:LONGEST_NAME]
-    found["library_name"] = "facediff"
+    fields: dict[str, Any] = {
+        "license": identifier if identifier in KNOWN else "unknown" if identifier == "unknown" else "other"
+    }
+    if fields["license"] == "other":
+        fields["license_name"] = re.sub(r"[^a-z0-9.]+", "-", identifier).strip("-")[:LONGEST_NAME]
+    fields["library_name"] = "facediff"
     if languages := languages_of(model, facts):
-        found["language"] = list(languages)
-    found["tags"] = [
+        fields["language"] = list(languages)
+    fields["tags"] = [
         *("speech-driven-3d-facial-animation", "3d-face", "talking-head", "audio-to-motion"),
         type(model).__name__.lower(),
         f"corpus-{model.assets.corpus}",
         *(["synthetic-data"] if model.assets.synthetic else []),
     ]
     if re.fullmatch(r"[\w.-]+/[\w.-]+(@.*)?", parent):
-        found["base_model"] = parent.partition("@")[0]
-    found["corpus"] = {"name": model.assets.corpus, "synthetic": model.assets.synthetic}
-    found["commercial_use"] = commercial_use(licences)
+        fields["base_model"] = parent.partition("@")[0]
+    fields["corpus"] = {"name": model.assets.corpus, "synthetic": model.assets.synthetic}
+    fields["commercial_use"] = commercial_use(licences)
     if results := model_index(model, facts):
-        found["model-index"] = [{"name": facts.name, "results": results}]
-    return found
+        fields["model-index"] = [{"name": facts.name, "results": results}]
+    return fields
 
 
 def model_index(model: CheckpointContent, facts: Facts) -> list[dict[str, Any]]:
@@ -229,7 +230,9 @@ numbers and plain text only; nothing in it is run."""
 
 def licence_section(licences: Sequence[Licence]) -> str:
     """The labels, and what the strictest of them says."""
-    rows = [(text(each.of), text(each.name), each.commercial, text(each.source) or "not stated") for each in licences]
+    rows = [
+        (text(label.of), text(label.name), label.commercial, text(label.source) or "not stated") for label in licences
+    ]
     verdict = {
         "allowed": "Commercial use is **allowed** by every licence that this model inherits.",
         "forbidden": "Commercial use is **forbidden** by at least one licence that this model inherits.",
@@ -256,14 +259,14 @@ def data_section(model: CheckpointContent, facts: Facts) -> str:
 
 def training_section(model: CheckpointContent) -> str:
     """How it was trained."""
-    known = model.provenance
+    provenance = model.provenance
     options = dict(model.hparams)
     data = model.data_options
     rows = [
-        ("adapted from", text(known.get("parent") or "nothing; trained from its first step")),
-        ("epochs", known.get("epochs", "not known")),
-        ("optimiser steps", known.get("steps", "not known")),
-        ("seed", known.get("seed", "not known")),
+        ("adapted from", text(provenance.get("parent") or "nothing; trained from its first step")),
+        ("epochs", provenance.get("epochs", "not known")),
+        ("optimiser steps", provenance.get("steps", "not known")),
+        ("seed", provenance.get("seed", "not known")),
         ("learning rate", f"{options.get('learning_rate', 'not known')}, {options.get('lr_schedule', '')}"),
         ("weight decay", str(options.get("weight_decay", "not known"))),
         ("clips a batch", str(data.get("batch_size", "not known"))),
@@ -346,8 +349,10 @@ def languages_of(model: CheckpointContent, facts: Facts) -> Sequence[str]:
     """The languages that were stated, else those of the corpus."""
     if facts.languages is not None:
         return facts.languages
-    known: list[type[Any]] = [entry.implementation for entry in corpus]
-    return next((each.languages for each in known if getattr(each, "corpus_name", None) == model.assets.corpus), ())
+    corpora: list[type[Any]] = [entry.implementation for entry in corpus]
+    return next(
+        (module.languages for module in corpora if getattr(module, "corpus_name", None) == model.assets.corpus), ()
+    )
 
 
 def text(value: str) -> str:

@@ -81,11 +81,11 @@ def publish(
     before = model.licences
     model.licences = published_licences(before, licence)
     try:
-        with atomic_folder(folder) as made:
-            write_model(model, made, half=half)
-            sizes = {path.name: path.stat().st_size for path in made.iterdir()}
+        with atomic_folder(folder) as partial:
+            write_model(model, partial, half=half)
+            sizes = {path.name: path.stat().st_size for path in partial.iterdir()}
             facts = Facts(name or folder.resolve().name, rows, languages, half, sizes)
-            (made / CARD).write_text(card(model, model.licences, facts), encoding="utf-8")
+            (partial / CARD).write_text(card(model, model.licences, facts), encoding="utf-8")
     finally:
         model.licences = before
     return folder
@@ -98,11 +98,11 @@ def published_licences(inherited: Iterable[Licence], name: str | None) -> tuple[
         inherited: the model's labels.
         name: the licence that its author chose for the weights; that of the data if None.
     """
-    found = list(inherited)
-    kept = [each for each in found if each.of != "weights"]
-    # Whoever publishes somebody's published weights inherits their terms, as those of the parent.
-    parents = [replace(each, of="parent's weights") for each in found if each.of == "weights"] if name else []
-    return merged([weights_licence(found, name)], parents, kept)
+    labels = list(inherited)
+    others = [label for label in labels if label.of != "weights"]
+    # Weights that derive from published weights inherit their terms, as those of the parent.
+    parents = [replace(label, of="parent's weights") for label in labels if label.of == "weights"] if name else []
+    return merged([weights_licence(labels, name)], parents, others)
 
 
 def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:
@@ -110,12 +110,12 @@ def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:
 
     Where several of the data's are equally strict, the first is named.
     """
-    found = list(inherited)
+    labels = list(inherited)
     if name is not None:
         return Licence("weights", name, known_licence(name), "chosen when the model was published")
-    strictest = commercial_use(found)
-    origin = next((each for each in found if each.commercial == strictest), Licence("weights"))
-    return Licence("weights", origin.name, strictest, f"as {origin.of}" if found else "")
+    strictest = commercial_use(labels)
+    origin = next((label for label in labels if label.commercial == strictest), Licence("weights"))
+    return Licence("weights", origin.name, strictest, f"as {origin.of}" if labels else "")
 
 
 def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -> dict[str, Any]:
@@ -251,9 +251,9 @@ def as_plain(value: Any, tensors: dict[str, Tensor], name: str) -> Any:  # noqa:
         tensors[key] = value.detach().cpu()
         return {MARK: key, "type": str(value.dtype).removeprefix("torch."), "shape": list(value.shape)}
     if isinstance(value, Mapping):
-        if not all(isinstance(each, str) for each in value) or MARK in value:
+        if not all(isinstance(key, str) for key in value) or MARK in value:
             raise FaceDiffError(f"the model keeps {quoted(value)} in {name}; expected values by name")
-        return {each: as_plain(part, tensors, f"{name}.{each}".lstrip(".")) for each, part in value.items()}
+        return {key: as_plain(part, tensors, f"{name}.{key}".lstrip(".")) for key, part in value.items()}
     if isinstance(value, list | tuple):
         return [as_plain(part, tensors, f"{name}.{place}") for place, part in enumerate(value)]
     if value is not None and not isinstance(value, bool | int | float | str):
@@ -286,8 +286,8 @@ def with_tensors(value: Any, arrays: Mapping[str, np.ndarray[Any, Any]], path: P
     if array.dtype == np.uint8 and array.ndim == 3 and kind != "uint8":
         array = decoded(array)
     numbers = torch.from_numpy(np.frombuffer(bytearray(np.ascontiguousarray(array).tobytes()), np.uint8))
-    made = numbers.view(getattr(torch, kind)) if kind != "bool" else numbers != 0
-    return made.reshape(shape)
+    typed = numbers.view(getattr(torch, kind)) if kind != "bool" else numbers != 0
+    return typed.reshape(shape)
 
 
 def is_motion(value: Tensor) -> bool:

@@ -186,7 +186,7 @@ def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: flo
             f"there are {process.steps - cleanest} steps with at least that much noise; "
             f"choose less noise or fewer sampling steps",
         )
-    found: list[int] = []
+    chosen: list[int] = []
     for i in range(steps):
         share = i / max(1, steps - 1)
         if spacing == "steps":
@@ -194,9 +194,9 @@ def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: flo
         else:
             nearest = int((snr - (snr[-1] + share * (snr[cleanest] - snr[-1]))).abs().argmin())
         # Each step once, and room for those that follow.
-        nearest = min(nearest, found[-1] - 1) if found else process.steps - 1
-        found.append(max(nearest, cleanest + steps - 1 - i))
-    return found
+        nearest = min(nearest, chosen[-1] - 1) if chosen else process.steps - 1
+        chosen.append(max(nearest, cleanest + steps - 1 - i))
+    return chosen
 
 
 PART = 2**21

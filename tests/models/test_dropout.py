@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from facediff.models.audio_encoders import ConvBlock, MelEncoder
-from facediff.models.decoders import Block, GruDecoder, StyleTransformer
+from facediff.models.decoders import DecoderBlock, GruDecoder, StyleTransformer
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.layers import Attention, FeedForward
 from facediff.models.speaker_encoders import EncoderLayer, TcnGruTransformer, TemporalBlock
@@ -23,7 +23,7 @@ def x() -> Tensor:
 
 
 def test_dropout_of_a_decoder_block_silences_its_three_branches(x: Tensor) -> None:
-    block = Block(DIM, 6, 2, 16, 1.0)
+    block = DecoderBlock(DIM, 6, 2, 16, 1.0)
     style = torch.randn(2, 3, 6)
     assert torch.equal(block(x, style, MASK, None), x)
     assert not torch.allclose(block.eval()(x, style, MASK, None), x)
@@ -34,7 +34,7 @@ def test_dropout_of_a_decoder_block_silences_its_three_branches(x: Tensor) -> No
 @pytest.mark.parametrize("branch", ["time_attention", "style_attention", "feed_forward"])
 def test_dropout_of_a_decoder_block_scales_what_it_keeps(x: Tensor, branch: str) -> None:
     """What is not dropped is doubled at one half, so that the mean stays; each branch by itself."""
-    block = Block(DIM, 6, 2, 16, 0.5)
+    block = DecoderBlock(DIM, 6, 2, 16, 0.5)
     block.time_attention.dropout, block.feed_forward[2].p = 0.0, 0.0
     for name, last in (("time_attention", "out"), ("style_attention", "out"), ("feed_forward", "3")):
         layer = block.get_submodule(f"{name}.{last}")

@@ -25,7 +25,7 @@ from facediff.models.style_content.losses import (
     pair_up,
     relative_distance,
 )
-from facediff.models.style_content.network import MotionDecoder, WindowedTransformer
+from facediff.models.style_content.network import StyleContentDecoder, WindowedTransformer
 from tests.fakes.style_content import make
 from tests.fakes.tiny import VERTICES, Tiny
 
@@ -37,9 +37,9 @@ def masks(*lengths: int) -> Tensor:
 
 
 class TestDecoder:
-    def make(self) -> MotionDecoder:
+    def make(self) -> StyleContentDecoder:
         torch.manual_seed(0)
-        return MotionDecoder(
+        return StyleContentDecoder(
             n_vertices=7, content_dim=5, style_dim=3, channels=(6, 8, 8), kernels=(5, 3, 3), hidden=(9, 9), basis_size=4
         )
 

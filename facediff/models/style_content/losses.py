@@ -160,9 +160,9 @@ def dynamics_distance(
     if not chosen.any():
         return motion.new_zeros(())
     # FDD's own quantity is the spread of the squared displacement, so the loss compares the same one.
-    squared = [each[chosen][:, :, vertices].square().sum(-1) for each in (motion, truths)]
-    spread, wanted = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
-    return (spread - wanted).square().mean() / (wanted.mean().square() + EPSILON)
+    squared = [clips[chosen][:, :, vertices].square().sum(-1) for clips in (motion, truths)]
+    spread, true_spread = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
+    return (spread - true_spread).square().mean() / (true_spread.mean().square() + EPSILON)
 
 
 @dataclass(frozen=True)
@@ -219,9 +219,9 @@ def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
     for clip, other in enumerate(partner.tolist()):
         same = clip != other and batch.sentences[clip] == batch.sentences[other]
         if alignments is not None and same and batch.names[clip] != batch.names[other]:
-            found = alignments.frames(batch, clip, other)
-            places[clip, : len(found)] = found
-            aligned[clip, : len(found)] = True
+            matches = alignments.frames(batch, clip, other)
+            places[clip, : len(matches)] = matches
+            aligned[clip, : len(matches)] = True
     device = batch.motion.device
     return Pairing(partner.to(device), places.to(device), aligned.to(device))
 

@@ -37,7 +37,7 @@ from facediff.models.style_content.losses import (
     squared_distance,
     style_distance,
 )
-from facediff.models.style_content.network import DisentanglementNetwork, MotionDecoder, WindowedTransformer
+from facediff.models.style_content.network import DisentanglementNetwork, StyleContentDecoder, WindowedTransformer
 from facediff.utils.ranges import Range
 
 SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
@@ -188,7 +188,7 @@ class StyleContentDisentanglement(AnimationModel):
                 num_heads=speech_heads,
                 num_layers=speech_layers,
             ),
-            decoder=MotionDecoder(
+            decoder=StyleContentDecoder(
                 n_vertices=self.n_vertices,
                 content_dim=content_dim,
                 style_dim=sum(style.token_dims),
@@ -265,8 +265,8 @@ class StyleContentDisentanglement(AnimationModel):
             ("", content, style),
             ("speech_", spoken, style if self.speech_style == "own" else usual),
         ):
-            made = self.branch_losses(batch, motion, pairing, said, own, style)
-            terms |= {f"{prefix}{name}": term for name, term in made.items()}
+            branch = self.branch_losses(batch, motion, pairing, said, own, style)
+            terms |= {f"{prefix}{name}": term for name, term in branch.items()}
         terms["loss"] = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
         return terms
 
@@ -288,7 +288,7 @@ class StyleContentDisentanglement(AnimationModel):
         # D(C_i, S_i) ≈ M_i
         terms = {"reconstruction": self.distance_to(batch, self.decode_scaled(content, own, mask), motion, counted)}
         apart = partner != torch.arange(len(partner), device=partner.device)
-        if not apart.any():  # nobody to swap with: it saves two thirds of the work while one speaker alone is learnt
+        if not apart.any():  # no partners: saves two thirds of the work while one speaker alone is trained
             return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
         # D(C_i, S_j) is the partner's motion where both say the same sentence, in the timing of i. Where they do not,
         # no true motion exists, and content and style that are encoded again must be those that went in.
@@ -298,9 +298,9 @@ class StyleContentDisentanglement(AnimationModel):
         terms["swap"] = self.distance_to(batch, swapped, pairing.of_partner(motion), pairing.aligned, lower)
         free = pairing.unaligned
         terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), counted & free[:, None])
-        wanted = style[partner].detach()
-        terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], wanted[:, None], free[:, None])
-        # Nobody blinks at the same time as another, so the upper face has the partner's spread over time, not motion.
+        target = style[partner].detach()
+        terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], target[:, None], free[:, None])
+        # Two people do not blink at the same time, so the upper face has the partner's spread over time, not motion.
         upper = self.assets.regions["upper_face"].to(motion.device)
         terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], counted, counted[partner], apart, upper)
         # Swapped back, D(E_C(D(C_i, S_j)), E_S(D(C_j, S_i))) ≈ M_i

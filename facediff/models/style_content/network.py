@@ -48,7 +48,7 @@ class DisentanglementNetwork(nn.Module):
         style_encoder: StyleEncoder,
         audio_encoder: AudioEncoder,
         speech_content: WindowedTransformer,
-        decoder: MotionDecoder,
+        decoder: StyleContentDecoder,
         standardise_content: bool,
         speech_rate: float | None = None,
         frame_rate: float = 25.0,
@@ -104,8 +104,8 @@ class DisentanglementNetwork(nn.Module):
         # The encoder gives features at any rate, as if motion had so many frames.
         steps = (lengths * self.ratio).round().long().clamp_min(1) if self.ratio != 1 else lengths
         features = self.audio_encoder(heard.audio, heard.audio_lengths, steps, *cached)
-        made: Tensor = self.speech_content(features, frames, self.ratio, steps)
-        return made
+        content: Tensor = self.speech_content(features, frames, self.ratio, steps)
+        return content
 
     @property
     def ratio(self) -> float:
@@ -113,7 +113,7 @@ class DisentanglementNetwork(nn.Module):
         return self.speech_rate / self.frame_rate
 
 
-class MotionDecoder(nn.Module):
+class StyleContentDecoder(nn.Module):
     """Causal convolutions over time, each fed with the style next to the features, then fully connected layers.
 
     The sequence is padded with zeros at its front, so that its length is kept and no future frame is seen. The last of
