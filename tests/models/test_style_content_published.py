@@ -18,7 +18,7 @@ from facediff.data import Vocaset
 from facediff.models import StyleContentDisentanglement
 from facediff.models.mesh_encoders import SpiralMeshEncoder
 from facediff.models.speaker_encoders import LstmStyle
-from facediff.models.style_content.network import SLOPE, MotionDecoder, WindowedTransformer
+from facediff.models.style_content.network import SLOPE, StyleContentDecoder, WindowedTransformer
 from facediff.registry import defaults
 
 MODEL, DATA = "model.init_args", "data.init_args"
@@ -146,7 +146,7 @@ DEFAULTS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     (LstmStyle, {"style_dim": 32, "num_layers": 1, "pooling": "last"}),
     (WindowedTransformer, {"dim": 64, "num_heads": 4, "num_layers": 3}),
     (
-        MotionDecoder,
+        StyleContentDecoder,
         {"channels": (64, 128, 256), "kernels": (5, 3, 3), "hidden": (256, 256, 128), "basis_size": 50},
     ),
 ]
