@@ -216,6 +216,8 @@ class MelEncoder(AudioEncoder):
         spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
         # Padding is zeroed again after every layer: a convolution next to it would let its values into the clip.
         x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
+        # The strided stem halves the steps; a single spectrum still gives one step, so that the shortest clip has a
+        # feature.
         lengths = (lengths // 2).clamp_min(1)
         mask = frame_mask(lengths, x.shape[1])[..., None].to(x.dtype)
         x = nn.functional.gelu(x) * mask
@@ -237,6 +239,7 @@ class MelEncoder(AudioEncoder):
             else:
                 frames = padded.unfold(1, self.n_fft, self.hop) * window
                 power = torch.fft.rfft(frames).abs().square()
+            # The logarithm follows loudness as it is perceived; the floor keeps digital silence from becoming −∞.
             spectrum = torch.log(power @ self.filters.T + 1e-5)
         steps = (lengths // self.hop).clamp(min=2)
         mask = frame_mask(steps, spectrum.shape[1])[..., None]
@@ -270,12 +273,14 @@ class ConvBlock(nn.Module):
     def __init__(self, dim: int, dilation: int, dropout: float) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(dim)
+        # Dilations 1, 2, 4 see about half a second of context in three blocks, as long as coarticulation reaches.
         self.conv = nn.Conv1d(dim, dim, kernel_size=5, dilation=dilation, padding=2 * dilation)
         self.mix = nn.Linear(dim, dim)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """``x`` (batch, steps, dim) and ``mask`` (batch, steps, 1), which keeps padding at zero."""
+        # The norm's bias makes padding non-zero, and the convolution would carry it into the clip: masked before it.
         hidden = self.norm(x) * mask
         hidden = nn.functional.gelu(self.conv(hidden.transpose(1, 2)).transpose(1, 2))
         return (x + self.dropout(self.mix(hidden))) * mask
@@ -339,6 +344,8 @@ class HubertEncoder(AudioEncoder):
 
     def _freeze(self, count: int) -> list[str]:
         """Freeze what lies below layer ``count``; the names of the frozen modules."""
+        # Always frozen: the convolutions have learnt acoustics from hundreds of hours, and a corpus of an hour would
+        # overfit them.
         names = ["feature_extractor", "feature_projection"]
         if count:
             names += ["encoder.pos_conv_embed", "encoder.dropout", *(f"encoder.layers.{i}" for i in range(count))]
@@ -409,6 +416,8 @@ class HubertEncoder(AudioEncoder):
         feature_lengths: Lengths | None = None,
     ) -> Frames:
         """Encode; see :class:`AudioEncoder`."""
+        # SpecAugment masks the input of the first layer at random, so that nothing below the trained layers can be
+        # cached.
         if self.hubert.config.apply_spec_augment:
             hidden, steps = by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
         else:

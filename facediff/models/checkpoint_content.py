@@ -133,6 +133,7 @@ class CheckpointContent(LightningModule, Inference):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the assets, so that the checkpoint animates without the corpus."""
+        # Plain data and tensors only: a checkpoint is read with weights_only=True, where a class would be refused.
         checkpoint[FORMAT_KEY] = FORMAT
         checkpoint[ASSETS_KEY] = self.assets.state()
         checkpoint[DATA_SOURCE_KEY] = self.data_source
@@ -148,6 +149,7 @@ class CheckpointContent(LightningModule, Inference):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""
         if ASSETS_KEY in checkpoint:
+            # Before the weights are loaded: modules whose size follows from the corpus are made by it.
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
             self.licences = merged(self.licences, self._stated_licences(checkpoint))

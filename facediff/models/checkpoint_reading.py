@@ -348,6 +348,7 @@ def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a
     if module == f"facediff.registry.{kind.kind}":
         return kind.get(name) if name in kind.names() else None
     kind.load()
+    # The module must be imported already: importing what a file names would run code that the file chose.
     # Not getattr, which may make a lazily loaded package import the module that the file asks for.
     place = sys.modules.get(module)
     implementation = vars(place).get(name) if isinstance(place, types.ModuleType) else None

@@ -156,6 +156,8 @@ class DecoderBlock(nn.Module):
         self, x: Tensor, style: Tensor | PreparedTokens, mask: Tensor | None, rotation: Rotation | None
     ) -> Tensor:
         """``x`` (batch, frames, dim), ``style`` (batch, tokens, style_dim), ``mask`` (batch, frames)."""
+        # Pre-norm (Xiong et al. 2020): the residual path is never normalised, so that gradients reach the lower blocks
+        # without warming up the learning rate.
         normed = self.time_norm(x)
         x = x + self.dropout(self.time_attention(normed, normed, mask, rotation))
         x = x + self.dropout(self.style_attention(self.style_norm(x), style))
@@ -198,6 +200,8 @@ class TokenAttention(Attention):
         if isinstance(context, AttentionContext):
             return self.attend(self.queries(x, rotation), context)
         # One product for all heads; the softmax is over each head's own tokens.
+        # The scores arrive with W_q, b_q and 1/√d in them, and the values with W_o, so that neither queries nor a last
+        # map are computed. Heads lie side by side in one matrix.
         scores = x @ context.keys + context.offset
         weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
         return weights @ context.values + self.out.bias
@@ -292,6 +296,8 @@ class GruDecoder(Decoder):
 
     def prepare(self, style: Tokens, mask: FrameMask) -> GruConstants:
         """The lengths, for which the device must be waited for, and the modulation by the style."""
+        # The mean of the tokens has no order and no number of them, so that any style encoder fits. 1 + scale is the
+        # identity for small weights: an untrained style changes hardly anything.
         scale, shift = self.modulation(style.mean(1, keepdim=True)).chunk(2, dim=-1)
         lengths = mask.sum(1)
         return GruConstants(lengths if exporting() else lengths.cpu(), 1 + scale, shift)

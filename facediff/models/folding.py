@@ -107,6 +107,7 @@ class FoldedSpace:
     def __init__(self, embed: nn.Linear, fold: Fold, rest: Tensor | None = None) -> None:
         self._embed, self._fold = embed, fold
         self.width = embed.out_features
+        # What is added on the vertices must be mapped too: E (U h + b + rest) = E U h + E b + E rest.
         self._offset = None if rest is None else fold.offset + self.project(rest)
 
     def project(self, motion: ScaledMotion) -> State:
@@ -200,6 +201,7 @@ class ConditionalDenoiser:
     def features(self, embedded: Frames, step: Step) -> Frames:
         """The network's last features of embedded noisy motion, guided, at a step counted from 0."""
         views = len(self.shares)
+        # All conditional and unconditional predictions in one call of the network.
         rows = embedded if views == 1 else embedded.repeat(views, 1, 1)
         steps = step_of_rows(step, rows)
         features = self.network.core(rows, steps, self.conditions)

@@ -110,6 +110,7 @@ def interpolate_frames(
     # not depend on how far it is padded.
     position = (torch.arange(frames, device=features.device, dtype=torch.float32)[None, :] + 0.5) * ratio[:, None] - 0.5
     position = torch.minimum(position.clamp_min(0.0), last)
+    # Held at the ends: half a step before the first cell's centre there is nothing to interpolate from.
     low = position.floor()
     weight = (position - low)[..., None].to(features.dtype)
 
@@ -144,6 +145,7 @@ def recurrent_nodes(
     attributes: dict[str, int | str] = {
         "hidden_size": network.hidden_size,
         "direction": "bidirectional" if network.bidirectional else "forward",
+        # PyTorch's GRU applies the reset gate after the product with the hidden state, the format's default before it.
         **({} if lstm else {"linear_before_reset": 1}),
     }
 
@@ -184,6 +186,7 @@ class RotaryEmbedding(nn.Module):
         if head_dim % 2:
             raise ArgumentError({"head_dim": head_dim}, "rotary positions need an even number of channels per head")
         exponent = torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim
+        # Not saved: it follows from the options, so a checkpoint need not repeat it.
         self.register_buffer("frequencies", base**-exponent, persistent=False)
 
     def table(self, frames: int) -> Rotation:
@@ -205,6 +208,8 @@ class RotaryEmbedding(nn.Module):
         frames = x.shape[-2]
         cos, sin = (part[:frames].to(x.dtype) for part in (self.table(frames) if table is None else table))
         # (a, b) → (a cos − b sin, b cos + a sin): the halves change places, and the table's sines carry the signs.
+        # Pairs are (i, i + head_dim/2) and not neighbours as in the paper: the same rotation up to a permutation of
+        # channels, without strided access.
         first, second = x.chunk(2, dim=-1)
         return x * cos + torch.cat([second, first], dim=-1) * sin
 
@@ -281,6 +286,8 @@ class Attention(nn.Module):
     ) -> Frames:
         """The attention itself, and the map of its result."""
         key, value = context
+        # Keys are masked, queries are not: what padding frames attend to is zeroed later, and a row without any valid
+        # key would be NaN.
         # One mask for all heads and queries. None where possible, since masks rule out the quickest kernels.
         mask = None if context_mask is None else context_mask[:, None, None, :]
         dropout = self.dropout if self.training else 0.0

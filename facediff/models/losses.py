@@ -56,6 +56,7 @@ def reconstruction_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar
 
 def velocity_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
     """L_vel: Huber loss of the first differences over time (eq. 17); 0 for a single frame."""
+    # A difference exists only between two valid frames: the one over a clip's end would compare motion with padding.
     both = mask[:, 1:] & mask[:, :-1]
     return huber(prediction.diff(dim=1), truth.diff(dim=1), both)
 
@@ -79,6 +80,8 @@ def face_dynamics_loss(prediction: Motion, truth: Motion, mask: Mask, region: In
         mask: valid frames.
         region: indices of the upper-face vertices R.
     """
+    # Only the length of the displacement, not its direction: the upper face hardly follows from speech (blinks, brows),
+    # so its liveliness can be asked for, but not its course.
     true, predicted = (
         masked_std(torch.linalg.vector_norm(motion[:, :, region], dim=-1), mask) for motion in (truth, prediction)
     )
@@ -88,6 +91,8 @@ def face_dynamics_loss(prediction: Motion, truth: Motion, mask: Mask, region: In
 def huber(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
     """Mean Huber loss (δ = 1) over the coordinates of all valid frames; 0 if there is none."""
     loss = F.huber_loss(prediction, truth, reduction="none").mean((2, 3))
+    # The mean over all valid frames of the batch and not the mean of clips' means: a long clip weighs as its frames do,
+    # and the result does not depend on how far clips are padded.
     return (loss * mask).sum() / mask.sum().clamp_min(1)
 
 
@@ -122,6 +127,7 @@ def preconditioned_losses(
         importance: what a squared error of each coordinate counts in each clip.
         weights: weight of ``reconstruction``, ``velocity`` and ``acceleration`` in the sum.
     """
+    # Differences over time are linear, so those of the error are the errors of velocity and acceleration.
     gap, valid = prediction - truth, mask
     terms = {}
     for name in ("reconstruction", "velocity", "acceleration"):
@@ -155,6 +161,8 @@ def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
     # No identity has two styles, or all styles are of one identity: there is nothing to contrast.
     if not counts.any() or bool(same.logical_or(own).all()):
         return styles.new_zeros(())
+    # Each style is an anchor that weighs the same however many others of its identity the batch has (L_out of the
+    # paper); a sum over all pairs would let identities with many clips dominate.
     clip_losses = -chances.where(same, 0.0).sum(1) / counts.clamp_min(1)
     return clip_losses[counts > 0].mean()
 

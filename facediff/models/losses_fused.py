@@ -156,6 +156,7 @@ class _Blocks:
         self.count = self.valid.sum(1, keepdim=True).clamp_min(1)
         # What each difference of order 0, 1 and 2 counts in its mean over valid frames and coordinates.
         self.shares, valid = [], mask
+        # A difference of order k counts where k + 1 neighbouring frames are valid, as in eq. 16 to 18.
         for _ in range(3):
             share = valid.to(weight.dtype) / (valid.sum().clamp_min(1).to(weight.dtype) * len(weight))
             self.shares.append(share[..., None])
@@ -187,6 +188,8 @@ class _Blocks:
         values = torch.stack([*(value for value, _ in pairs), face]).to(_sum_dtype(prediction.device))
         if not self.differentiated:
             return values, None
+        # The gradient is formed here, in the forward pass, while the block of differences is still in the cache: kept
+        # for a backward pass, the differences of all blocks would have to be stored and read again.
         slope, of_change, of_bend = (slope for _, slope in pairs)
         slope *= self.factors[0]
         of_change *= self.factors[1]
@@ -202,6 +205,8 @@ class _Blocks:
     def _face(self, prediction: Tensor, truth: Tensor, upper: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
         """L_face of a block's upper-face vertices, and its gradient there (B, T, R, 3)."""
         moved, true = (motion.view(*motion.shape[:2], -1, 3)[:, :, upper] for motion in (prediction, truth))
+        # The readable form is :func:`facediff.models.losses.face_dynamics_loss` (eq. 19); only its gradient is written
+        # out.
         length = torch.linalg.vector_norm(moved, dim=-1)
         off, spread = self._spread(length)
         _, true_spread = self._spread(torch.linalg.vector_norm(true, dim=-1))

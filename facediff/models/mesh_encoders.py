@@ -145,6 +145,8 @@ class SpiralDown(nn.Module):
         self.register_buffer("table", torch.zeros(taken, length, dtype=torch.int64))
         self.register_buffer("rows", torch.zeros(taken, dtype=torch.int64) if mean else None)
         self.register_buffer("weights", torch.zeros(taken) if mean else None)
+        # A linear map of the concatenated spiral is a convolution whose filter depends on the position along the
+        # spiral: the fixed order of neighbours stands in for the grid of pixels.
         self.map = nn.Linear(length * in_channels, out_channels)
         nn.init.xavier_uniform_(self.map.weight)
         nn.init.zeros_(self.map.bias)
@@ -157,6 +159,7 @@ class SpiralDown(nn.Module):
         if self.rows is None or self.weights is None:
             return out
         # A sparse matrix product by scattering: each vertex adds its share to the one coarse vertex of its group.
+        # By index_add and not by a sparse matrix, which the format of exported graphs does not have.
         shares = out * self.weights[:, None]
         return shares.new_zeros(x.shape[0], self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
 
@@ -210,6 +213,7 @@ class SpiralMeshEncoder(MeshEncoder):
         steps = []
         width, vertices = 3, n_vertices
         for wider in channels:
+            # Rounded up, as the hierarchy does: its sizes must be known here, before there is any mesh.
             fewer = -(-vertices // factor)
             steps.append(SpiralDown(vertices, fewer, spiral_length, width, wider, mean=pooling == "mean"))
             width, vertices = wider, fewer
@@ -277,6 +281,8 @@ class SpiralMeshEncoder(MeshEncoder):
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
         frames = motion.flatten(0, 1)
+        # Frames are independent of one another, so that splitting them changes nothing but memory: activations are
+        # those of ``max_frames`` frames, at the cost of a second forward pass (Chen et al. 2016, sublinear memory).
         if self.max_frames is None or exporting() or len(frames) <= self.max_frames:
             return self.encode(frames).view(*motion.shape[:2], -1)
         parts = [self._part(part) for part in torch.split(frames, self.max_frames)]

@@ -99,6 +99,7 @@ class VertexMotion(MotionSpace):
 
     def decode(self, coordinates: Coordinates) -> Offsets:
         """Every coordinate."""
+        # A view: 70 000 coordinates a frame are not copied.
         return coordinates.view(*coordinates.shape[:2], -1, 3)
 
 
@@ -150,6 +151,8 @@ class ComponentMotion(MotionSpace):
         return self._sizes(variances.sqrt()).square()
 
     def _sizes(self, deviations: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
+        # In proportion to the largest, so that the unit of the corpus drops out; floored, since a corpus with fewer
+        # components than ``count`` leaves deviations of 0, by which decoding would divide.
         share = (deviations / deviations[0]).clamp_min(SMALLEST)
         return deviations[0] * share ** (1 - self.whitening)
 
@@ -157,6 +160,8 @@ class ComponentMotion(MotionSpace):
         """Precondition the network by each component's own variance."""
         deviations = self.components.deviations
         self.sizes.copy_(self._sizes(deviations))
+        # The importance undoes the whitening in the loss: an error of one unit in the noised coordinate is deviation /
+        # size on the vertices, however large the component was made for the noise.
         self.preconditioning.fit(signal, self.sizes.square(), (deviations / self.sizes).square())
 
     def encode(self, motion: Offsets) -> Coordinates:
@@ -212,11 +217,15 @@ class Preconditioning(nn.Module):
         """
         # In float64: 1 − ᾱ loses all digits at the clean end.
         kept, own, counted = signal.cpu().double()[:, None], variances.cpu().double(), importance.cpu().double()
+        # Gaussian motion y = √ᾱ x + √(1 − ᾱ) ε has the variance ᾱλ + 1 − ᾱ; given y, x has the mean √ᾱ λ y / total and
+        # the variance λ (1 − ᾱ) / total. These are the tables.
         total = kept * own + 1 - kept
         left = own * (1 - kept) / total
         self.into.copy_(total.rsqrt())
         self.skip.copy_(kept.sqrt() * own / total)
         self.out.copy_(left.sqrt())
+        # Normalised over the coordinates of a step: near the clean end the filter leaves hardly any error open, and
+        # such steps would otherwise not be trained.
         self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
 
     def clean(self, noisy: Coordinates, features: Coordinates, step: Int[Tensor, " batch"]) -> Coordinates:

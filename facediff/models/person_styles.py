@@ -84,8 +84,11 @@ class PersonStyles(CheckpointContent):
         if self.style_source != "person" or self._styles_of_step == step:
             return
         data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        # functional_call swaps the weights in for the call alone: the model that is training is not touched.
         encoder = StyleEncoding(self)
         named = {f"model.{name}": value for name, value in (weights or {}).items()}
+        # Each module's own mode is restored and not train() called, which would wake up frozen parts in evaluation
+        # mode.
         modes = [(module, module.training) for module in self.modules()]
         self.eval()
         styles: dict[str, Style] = {}

@@ -88,10 +88,14 @@ class NoiseProcess:
         self.signal = torch.cumprod(1.0 - self.variances, dim=0)
         self.scale = scale
         if scale != 1:
+            # In float64, so that 1 − ᾱ keeps its digits at the clean end. The variances follow from the new ᾱ as α_n =
+            # 1 − ᾱ_n / ᾱ_{n−1}, so that eq. 1 and its closed form still agree.
             shown = scale**2 * self.signal.double()
             signal = shown / (shown + 1 - self.signal.double())
             before = torch.cat([signal.new_ones(1), signal[:-1]])
             self.signal, self.variances = signal.float(), (1 - signal / before).float()
+        # A product of so many small factors underflows to 0 in float32; dpm_solver's time, ln(ᾱ / (1 − ᾱ)) / 2, would
+        # then be infinite at the very step at which sampling starts.
         if not 0 < float(self.signal[-1]) < 1:
             raise ArgumentError(
                 {"diffusion_steps": steps, "noise_schedule": schedule, "noise_scale": scale},
@@ -128,6 +132,8 @@ class NoiseProcess:
         """
         if min_snr is None:
             return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
+        # Drawing in proportion to the weight replaces multiplying the loss by it: the expectation is the same, and no
+        # part of a batch is spent on steps that would hardly count.
         signal = self.signal.to(device)
         weights = (signal / (1 - signal)).clamp_max(min_snr)
         return torch.multinomial(weights, batch, replacement=True, generator=generator)
@@ -148,6 +154,7 @@ def half_hidden(
     own = variances.double()
     counted = own if importance is None else importance.double()
     shares = counted / counted.sum()
+    # Bisection, since the share is monotonous in b but has no inverse in closed form for several components.
     low, high = -60.0, 60.0  # of ln b²; the share that shows rises with it
     for _ in range(100):
         middle = (low + high) / 2
@@ -294,6 +301,8 @@ class Sampler(ABC):
             noise: source of the noise that stochastic samplers add.
             progress: wraps the iteration over steps, e.g. in a progress bar.
         """
+        # Solvers of a higher order extrapolate from earlier predictions instead of calling the network again, which is
+        # why the predictions and not the states are kept.
         noisy = start
         predictions: list[Tensor] = []
         for i, step in enumerate(progress(self.timesteps) if progress is not None else self.timesteps):
@@ -421,6 +430,7 @@ class DpmSolverSampler(Sampler):
     ) -> None:
         super().__init__(process, steps, spacing, last_noise)
         self.order = order
+        # Without the clean end, whose time λ is infinite; the last update returns the prediction and needs none.
         signal = self.signal[:-1]
         self.signal_rate = [math.sqrt(kept) for kept in signal]
         self.noise_rate = [math.sqrt(1 - kept) for kept in signal]
@@ -436,6 +446,7 @@ class DpmSolverSampler(Sampler):
         # the same choices as in the authors' and diffusers' implementations.
         order = min(self.order, i + 1, self.steps - i if self.steps < 15 else self.order)
         h = self.time[i + 1] - self.time[i]
+        # e^{−h} − 1: with many steps h is small, and the difference would lose its digits.
         decay = math.expm1(-h)
         signal = self.signal_rate[i + 1]
         moved = self.noise_rate[i + 1] / self.noise_rate[i] * noisy - signal * decay * clean
@@ -449,4 +460,6 @@ class DpmSolverSampler(Sampler):
         before = (self.time[i - 1] - self.time[i - 2]) / h
         bend = (slope - (predictions[-2] - predictions[-3]) / before) / (ratio + before)
         slope = slope + ratio * bend
+        # Third order (Lu et al. 2022, appendix): φ₂ = (e^{−h} − 1)/h + 1 weights the slope, φ₃ = (e^{−h} − 1 + h)/h² −
+        # ½ the curvature. Second order above approximates φ₂ by half of −(e^{−h} − 1), the midpoint form.
         return moved + signal * (decay / h + 1) * slope - signal * ((decay + h) / h**2 - 0.5) * bend

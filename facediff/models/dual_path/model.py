@@ -285,6 +285,7 @@ class DualPathDiffusion(AnimationModel):
         Raises:
             FaceDiffError: if it is out of range, or not one number for each vertex.
         """
+        # One number for each vertex lets the lips follow the mean while the brows are sampled.
         numbers = expressivity.flatten().tolist() if isinstance(expressivity, Tensor) else [expressivity]
         if isinstance(expressivity, Tensor) and expressivity.shape != (self.n_vertices,):
             raise FaceDiffError(
@@ -418,6 +419,7 @@ class DualPathDiffusion(AnimationModel):
         """The terms of the dynamic style, where they are asked for, and the sum with them."""
         weights, style = self.style_weights, conditions.dynamic
         assert style is not None  # noqa: S101 - for the type checker
+        # The terms look at F_dyn alone: no denoising step takes part, so they cost one pass of the style encoder.
         terms: dict[str, Tensor] = {}
         if self.style_identity is not None:
             terms["style_identity"] = style_identity_loss(self.style_identity(style), batch.identity)
@@ -539,6 +541,7 @@ class DualPathDiffusion(AnimationModel):
         mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, first)
         if mean is not None and whole and expressivity == 0:
             return mean.expand(samples * len(mean), -1, -1, -1)
+        # Samples of one clip share its speech features and style: only the noisy motion differs.
         conditions = conditions.repeated(samples)
         denoiser = self.denoiser(conditions, blend)
 
@@ -552,6 +555,8 @@ class DualPathDiffusion(AnimationModel):
         if mean is None:
             return motion
         share = expressivity.to(motion)[:, None] if isinstance(expressivity, Tensor) else expressivity
+        # Linear in the offset of the vertices, so that 0 and 1 give mean and sample exactly, and any factor between
+        # keeps the sample's timing.
         return mean + share * (motion - mean)
 
     def _mean(self, conditions: Conditions, of_mean: NoiseSource, blend: Blend, first: int) -> Tensor:

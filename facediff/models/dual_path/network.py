@@ -211,6 +211,8 @@ class DualPathNetwork(nn.Module):
         table = conditions.step_table
         embedded = self.step_embedding(step) if table is None else table[step]
         fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
+        # The step enters next to the speech and the noisy motion and not through the style tokens: those stay constant
+        # over the steps, so that their keys and values are computed once.
         return self.decoder(fused, conditions.style, conditions.mask, *decoder)
 
     def clean_motion(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
@@ -254,6 +256,7 @@ class DualPathNetwork(nn.Module):
         weights = [self.step_embedding.frequencies, *self.step_embedding.parameters(), *ends]
         table, product = self._of_weights.get(weights, (steps, folded), of_weights)
         audio, style, mask = conditions.audio, conditions.style, conditions.mask
+        # For a window of long speech these are made from its own frames, since positions count from the window's start.
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
         ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
         if preconditioning is not None:

@@ -219,6 +219,8 @@ def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
     for clip, other in enumerate(partner.tolist()):
         same = clip != other and batch.sentences[clip] == batch.sentences[other]
         if alignments is not None and same and batch.names[clip] != batch.names[other]:
+            # Dynamic time warping of the speech: two recordings of one sentence differ in timing, and comparing frame
+            # by frame would teach the swapped motion the partner's timing.
             matches = alignments.frames(batch, clip, other)
             places[clip, : len(matches)] = matches
             aligned[clip, : len(matches)] = True

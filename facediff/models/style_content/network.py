@@ -102,6 +102,8 @@ class DisentanglementNetwork(nn.Module):
         """Content of speech, of so many frames each."""
         cached = heard.cached_features or ()
         # The encoder gives features at any rate, as if motion had so many frames.
+        # Rounded in the same way for every clip, and at least one step, so that a clip's features do not depend on its
+        # batch.
         steps = (lengths * self.ratio).round().long().clamp_min(1) if self.ratio != 1 else lengths
         features = self.audio_encoder(heard.audio, heard.audio_lengths, steps, *cached)
         content: Tensor = self.speech_content(features, frames, self.ratio, steps)
