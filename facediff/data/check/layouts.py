@@ -53,7 +53,7 @@ BASES = 100  # folders in the raw folder that are searched: an archive may have 
 
 @dataclass(frozen=True)
 class CorpusFolder:
-    """Files of clips by name, files that a killed program left half-written, and files that nothing reads."""
+    """Files of clips by name, files that a killed program left half-written, and files of other types."""
 
     root: Path
     motions: dict[str, Path] = field(default_factory=dict)
