@@ -70,9 +70,6 @@ class Performer(ABC):
 def read_acting(text: str) -> Acting:
     """A kind of acting from ``NAME:option=value,option=value``.
 
-    Raises:
-        FaceDiffError: if there is no such kind or option, or a value is out of range.
-
     Example:
         >>> read_acting("prosody:brows=2").brows
         2.0
@@ -91,11 +88,7 @@ def acted(kind: Acting, speech: Wave, frames: int, frame_rate: float, seed: int)
 
 
 def act(kind: Acting, animation: Animation, seed: int) -> Acted:
-    """The values (T, 5) for an animation with its speech.
-
-    Raises:
-        FaceDiffError: if it is silent.
-    """
+    """The values (T, 5) for an animation with its speech."""
     if animation.speech is None:
         raise OptionError.naming(f"{animation.name}: {{acting}}: has no speech to act on; give it with {{speech}}")
     from facediff.speech.audio import to_speech

@@ -121,9 +121,6 @@ class Weights:
         Args:
             frame_rate: frames a second.
 
-        Raises:
-            FaceDiffError: if the frame rate is out of range.
-
         Example:
             >>> curve = Weights(("jawOpen",), np.array([[0.0], [1.0]]), np.zeros(2), np.zeros(2), 1.0, frame_rate=30.0)
             >>> curve.at_rate(60.0).values.ravel().tolist()
@@ -163,9 +160,6 @@ class Weights:
             plain: columns time, the set's own names and residuals in mm, instead of those of Live Link Face.
             key_tolerance: above 0, the .json gets the keys of each curve that a straight line does not replace to
                 within so much of a weight. The table has a row for each frame.
-
-        Raises:
-            FaceDiffError: if a file cannot be written.
         """
         path = Path(path)
         if path.suffix.lower() != ".csv":
@@ -339,11 +333,7 @@ def objective(moving: Moving, shapes: ShapeSet, options: SolveOptions, frame_rat
 
 
 def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> Moving:
-    """The shapes of a set that move vertices which count.
-
-    Raises:
-        FaceDiffError: if the region is unknown, or no shape moves anything.
-    """
+    """The shapes of a set that move vertices which count."""
     used = np.arange(len(animation.template))
     if options.region is not None:
         if not animation.regions:

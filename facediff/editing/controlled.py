@@ -133,11 +133,7 @@ class ControlledFace:
         return eyes
 
     def refuse_whole_animation(self) -> None:
-        """Refuse, for a stream, what depends on where the animation ends.
-
-        Raises:
-            FaceDiffError: naming the option or the channel.
-        """
+        """Refuse, for a stream, what depends on where the animation ends."""
         for name in ("blinks", "gaze", "sway"):
             if getattr(self.controls, name) is not None:
                 raise FaceDiffError(f"--{name}: needs the whole animation; stream to .npy, then use `facediff export`")
@@ -204,9 +200,6 @@ class ControlledFace:
             seed: of blinks, gaze and sway, unless the controls have their own.
             start: the number of its first frame; blinks, gaze and sway need all frames.
             acted: values (T, 5) of :data:`ACTED`, where there is acting.
-
-        Raises:
-            FaceDiffError: if its head moves already.
         """
         if procedural.moves_head(animation):
             raise FaceDiffError(

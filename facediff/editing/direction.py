@@ -77,9 +77,6 @@ CHANNELS: dict[str, Channel] = {
 def channel_of(name: str) -> Channel:
     """The channel that a key names.
 
-    Raises:
-        FaceDiffError: if there is none of that name.
-
     Example:
         >>> str(channel_of("expressiveness.lips").range)
         'from 0 to 4'
@@ -105,9 +102,6 @@ class Key:
         interpolation: how the channel goes on from here to its next key.
         slope: change a second at this key, for ``smooth`` curves of numbers; chosen so that the curve does not
             overshoot if None.
-
-    Raises:
-        FaceDiffError: naming the field that is impossible.
 
     Example:
         >>> Key(1.5, "expressiveness.upper_face", 1.4)
@@ -215,20 +209,12 @@ class Direction:
         return text_shares(self.channels[channel], times)
 
     def refuse_both(self, name: str) -> None:
-        """Refuse keys of what an option of this name sets from beginning to end.
-
-        Raises:
-            FaceDiffError: naming the channel and the option.
-        """
+        """Refuse keys of what an option of this name sets from beginning to end."""
         for channel in self.under(name):
             raise FaceDiffError(f"{self.source}: channel {channel}: --{name} says the same; give one of them")
 
     def refuse_model_channels(self) -> None:
-        """Refuse keys of what only a model can follow, such as the style.
-
-        Raises:
-            FaceDiffError: naming the channel.
-        """
+        """Refuse keys of what only a model can follow, such as the style."""
         for channel in self.channels:
             if channel_of(channel).in_model:
                 raise FaceDiffError(
@@ -259,11 +245,7 @@ class Direction:
         return json_text(self.source, {"format": FORMAT, "version": VERSION, "keys": self.rows()}, indent=None)
 
     def save(self, path: str | Path) -> Path:
-        """Write a .json or .csv file that :func:`read_direction` reads.
-
-        Raises:
-            FaceDiffError: if the suffix is another one, or the file cannot be written.
-        """
+        """Write a .json or .csv file that :func:`read_direction` reads."""
         path = Path(path)
         if path.suffix.lower() == ".json":
             write_json(path, {"format": FORMAT, "version": VERSION, "keys": self.rows()})

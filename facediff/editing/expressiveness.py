@@ -75,9 +75,6 @@ def scale_regions(
             covers.
         eyes: where they are known, the closing of the lids is left as it is: a blink stays a blink, and lids that meet
             do not run through each other.
-
-    Raises:
-        FaceDiffError: if the animation has no such region.
     """
     weights = region_weights(animation.template, animation.regions, list(factors), animation.name)
     lids: Indices = np.zeros(0, np.int64)
@@ -147,9 +144,6 @@ def region_factors(
         factors: by region, or ``all`` (1 if absent).
         name: what has the regions, for the message.
         fall_off: in the template's unit; 0.06 of the face's size if None.
-
-    Raises:
-        FaceDiffError: if a region is not there.
     """
     return region_weights(template, regions, list(factors), name, fall_off).factors(factors)
 

@@ -127,9 +127,6 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
 
     ``.npz`` holds the same as arrays: ``closing`` (V, 3), ``neutral`` (V, 3), and ``brows`` and any ``eyeball…`` with
     indices.
-
-    Raises:
-        FaceDiffError: naming the file and what is wrong with it.
     """
     if not path.is_file():
         raise OptionError.naming(
@@ -253,9 +250,6 @@ def closing_of_lids(
     For each eye, the upper and the lower edge run from one corner to the other. Each edge vertex goes to the line
     between them at its own share of the way along; the skin around follows its nearest edge vertices, less and less up
     to 0.4 of the eye's width away. ``rigid`` vertices (eyeballs) do not follow.
-
-    Raises:
-        FaceDiffError: if an edge has less than two vertices.
     """
     places = np.asarray(template, np.float64)
     closing = np.zeros_like(places)

@@ -278,11 +278,7 @@ class Landmarks:
         return self.source, self.target
 
     def check(self, source_vertices: int, target_vertices: int) -> None:
-        """Refuse vertices that do not exist.
-
-        Raises:
-            FaceDiffError: naming the mesh and the vertex.
-        """
+        """Refuse vertices that do not exist."""
         for name, places, count in zip(
             ("source", "target"), self._sides, (source_vertices, target_vertices), strict=True
         ):
@@ -380,9 +376,6 @@ def parse_landmarks(
         source: named places of the source; None for none.
         target: of the target.
         counts: vertices of both meshes, where the places are checked against them.
-
-    Raises:
-        FaceDiffError: naming what is wrong.
     """
     if not isinstance(content, dict) or not isinstance(content.get("format"), str):
         raise FaceDiffError(f"{where}: is no file of landmarks; expected one that `facediff retarget --pick` saved")

@@ -38,9 +38,6 @@ class FrameSolver:
         unit: of length, for :meth:`residual_mm`.
         options: the usual ones if None; `residual_limit` has no meaning here.
 
-    Raises:
-        FaceDiffError: if the region is unknown or no shape moves anything.
-
     Example:
         >>> rest = np.random.default_rng(0).normal(size=(9, 3))
         >>> solver = FrameSolver(ShapeSet(("jawOpen",), rest, np.full((1, 9, 3), 0.01)), frame_rate=30.0)
@@ -91,9 +88,6 @@ class FrameSolver:
 
         Args:
             offsets: (V, 3) of the vertices from the neutral face.
-
-        Raises:
-            FaceDiffError: if they have another shape or are not finite.
         """
         if offsets.shape != self.shapes.neutral.shape:
             raise FaceDiffError(

@@ -54,9 +54,6 @@ def add_blinks(animation: Animation, eyes: Eyes, *, rate: Amount = RATE, seed: i
     """Let the eyes blink, in addition to any blinks of the animation, see :func:`shut_lids`.
 
     The head must not sway yet; ``rate`` is blinks a minute, 1 to 40, or as many of each frame, down to 0.
-
-    Raises:
-        FaceDiffError: if the rate is impossible, or the eyes' lids are not known.
     """
     curve = blinks_over_time(len(animation.vertices), animation.frame_rate, rate, seed)
     vertices = shut_lids(animation, eyes, curve)
@@ -118,9 +115,6 @@ def blink_curve(
         seed: of the random numbers.
         kept: with which chance a blink is kept that begins in each frame (T,); all of them are if None.
 
-    Raises:
-        FaceDiffError: if the rate is not in 1 … 40.
-
     Example:
         >>> bool((blink_curve(250, 25.0, seed=1) == 1.0).any())
         True
@@ -166,9 +160,6 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: Amount = DEGREES_GAZE
     """Let the eyes wander: eyeballs turn about their centres, lids follow slightly where their closing is known.
 
     The head must not sway yet; ``degrees`` is how far from straight ahead the eyes turn at most, or that in each frame.
-
-    Raises:
-        FaceDiffError: if the angle is impossible, or the eyeballs are not known.
     """
     if not eyes.eyeballs:
         raise FaceDiffError(f"{eyes.source}: does not say which vertices are the eyeballs; {GIVE}")
@@ -199,9 +190,6 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: ranges.GazeAngle = DE
 
     Fixations straight ahead and elsewhere alternate, now and then with two elsewhere; the first and the last are
     straight ahead.
-
-    Raises:
-        FaceDiffError: if the angle is not above 0 and at most 20.
     """
     random = random_of("gaze", seed)
 
@@ -263,9 +251,6 @@ def add_sway(animation: Animation, *, degrees: Amount = DEGREES_SWAY, seed: int 
     """Let the head sway, by ``degrees`` at most, or that in each frame; all vertices move as one.
 
     Nothing can be added after it.
-
-    Raises:
-        FaceDiffError: if the angle is impossible.
     """
     turns, shifts = sway_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
     moved = move_head(animation, turns, shifts)
@@ -318,9 +303,6 @@ def sway_curve(
     """Rotations (T, 3), axis-angle in radians, and shifts (T, 3), in head heights; zero in the first and last frame.
 
     Sums of six sines between 0.08 and 0.6 Hz, so that nothing is quick; the largest rotation is ``degrees``.
-
-    Raises:
-        FaceDiffError: if the angle is not above 0 and at most 15.
     """
     random = random_of("sway", seed)
     times = np.arange(frames) / frame_rate

@@ -369,11 +369,7 @@ SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
 
 
 def save_correspondence(path: Path, correspondence: Correspondence) -> None:
-    """Write a correspondence as .npz, which ``numpy.load`` opens without pickle.
-
-    Raises:
-        FaceDiffError: if the suffix is another one or the file cannot be written.
-    """
+    """Write a correspondence as .npz, which ``numpy.load`` opens without pickle."""
     if path.suffix != ".npz":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a correspondence .npz')
     similarity = correspondence.similarity
@@ -388,11 +384,7 @@ def save_correspondence(path: Path, correspondence: Correspondence) -> None:
 
 
 def load_correspondence(path: Path) -> Correspondence:
-    """Read what :func:`save_correspondence` wrote.
-
-    Raises:
-        FaceDiffError: if the file is missing, broken or something else.
-    """
+    """Read what :func:`save_correspondence` wrote."""
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
     held = read_arrays(path)

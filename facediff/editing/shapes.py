@@ -155,11 +155,7 @@ def is_built_in(path: Path) -> bool:
 
 
 def check_shapes(path: Path) -> None:
-    """Refuse a path that is neither there nor stands for the built-in shapes.
-
-    Raises:
-        FaceDiffError: naming the path.
-    """
+    """Refuse a path that is neither there nor stands for the built-in shapes."""
     if not path.exists() and not is_built_in(path):
         raise OptionError.naming(
             f"{{shapes}} {path}: no such folder or file; expected a folder of meshes, a .glb with targets, or puppet"

@@ -72,11 +72,7 @@ class BlendshapeWeights(Format):
     up_axes = ()
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Solve for the weights and write them, with a .json file that says how well they fit.
-
-        Raises:
-            FaceDiffError: if the blendshapes do not fit the animation.
-        """
+        """Solve for the weights and write them, with a .json file that says how well they fit."""
         from facediff.editing.blendshapes import SolveOptions, solve
         from facediff.editing.shapes import read_shapes
 

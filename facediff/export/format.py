@@ -127,11 +127,7 @@ class FileSpace:
 
 
 def check_animation(animation: Animation, *, needs_mesh: bool = True) -> None:
-    """Refuse an animation that would make a broken file.
-
-    Raises:
-        FaceDiffError: naming the animation and what is wrong with it.
-    """
+    """Refuse an animation that would make a broken file."""
     animation.refuse_not_finite()
     if needs_mesh:
         _ = animation.triangles
@@ -151,11 +147,7 @@ def facts(animation: Animation, space: FileSpace) -> dict[str, object]:
 
 
 def outward(animation: Animation) -> npt.NDArray[np.int32]:
-    """The triangles (F, 3), counter-clockwise seen from outside.
-
-    Raises:
-        FaceDiffError: if the animation has none.
-    """
+    """The triangles (F, 3), counter-clockwise seen from outside."""
     return face_outward(animation.triangles.astype(np.int32, copy=False), animation.template.astype(np.float64))
 
 

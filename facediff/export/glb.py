@@ -36,11 +36,7 @@ class GlbFormat(Format):
     uses = ("tolerance", "shapes", "key_tolerance")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation: all of it, or what the given shapes can show of it.
-
-        Raises:
-            FaceDiffError: if the shapes do not fit the animation.
-        """
+        """Write one animation: all of it, or what the given shapes can show of it."""
         (animation,) = animations
         space = FileSpace.of(animation, options, "m")
         head, animation = animation.head, animation.still()
@@ -75,11 +71,7 @@ class Morphs:
 def named_shapes(
     animation: Animation, space: FileSpace, shapes: Path, key_tolerance: float
 ) -> tuple[Morphs, dict[str, object]]:
-    """The motion as weights of blendshapes under their own names, and facts on how well they fit.
-
-    Raises:
-        FaceDiffError: if the shapes do not fit the animation.
-    """
+    """The motion as weights of blendshapes under their own names, and facts on how well they fit."""
     from facediff.editing.blendshapes import SolveOptions, key_frames, solve
     from facediff.editing.shapes import read_shapes
 

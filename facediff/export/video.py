@@ -55,9 +55,6 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
     """Pictures of animations side by side, one a frame; everything is checked before the first is drawn.
 
     Faces of one unit are seen by one camera, so that their sizes compare.
-
-    Raises:
-        FaceDiffError: if an animation has no triangles, or the frame rates differ.
     """
     from facediff.render import Camera, Renderer, side_by_side
 

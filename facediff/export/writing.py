@@ -148,9 +148,6 @@ def check_used(suffix: str, option_names: Collection[str]) -> None:
     Args:
         suffix: of the file.
         option_names: names of the options that were given, as ``facediff export`` calls them.
-
-    Raises:
-        FaceDiffError: naming the first option that changes nothing.
     """
     if suffix not in FORMATS:
         return
@@ -185,11 +182,7 @@ def _speech_file(path: Path, form: Format, animation: Animation, options: Export
 
 
 def is_free(path: Path) -> bool:
-    """Whether a path does not exist or was written by facediff; for a folder, whether all of its files were.
-
-    Raises:
-        FaceDiffError: if the file or folder cannot be read.
-    """
+    """Whether a path does not exist or was written by facediff; for a folder, whether all of its files were."""
     if not path.exists():
         return True
     try:
@@ -206,11 +199,7 @@ def is_free(path: Path) -> bool:
 
 
 def check_free(path: Path) -> None:
-    """Refuse a file or folder that the user did not name and that facediff did not write.
-
-    Raises:
-        FaceDiffError: naming the file or folder.
-    """
+    """Refuse a file or folder that the user did not name and that facediff did not write."""
     if not is_free(path):
         what = "is a folder with files" if path.is_dir() else "is a file"
         raise FaceDiffError(

@@ -101,9 +101,6 @@ def robust_align(
     triples are chosen with a fixed seed: equal input gives equal output.
 
     Arguments are those of :func:`align`; weights multiply the robust ones, and points of weight 0 are ignored.
-
-    Raises:
-        FaceDiffError: as :func:`align`.
     """
     source, target, weights = _checked(source, target, weights)
     rotation, translation, factor = robust_fit(source[None], target, weights, scale=scale)
@@ -344,9 +341,6 @@ def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None,
         frames: (T, V, 3) vertices; may be memory-mapped.
         stable: vertices that determine the head's motion; all, by a robust fit, if None.
         sample: how many frames to use.
-
-    Raises:
-        FaceDiffError: as :func:`stable_vertices`.
     """
     some = _sample(frames, sample)
     _, median = _aligned_with_median(some, np.arange(some.shape[1]) if stable is None else np.asarray(stable))

@@ -94,9 +94,6 @@ class Flame:
             shape: (S,) shape coefficients, the same for all frames; omitted ones are zero.
             expression: (T, E) expression coefficients; omitted ones are zero.
             jaw: (T, 3) rotation of the jaw, axis-angle in radians.
-
-        Raises:
-            FaceDiffError: if there are too many coefficients, or the numbers of frames differ.
         """
         expression = _coefficients("expression", expression, EXPRESSIONS, 2)
         jaw = _coefficients("jaw", jaw, 3, 2)
@@ -302,9 +299,6 @@ def read_masks(path: Path, names: str) -> list[int]:
         path: a pickle that holds a dict from mask to indices, or a single list of indices.
         names: masks, several joined by "+" ("lips", "forehead+eye_region"), or without the vertices of others after "-"
             ("face-left_eyeball-right_eyeball"); the whole list if empty.
-
-    Raises:
-        FaceDiffError: if the file holds something else, or has no mask of that name.
     """
     loaded = load_pickle(path)
     if names and not isinstance(loaded, dict):

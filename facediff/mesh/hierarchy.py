@@ -91,11 +91,7 @@ class MeshHierarchy:
 
     @classmethod
     def from_arrays(cls, named: Mapping[str, npt.ArrayLike]) -> MeshHierarchy:
-        """The hierarchy that :meth:`arrays` described.
-
-        Raises:
-            FaceDiffError: if an array is missing or does not fit the others.
-        """
+        """The hierarchy that :meth:`arrays` described."""
         try:
             arrays = {name: np.asarray(array) for name, array in named.items()}
             sizes: list[int] = []

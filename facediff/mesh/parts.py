@@ -26,11 +26,7 @@ class MeshPart:
 
 
 def mesh_parts(path: Path) -> list[MeshPart]:
-    """The parts of a file that :func:`facediff.mesh.read_mesh` reads; none for formats that have no names.
-
-    Raises:
-        FaceDiffError: if the file cannot be read.
-    """
+    """The parts of a file that :func:`facediff.mesh.read_mesh` reads; none for formats that have no names."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".glb":

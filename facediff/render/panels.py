@@ -50,9 +50,6 @@ def side_by_side(
     Returns:
         A generator of T pictures, drawn in several threads. They are as wide as all panels; strips for labels above
         and footer below add height.
-
-    Raises:
-        FaceDiffError: if the numbers of motions, labels, renderers and colours differ, or a motion cannot be drawn.
     """
     if not motions or len(labels) != len(motions):
         raise FaceDiffError(f"{len(motions)} motions and {len(labels)} labels: give a label for each.")
@@ -132,9 +129,6 @@ def check_motion(motion: Motion, n_vertices: int, name: str) -> None:
         motion: absolute positions (T, V, 3); read frame by frame, so a memory map stays on disk.
         n_vertices: V of the template it is drawn with.
         name: what the motion is called in the message.
-
-    Raises:
-        FaceDiffError: if the shape is wrong, there are no frames, or one is not finite.
     """
     if motion.ndim != 3 or motion.shape[2] != 3:
         raise FaceDiffError(f'motion "{name}" must have the shape (frames, vertices, 3), got {motion.shape}.')
@@ -175,9 +169,6 @@ def comparison(
 
     Returns:
         A generator of T pictures, three panels wide, with strips above and below them.
-
-    Raises:
-        FaceDiffError: if the motions cannot be drawn or differ in length, or the scale has no extent.
     """
     for motion, label in zip((truth, prediction), labels, strict=False):
         check_motion(motion, renderer.n_vertices, label)
@@ -217,9 +208,6 @@ def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float
 
     Returns:
         sRGB, of the values' shape and one axis of 3 more.
-
-    Raises:
-        FaceDiffError: if the scale has no extent or a value is not finite.
     """
     if not highest > lowest:
         raise FaceDiffError(f"a colour scale from {lowest} to {highest} has no extent: give a highest above the lowest")
@@ -250,9 +238,6 @@ def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str
         columns: pictures per row.
         labels: a text per picture, on a strip above it.
         gap: pixels between pictures.
-
-    Raises:
-        FaceDiffError: if there is no picture or column, or sizes or numbers differ.
     """
     pictures = list(frames)
     if not pictures or columns < 1:
@@ -274,11 +259,7 @@ def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str
 
 
 def save_image(path: str | Path, image: Frame) -> None:
-    """Write a picture (height, width, 3) as PNG; it appears under its name only when complete.
-
-    Raises:
-        FaceDiffError: if the name does not end in .png, or the file cannot be written.
-    """
+    """Write a picture (height, width, 3) as PNG; it appears under its name only when complete."""
     target = Path(path)
     if target.suffix.lower() != ".png":
         raise FaceDiffError(f'picture file "{target}" must end in .png.')

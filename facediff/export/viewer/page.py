@@ -284,10 +284,10 @@ def assemble(
     """A page of this package's assets in pieces, in order.
 
     Args:
-        page: its template, with places for style, script, policy, facts, blobs and further values.
+        page: the template of its body, with places for script, facts, blobs and further values.
         styles: files of its style.
         scripts: parts of its script, without the suffix; each uses only the parts before it.
-        values: further values of the template, as HTML.
+        values: further values of the template, as HTML: the title, and the browser tab's (``tab``) if it differs.
         facts: JSON that the script reads.
         blobs: the binary parts.
         loads: what the page may load, as its content security policy says it; nothing else is let in.
@@ -297,6 +297,7 @@ def assemble(
     script = script_of(scripts)
     own = " 'self'" if own_scripts else ""
     filled = {
+        "tab": values["title"],
         **values,
         # Lets this script and this style run, and nothing else be loaded.
         "policy": f"default-src 'none'; script-src {hash_source(script)}{own}; style-src {hash_source(style)}; "
@@ -305,7 +306,8 @@ def assemble(
         "facts": script_data(facts),
         "script": script,
     }
-    before, after = (fill(part, filled) for part in _asset(page).split("{{blobs}}"))
+    whole = _asset("head.html") + _asset(page)
+    before, after = (fill(part, filled) for part in whole.split("{{blobs}}"))
     texts = enumerate(blobs.texts)
     return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
 

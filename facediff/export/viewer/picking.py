@@ -85,11 +85,7 @@ class Picking:
         return len(self.source.template), len(self.target.vertices)
 
     def save(self, content: dict[str, Any]) -> int:
-        """Check what the page sends and write it; how many pairs there are.
-
-        Raises:
-            FaceDiffError: naming what is wrong, or the file if it cannot be written.
-        """
+        """Check what the page sends and write it; how many pairs there are."""
         landmarks = parse_landmarks(content, "request", counts=self.counts)
         if len(landmarks) < FEWEST:
             raise FaceDiffError(f"request: holds {len(landmarks)} pairs; expected {FEWEST} or more")
@@ -148,7 +144,7 @@ def picking_page(picking: Picking) -> list[str]:
         "picking.html",
         ("style.css", "picking.css"),
         SCRIPTS,
-        {"title": html.escape(f"{picking.names[0]} · {picking.names[1]}")},
+        {"title": html.escape(f"Pick landmarks: {picking.names[0]} · {picking.names[1]}")},
         facts,
         blobs,
         loads="img-src data:; connect-src 'self'",

@@ -340,7 +340,7 @@ def page(subject: str) -> list[str]:
     from facediff.export.viewer.page import assemble
 
     facts: dict[str, Any] = {"format": FORMAT}
-    texts = {"title": html.escape(subject)}
+    texts = {"title": html.escape(subject), "tab": html.escape(f"{subject}, live")}
     return assemble(
         "live.html",
         ("style.css", "live.css"),
