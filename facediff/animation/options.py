@@ -245,11 +245,13 @@ class DeviceOptions(CheckedOptions):
         device: cpu, cuda …; auto for CUDA where there is one
         commercial_only: refuse a model that is not cleared for commercial use
         precision: bf16 multiplies in 16 bits, where the processor is faster at it; the motion differs a little
+        threads: of the processor, for an exported model (default: its cores)
     """
 
     device: str = "cpu"
     commercial_only: bool = False
     precision: Precision = "32"
+    threads: Annotated[ranges.Threads, Option(metavar="N")] = 0
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from facediff.cli.parsing import changed, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.hub import check_model_source
+from facediff.utils.hub import check_animating_source
 from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
 
@@ -109,8 +109,7 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     if not streamed and not several and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
-    if not (checkpoint / "model.json").is_file():  # a folder of `facediff export-model`
-        check_model_source(checkpoint)
+    check_animating_source(checkpoint)
     check_scheduler(batch.scheduler)
     check_output(files, batch.suffix if several else ".npy" if stream else output.suffix)
     files = replace(files, quiet=quiet)

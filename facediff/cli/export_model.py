@@ -24,12 +24,12 @@ def export_model(
 ) -> None:
     """Write a model for ONNX Runtime: graphs, templates, styles, and a description.
 
-    The folder animates without PyTorch, in Python, on the command line (facediff-run) and in the browser. It is
+    The folder animates without PyTorch, in Python, on the command line and in the browser. It is
     compared with the model before it appears.
 
     For example:
       facediff export-model demo/puppet.ckpt -o puppet-onnx
-      facediff-run puppet-onnx speech.wav -o speech.glb
+      facediff animate speech.wav --checkpoint puppet-onnx -o speech.glb
 
     Args:
         model: checkpoint (.ckpt)

@@ -1,20 +1,16 @@
-"""What animates a live performance: a model with its choices made, from which streams are started."""
+"""The model of a live performance, with its choices made, from which streams are started."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.speech.voice_activity import USUAL_GATE, EnergyGate, Openness, VoiceGate
+from facediff.speech.voice_activity import USUAL_GATE, EnergyGate
 from facediff.utils import SAMPLE_RATE
-
-if TYPE_CHECKING:
-    from facediff.runtime import RuntimeModel
-    from facediff.speech.stream import AnimationStream
 
 Array = npt.NDArray[np.float32]
 
@@ -27,7 +23,7 @@ class VertexStream(Protocol):
         """Frames that the model has generated so far; some of them may wait to be certain."""
 
     def feed(self, samples: Array, /) -> Array:
-        """Hear samples (n,) at 16 kHz, and give the frames (m, V, 3) that are certain now."""
+        """Take samples (n,) at 16 kHz, and give the frames (m, V, 3) that are certain now."""
 
     def finish(self) -> Array:
         """The frames (m, V, 3) that are left."""
@@ -43,7 +39,7 @@ class LiveModel:
         neutral: the face at rest (V, 3).
         faces: triangles (F, 3); empty if there are none.
         unit: of length.
-        look_ahead: seconds of speech that must be heard after a frame begins before it is certain, at most.
+        look_ahead: seconds of speech that must arrive after a frame begins before it is certain, at most.
         hop: seconds of frames that become certain together.
         colours: of the vertices (V, 3); None if there are none.
         metadata: model, corpus, licences, identity, style, seed.
@@ -65,44 +61,9 @@ class LiveModel:
         return max(0.0, self.look_ahead - 1 / self.frame_rate)
 
     def warm_up(self) -> None:
-        """Compute once what a window costs, so that the first one of the performance is not the slow one."""
+        """Animate silence for a moment, since the first window after opening a model is slow."""
         stream = self.start()
         stream.feed(np.zeros(round((self.look_ahead + self.hop + 0.1) * SAMPLE_RATE), np.float32))
-
-
-def runtime_model(model: RuntimeModel, *, gate: VoiceGate | None, **chosen: Any) -> LiveModel:  # noqa: ANN401
-    """An exported model.
-
-    Args:
-        model: the model, whose ``windows`` are those of the performance.
-        gate: brings the mouth to rest in pauses; None for no gate.
-        chosen: ``identity``, ``condition``, ``style``, ``seed`` and ``expressivity`` of
-            :meth:`~facediff.runtime.RuntimeModel.stream`.
-
-    Raises:
-        FaceDiffError: if a name is unknown or a number out of range.
-    """
-    from facediff.runtime.gated import gated_stream
-
-    def start() -> AnimationStream:
-        return gated_stream(model.stream(**chosen, gate=gate))
-
-    stream = model.stream(**chosen, gate=gate)
-    template = model.arrays["templates"][stream.face].astype(np.float32)
-    still = model.animation(template[None], stream.face, None, "live", stream.conditions, gate)
-    plan = model.windows
-    gate_ahead = 0.0 if gate is None else Openness(gate, model.frame_rate).look_ahead
-    return LiveModel(
-        start=start,
-        frame_rate=model.frame_rate,
-        neutral=template,
-        faces=np.zeros((0, 3), np.int32) if still.faces is None else still.faces.astype(np.int32),
-        unit=still.unit,
-        look_ahead=max(plan.look_ahead, gate_ahead),
-        hop=plan.in_frames(model.frame_rate).hop / model.frame_rate,
-        colours=still.colours,
-        metadata=dict(still.metadata),
-    )
 
 
 def usual_gate(look_ahead: float) -> str:

@@ -24,9 +24,8 @@ from facediff.editing.controls import keys_of
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
 from facediff.pipelines.motion import Samples
-from facediff.pipelines.opening import is_exported
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.hub import EXPECTED, check_model_source
+from facediff.utils.hub import EXPECTED, check_model_source, is_exported
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import SAMPLE_RATES, check_number
 

@@ -377,7 +377,7 @@ def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]
         chosen = model.default_style(style)
     heard = torch.from_numpy(speech).to(model.device)
     wanted = model.animate(heard, identity=face, style=chosen, seed=3).vertices.numpy()
-    found = runtime.animate(speech, identity=face, style=style, seed=3, gate=None).vertices
+    found = runtime.animate(speech, identity=face, style=style, seed=3).vertices
     span = float(np.ptp(wanted - runtime.arrays["templates"][0]))
     difference = float(np.abs(found - wanted).max())
     return {

@@ -11,8 +11,7 @@ from facediff.animation.files import facts_of
 from facediff.animation.options import AnimationOptions
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of
-from facediff.runtime.gated import RuntimeVertices
-from facediff.runtime.model import RuntimeModel
+from facediff.runtime.model import RuntimeModel, RuntimeStream
 
 if TYPE_CHECKING:
     from facediff.editing.direction import Direction
@@ -40,7 +39,7 @@ class ExportedPipeline(AnimationPipeline):
                 raise OptionError(
                     name, "is fixed in an exported model; omit it, or animate with the checkpoint", changed[name]
                 )
-        self.model = copy(RuntimeModel.open(options.checkpoint) if model is None else model)
+        self.model = copy(RuntimeModel.open(options.checkpoint, threads=options.threads) if model is None else model)
         about = self.model.description
         if options.commercial_only and about.licences.get("commercial_use") != "allowed":
             raise OptionError("commercial_only", f"{about.model} is not cleared for commercial use; omit the option")
@@ -61,9 +60,9 @@ class ExportedPipeline(AnimationPipeline):
             "style": style_text(options),
             "expressivity": factors.get("all", 1.0),
         }
-        stream = self.model.stream(seed=options.seed or 0, gate=None, **self._chosen)
-        templates = self.model.arrays["templates"]
-        still = self.model.animation(templates[stream.face][None], stream.face, None, "face", stream.conditions, None)
+        stream = self.model.stream(seed=options.seed or 0, **self._chosen)
+        still = self.model.animation(self.model.arrays["templates"][stream.face][None], stream, None, "face")
+        self._metadata = dict(still.metadata)
         super().__init__(
             options,
             face={"faces": None, **cast("dict[str, Any]", facts_of(still))},
@@ -92,14 +91,12 @@ class ExportedPipeline(AnimationPipeline):
         """Absolute vertices of the whole recording."""
         motions = []
         for seed in self.track(seeds, "samples"):
-            animation = self.model.animate(speech, seed=seed, gate=None, **self._chosen)
-            self._metadata = dict(animation.metadata)
-            motions.append(animation.vertices)
+            motions.append(self.model.animate(speech, seed=seed, **self._chosen).vertices)
         yield motions
 
-    def generator(self) -> RuntimeVertices:
+    def generator(self) -> RuntimeStream:
         """What generates vertices while speech arrives."""
-        return RuntimeVertices(self.model.stream(seed=self.seed, gate=None, **self._chosen))
+        return self.model.stream(seed=self.seed, **self._chosen)
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""

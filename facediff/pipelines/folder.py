@@ -18,12 +18,12 @@ from facediff.editing.controls import check_controls, keys_file
 from facediff.errors import FaceDiffError, OptionError, choices, printable
 from facediff.export import FORMATS, check_export
 from facediff.pipelines.animate import check_options
-from facediff.pipelines.opening import is_exported, open_pipeline
+from facediff.pipelines.opening import open_pipeline
 from facediff.speech.inputs import read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
-from facediff.utils.hub import model_files
+from facediff.utils.hub import is_exported, model_files
 from facediff.utils.jobs import PerWorker, is_cluster
 from facediff.utils.tables import print_table
 

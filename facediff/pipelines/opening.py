@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationOptions
+from facediff.utils.hub import is_exported
 
 if TYPE_CHECKING:
     from facediff.pipelines.animate import AnimationPipeline
-
-
-def is_exported(source: str | Path) -> bool:
-    """Whether a model is a folder of ``facediff export-model``."""
-    return (Path(source) / "model.json").is_file()
 
 
 def open_pipeline(options: AnimationOptions) -> AnimationPipeline:

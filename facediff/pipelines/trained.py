@@ -36,6 +36,8 @@ class TrainedPipeline(AnimationPipeline):
     """
 
     def __init__(self, options: AnimationOptions, *, model: AnimationModel | None = None) -> None:
+        if options.threads:
+            raise OptionError("threads", "is for an exported model; omit it", options.threads)
         if model is None:
             from facediff.models import load_model
 

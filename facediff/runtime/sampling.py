@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.errors import OptionError
+from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.noise import NumpyClipNoise, NumpyWindowNoise, SeedNoise
 from facediff.speech.windows import MotionWindow
-
-if TYPE_CHECKING:
-    from facediff.runtime.model import RuntimeModel
 
 Array = npt.NDArray[np.float32]
 
@@ -41,22 +40,22 @@ class WindowSpeech:
     """Speech of a clip or a window.
 
     Attributes:
-        speech: samples (S,).
+        samples: (S,) at 16 kHz.
         frames: how many it lasts.
         mean: of all speech so far.
         deviation: standard deviation of all speech so far.
     """
 
-    speech: Array
+    samples: Array
     frames: int
     mean: float
     deviation: float
 
 
-def clip_motion(model: RuntimeModel, heard: WindowSpeech, conditions: RuntimeConditions) -> Array:
+def clip_motion(model: ExportedGraphs, speech: WindowSpeech, conditions: RuntimeConditions) -> Array:
     """Offsets from the template (1, frames, vertices, 3) of a whole clip."""
     about = model.description
-    features = model.features(heard, model.own_frames(heard))
+    features = features_of(model, speech, own_frame_count(model, speech))
     if about.generation == "direct":
         motion = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
     elif about.noise_of == "seed":
@@ -65,15 +64,15 @@ def clip_motion(model: RuntimeModel, heard: WindowSpeech, conditions: RuntimeCon
     else:
         noises = NumpyClipNoise(NAME, [conditions.seed]), NumpyClipNoise(f"{NAME}/mean", [0])
         motion = SamplerRun(model, conditions, None, 0).run(features, *noises)
-    if motion.shape[1] == heard.frames:
+    if motion.shape[1] == speech.frames:
         return motion
     # A model that counts its frames by itself may give fewer than the speech lasts: its last one is held.
-    return motion[:, np.minimum(np.arange(heard.frames), motion.shape[1] - 1)]
+    return motion[:, np.minimum(np.arange(speech.frames), motion.shape[1] - 1)]
 
 
 def window_motion(
-    model: RuntimeModel,
-    heard: WindowSpeech,
+    model: ExportedGraphs,
+    speech: WindowSpeech,
     window: MotionWindow,
     conditions: RuntimeConditions,
     before: Sequence[Array] | None,
@@ -82,7 +81,7 @@ def window_motion(
 
     Args:
         model: the model.
-        heard: the window's speech, with some before and after it.
+        speech: of the window, with some before and after it.
         window: which of its frames are generated.
         conditions: what motion is conditioned on.
         before: the tail of the window before; None for the first.
@@ -92,17 +91,43 @@ def window_motion(
     """
     own_frames = slice(window.context, window.context + window.frames)
     if model.description.blending == "motion":
-        motion = clip_motion(model, heard, conditions)[:, own_frames][:, window.fixed :]
+        motion = clip_motion(model, speech, conditions)[:, own_frames][:, window.fixed :]
         if before is not None:
             shared = before[0].shape[1]
             blended = before[0] + crossfade(shared, 0)[:, None, None] * (motion[:, :shared] - before[0])
             motion = np.concatenate([blended, motion[:, shared:]], 1)
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
-    features = np.ascontiguousarray(model.features(heard, heard.frames)[:, own_frames])
+    features = np.ascontiguousarray(features_of(model, speech, speech.frames)[:, own_frames])
     sampling = SamplerRun(model, conditions, before, window.shared, window.fixed)
     noise = NumpyWindowNoise(NAME, window, [conditions.seed])
     motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
     return motion, [kept[:, -window.kept :] for kept in sampling.kept]
+
+
+def own_frame_count(model: ExportedGraphs, speech: WindowSpeech) -> int:
+    """How many frames the model gives for speech, at least 1; its own number where it counts by itself."""
+    frames = speech.frames if model.clock.rule == "rounded" else max(1, model.clock.frames(len(speech.samples)))
+    longest, rate, name = model.description.longest, model.frame_rate, model.description.model
+    if longest and frames > longest:
+        raise OptionError.naming(
+            f"speech: {frames / rate:.1f} s are {frames} frames, and {name} was made for {longest} at most "
+            f"({longest / rate:g} s); animate it in windows ({{window}} 4)"
+        )
+    return frames
+
+
+def features_of(model: ExportedGraphs, speech: WindowSpeech, frames: int) -> Array:
+    """Speech to features (1, frames, …)."""
+    return model.run(
+        "speech",
+        {
+            "audio": speech.samples[None],
+            "mean": np.array([speech.mean], np.float32),
+            "deviation": np.array([speech.deviation], np.float32),
+            "samples": np.array([len(speech.samples)], np.int64),
+            "mask": np.ones((1, frames), bool),
+        },
+    )[0]
 
 
 def conditioned(features: Array, conditions: RuntimeConditions) -> dict[str, npt.NDArray[Any]]:
@@ -138,7 +163,7 @@ class SamplerRun:
 
     def __init__(
         self,
-        model: RuntimeModel,
+        model: ExportedGraphs,
         conditions: RuntimeConditions,
         before: Sequence[Array] | None,
         shared: int,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,9 +11,7 @@ import numpy.typing as npt
 from facediff.animation import metres_per_unit
 from facediff.animation.style_files import FILES, Stillness, frames_of, normalised, open_style, split_styles, stride_of
 from facediff.errors import FaceDiffError, OptionError, choices
-
-if TYPE_CHECKING:
-    from facediff.runtime.model import RuntimeModel
+from facediff.runtime.graphs import ExportedGraphs
 
 Array = npt.NDArray[np.float32]
 
@@ -32,28 +29,28 @@ class RuntimeStyle:
     vector: Array
 
 
-def read_style(words: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
-    """The style that the words of ``--style`` ask for; the model's styles must be those of reference motion.
+def read_style(text: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
+    """The style that the text of ``--style`` names; the model's styles must be those of reference motion.
 
     Args:
-        words: a style's name, a file, or several of them with weights, ``F1:0.3,b.npz:0.7``.
+        text: a style's name, a file, or several of them with weights, ``F1:0.3,b.npz:0.7``.
         model: the model.
         identity: whose motion a bare array (``.npy``) holds, where the file's name does not say it.
 
     Raises:
         FaceDiffError: if there is no such style, it cannot be read, or the weights make no mean.
     """
-    parts = split_styles(words, model.description.styles)
+    parts = split_styles(text, model.description.styles)
     if len(parts) == 1:
         return single_style(parts[0].name, model, identity)
-    shares = normalised(words, [part.weight for part in parts])
+    shares = normalised(text, [part.weight for part in parts])
     styles = [single_style(part.name, model, identity) for part in parts]
     vector = np.sum([np.float32(share) * style.vector for share, style in zip(shares, styles, strict=True)], 0)
     name = " + ".join(f"{share:.3g} {style.name}" for share, style in zip(shares, styles, strict=True))
     return RuntimeStyle(name, vector.astype(np.float32))
 
 
-def single_style(name: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
+def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
     """A style by its name in the folder, or from a file."""
     about, vectors = model.description, model.arrays["styles"]
     if name in about.styles:
@@ -83,4 +80,22 @@ def single_style(name: str, model: RuntimeModel, identity: str) -> RuntimeStyle:
             f"{{style}} {path}: does not lie on {face_of}, or the head moves; give an animation (.npz) of a head that "
             f"keeps still, or an array that is named <identity>_<clip>.npy"
         )
-    return model.encode_style(offsets, name=path.stem)
+    return encode_style(model, offsets, path.stem)
+
+
+def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyle:
+    """The style of reference motion: offsets (T, V, 3) from the speaker's face, at the model's unit and frame rate.
+
+    Raises:
+        FaceDiffError: if the model takes no styles from motion, or the motion is of another topology.
+    """
+    if not model.has("style"):
+        raise FaceDiffError(
+            f"style: the folder has no style encoder, so {model.description.model} takes styles by name alone; "
+            f"choose one of {', '.join(model.description.styles[:5])}, or export the model again"
+        )
+    motion, vertices = np.ascontiguousarray(motion, np.float32), model.arrays["templates"].shape[1]
+    if motion.ndim != 3 or not len(motion) or motion.shape[1:] != (vertices, 3) or not np.isfinite(motion).all():
+        raise FaceDiffError(f"style: is {motion.shape}; expected finite offsets (frames, {vertices}, 3)")
+    inputs = {"motion": motion[None], "mask": np.ones((1, len(motion)), bool)}
+    return RuntimeStyle(name, model.run("style", inputs)[0][0])

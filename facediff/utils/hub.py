@@ -71,6 +71,21 @@ def check_model_source(source: str | os.PathLike[str], option: str = "") -> None
         raise FaceDiffError(f"{shown}: no such checkpoint; {EXPECTED}")
 
 
+def is_exported(source: str | os.PathLike[str]) -> bool:
+    """Whether a model is a folder of ``facediff export-model``, which animates without PyTorch."""
+    return (Path(source) / "model.json").is_file()
+
+
+def check_animating_source(source: str | os.PathLike[str]) -> None:
+    """Refuse, before anything heavy is imported, what cannot be animated with.
+
+    Raises:
+        FaceDiffError: as :func:`check_model_source`; a folder of ``facediff export-model`` is no error.
+    """
+    if not is_exported(source):
+        check_model_source(source)
+
+
 def check_training_source(source: str | os.PathLike[str]) -> None:
     """Refuse to train on from a published model.
 

@@ -1,8 +1,7 @@
-"""The commands ``facediff live`` and ``facediff-live``: options, checks before anything is opened, the whole path."""
+"""The command ``facediff live``: options, checks before anything is opened, the whole path."""
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -13,12 +12,10 @@ import pytest
 import soundfile
 
 from facediff.cli.app import main as facediff
-from facediff.cli.live import live
-from facediff.cli.parsing import flat, parameters_of
 from facediff.errors import FaceDiffError
-from facediff.live.app import main, parser
-from facediff.live.command import LiveOptions, perform
+from facediff.live.command import perform
 from facediff.live.model import LiveModel, usual_gate
+from facediff.live.options import LiveOptions
 from facediff.registry import Kind
 from facediff.speech.voice_activity import EnergyGate, Openness, read_gate
 from tests.fakes.live import FakeSound, Kept, device, fake_model
@@ -45,7 +42,7 @@ def receivers(monkeypatch: pytest.MonkeyPatch) -> None:
     """No receivers but the one of this file."""
     kind = Kind("receiver", "", "tests", aliases=False)
     kind.register("keep")(Keeping)
-    for place in ("facediff.registry", "facediff.live.frames", "facediff.live.command"):
+    for place in ("facediff.registry", "facediff.live.frames", "facediff.live.options"):
         monkeypatch.setattr(f"{place}.receiver", kind)
     MADE.clear()
 
@@ -56,15 +53,10 @@ def speech(tmp_path: Path) -> Path:
     return tmp_path / "speech.wav"
 
 
-def opened(options: LiveOptions) -> LiveModel:
-    """A model that needs no folder."""
-    return fake_model()
-
-
 def test_performance_from_a_recording_to_receivers(speech: Path) -> None:
     said: list[str] = []
-    options = LiveOptions(Path("folder"), str(speech), to=["keep:1", "keep:2"])
-    summary = perform(options, opened, said.append)
+    options = LiveOptions(speech=str(speech), to=["keep:1", "keep:2"])
+    summary = perform(options, fake_model, said.append)
     assert summary.frames == 15
     assert [len(made.frames) for made in MADE] == [15, 15]
     assert [made.closed for made in MADE] == [1, 1]
@@ -79,7 +71,7 @@ def test_speech_goes_to_a_sound_device_instead_of_the_receivers(speech: Path, mo
     sound = FakeSound(device("Phones", 0, 2))
     monkeypatch.setitem(sys.modules, "sounddevice", sound)  # type: ignore[arg-type]
     said: list[str] = []
-    perform(LiveOptions(Path("folder"), str(speech), to=["keep:1"], sound="out:phones"), opened, said.append)
+    perform(LiveOptions(speech=str(speech), to=["keep:1"], sound="out:phones"), fake_model, said.append)
     assert not MADE[0].speech
     assert len(MADE[0].frames) == 15
     [stream] = sound.opened
@@ -87,9 +79,9 @@ def test_speech_goes_to_a_sound_device_instead_of_the_receivers(speech: Path, mo
 
 
 def test_receiver_that_cannot_open_closes_those_before_it(speech: Path) -> None:
-    options = LiveOptions(Path("folder"), str(speech), to=["keep:1", "keep:2?refuse=true"])
+    options = LiveOptions(speech=str(speech), to=["keep:1", "keep:2?refuse=true"])
     with pytest.raises(FaceDiffError, match="keep:2"):
-        perform(options, opened, str)
+        perform(options, fake_model, str)
     assert [made.closed for made in MADE] == [1, 1]
     assert not MADE[0].frames
 
@@ -99,25 +91,23 @@ def test_receiver_that_cannot_open_closes_those_before_it(speech: Path) -> None:
     [
         ({"speech": None}, "speech"),
         ({"microphone": "default"}, "speech"),
-        ({"rate": 8000}, "--rate"),
+        ({"rate": 8000}, "rate"),
         ({"to": []}, "--to.*keep"),
         ({"to": ["kep:1"]}, "--to kep:1.*keep"),
         ({"to": ["keep:1", "keep:1"]}, "--to keep:1"),
-        ({"to": ["keep:1?weights=true"]}, "--shapes"),
-        ({"to": ["keep:1?weights=true"], "shapes": Path("nowhere")}, "--shapes nowhere"),
-        ({"sound": "loud"}, "--sound loud"),
-        ({"voice_gate": "energetic"}, "--voice-gate"),
+        ({"to": ["keep:1?weights=true"]}, "shapes"),
+        ({"to": ["keep:1?weights=true"], "shapes": Path("nowhere")}, "shapes nowhere"),
+        ({"sound": "loud"}, "sound loud"),
         ({"speech": "nowhere.wav"}, "nowhere.wav"),
         ({"seconds": 0.0}, "seconds"),
-        ({"window": float("nan")}, "window"),
     ],
 )
 def test_what_cannot_be_is_refused_before_a_model_is_opened(words: dict[str, Any], named: str, speech: Path) -> None:
-    def never(options: LiveOptions) -> LiveModel:
+    def never() -> LiveModel:
         raise AssertionError("opened")
 
     with pytest.raises(FaceDiffError, match=named):
-        perform(LiveOptions(**{"model": Path("m"), "speech": str(speech), "to": ["keep:1"], **words}), never, str)
+        perform(LiveOptions(**{"speech": str(speech), "to": ["keep:1"], **words}), never, str)
 
 
 def test_weights_of_blendshapes_are_solved_for(speech: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -131,8 +121,8 @@ def test_weights_of_blendshapes_are_solved_for(speech: Path, monkeypatch: pytest
         (tmp_path / f"{name}.obj").write_text("\n".join(lines))
     model = fake_model()
     still = LiveModel(**{**vars(model), "neutral": neutral, "start": lambda: Moved(model.start(), neutral)})
-    options = LiveOptions(Path("m"), str(speech), to=["keep:1?weights=true"], shapes=tmp_path)
-    perform(options, lambda _: still, str)
+    options = LiveOptions(speech=str(speech), to=["keep:1?weights=true"], shapes=tmp_path)
+    perform(options, lambda: still, str)
     performance = MADE[0].performance
     assert performance is not None
     assert performance.shapes == ("jawOpen",)
@@ -159,18 +149,6 @@ class Moved:
         return np.asarray(self.stream.finish() + self.neutral, np.float32)
 
 
-def test_both_commands_have_the_same_options() -> None:
-    """But for those that need PyTorch."""
-    full = {parameter.name: parameter for parameter in flat(parameters_of(live))}
-    small = {action.dest: action for action in parser()._actions if not isinstance(action, argparse._HelpAction)}
-    small.pop("version")
-    assert set(full) - set(small) == {"steps", "device"}
-    for name, action in small.items():
-        if not full[name].positional:
-            assert (action.default or None) == (full[name].default or None), name
-            assert bool(action.const) == (full[name].option.bare is not None or full[name].is_switch), name
-
-
 def test_usual_gate_waits_no_longer_than_the_windows() -> None:
     for look_ahead in (0.05, 0.1, 0.2, 0.3, 0.5, 0.9, 1.5, 4.5):
         gate = read_gate(usual_gate(look_ahead))
@@ -186,7 +164,11 @@ def test_usual_gate_waits_no_longer_than_the_windows() -> None:
     [
         (["nowhere", "-", "--to", "keep:1"], "nowhere"),
         (["FOLDER", "nowhere.wav", "--to", "keep:1"], "nowhere.wav"),
-        (["FOLDER", "-", "--to", "keep:1", "--steps", "3"], "--steps"),
+        (["FOLDER", "-", "--to", "keep:1", "--voice-gate", "energetic"], "--voice-gate"),
+        (["FOLDER", "-", "--to", "keep:1", "--window", "nan"], "--window"),
+        (["FOLDER", "-", "--to", "keep:1", "--checkpoint", "FOLDER"], "--checkpoint"),
+        (["-", "--to", "keep:1", "--checkpoint", "nowhere"], "nowhere"),
+        (["--to", "keep:1", "--microphone"], "--checkpoint"),
         (["FOLDER", "-", "--to", "keep:1", "--seconds", "0"], "--seconds"),
         (["FOLDER", "-", "--to", "keep:1", "--threads", "-1"], "--threads"),
     ],
@@ -200,28 +182,14 @@ def test_wrong_words_end_with_one_sentence(
     assert named in line
 
 
-def test_small_command_says_errors_in_one_line(
-    speech: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert main(["nowhere", str(speech), "--to", "keep:1"]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert "nowhere" in line
-
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("facediff.live.app.perform", stopped)
-    assert main(["nowhere", str(speech), "--to", "keep:1"]) == 130
-
-
-def test_live_needs_neither_pytorch_nor_scipy() -> None:
+def test_a_wrong_model_loads_neither_pytorch_nor_scipy() -> None:
     program = (
         "import sys\n"
         "for name in ('torch', 'scipy', 'lightning', 'jsonargparse', 'sounddevice'): sys.modules[name] = None\n"
         "import facediff.live.command, facediff.live.sound, facediff.editing.live_weights, facediff.editing.shapes\n"
-        "from facediff.live.app import main\n"
-        "sys.exit(main(['nowhere', '--microphone', '--to', 'nothing:1']))"
+        "from facediff.cli.app import main\n"
+        "sys.exit(main(['live', 'nowhere', '--microphone', '--to', 'nothing:1']))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2, done.stderr
-    assert "nothing" in done.stderr
+    assert "nowhere" in done.stderr

@@ -117,7 +117,7 @@ def assert_alike(runtime: RuntimeModel, model: AnimationModel, seconds: float, i
     runtime.windows = model.windows = PLAN
     speech = sound(seconds)
     wanted = model.animate(torch.from_numpy(speech), identity=identity, seed=seed).vertices.numpy()
-    found = runtime.animate(speech, identity=identity, seed=seed, gate=None).vertices
+    found = runtime.animate(speech, identity=identity, seed=seed).vertices
     assert found.shape == wanted.shape
     span = np.ptp(wanted - model.assets.template(identity).numpy())
     assert np.abs(found - wanted).max() / span < 1e-4

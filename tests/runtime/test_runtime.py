@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 import torch
 
+import facediff
 from facediff import registry
 from facediff.animation import write_archive
+from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
@@ -27,11 +29,8 @@ from facediff.models.inference import WindowNoise as ModelWindowNoise
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
 from facediff.pipelines.export_model import Precision, export_model, store_weights
 from facediff.runtime import RuntimeModel
-from facediff.runtime.app import main
-from facediff.runtime.gated import gated_stream
 from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
 from facediff.runtime.styles import read_style
-from facediff.speech.voice_activity import QUICK_GATE, EnergyGate, read_gate
 from facediff.speech.windows import MotionWindow, WindowPlan
 from tests.fakes.tiny import Tiny
 
@@ -152,7 +151,7 @@ def test_folder_gives_what_the_model_gives(
     speech = sound(seconds)
     wanted = model.animate(torch.from_numpy(speech), identity="B", seed=seed, expressivity=expressivity)
     runtime = RuntimeModel.open(folder)
-    found = runtime.animate(speech, identity="B", seed=seed, expressivity=expressivity, gate=None)
+    found = runtime.animate(speech, identity="B", seed=seed, expressivity=expressivity)
     assert largest(found.vertices, wanted.vertices.numpy()) < 1e-4
     assert found.metadata["identity"] == "B"
     assert found.metadata["seed"] == str(seed)
@@ -160,39 +159,40 @@ def test_folder_gives_what_the_model_gives(
 
 def test_stream_gives_what_the_file_gives(folder: Path) -> None:
     runtime, speech = RuntimeModel.open(folder), sound(4.3)
-    stream = runtime.stream(identity="A", seed=2, gate=None)
+    stream = runtime.stream(identity="A", seed=2)
     pieces = [stream.feed(piece) for piece in np.split(speech, [1, 1000, 30_000, 30_001])]
-    made = np.concatenate([*pieces, stream.finish()], 1)[0] + runtime.arrays["templates"][stream.face]
-    assert np.array_equal(made, runtime.animate(speech, identity="A", seed=2, gate=None).vertices)
+    made = np.concatenate([*pieces, stream.finish()])
+    assert np.array_equal(made, runtime.animate(speech, identity="A", seed=2).vertices)
 
 
 def test_low_latency_gives_what_the_model_gives(model: AnimationModel, folder: Path) -> None:
     runtime, speech = RuntimeModel.open(folder), sound(1.2)
-    usual = runtime.animate(speech, identity="B", seed=1, gate=None).vertices
+    usual = runtime.animate(speech, identity="B", seed=1).vertices
     runtime.choose_low_latency()
     with model.choosing():
         model.choose_low_latency()
         wanted = model.animate(torch.from_numpy(speech), identity="B", seed=1).vertices.numpy()
-    found = runtime.animate(speech, identity="B", seed=1, gate=None)
+    found = runtime.animate(speech, identity="B", seed=1)
     assert largest(found.vertices, wanted) < 1e-4
     assert largest(usual, wanted) > 1e-3
     assert found.metadata["sampler"].endswith("2 steps")
-    stream = gated_stream(runtime.stream(identity="B", seed=1, gate=read_gate(QUICK_GATE)))
-    made = np.concatenate([*map(stream.feed, np.split(speech, [1, 9000])), stream.finish()])
-    gated = runtime.animate(speech, identity="B", seed=1, gate=read_gate(QUICK_GATE)).vertices
-    assert np.abs(made - gated).max() < 1e-6 * np.ptp(gated)
+    exported = facediff.load(folder)
+    options = {"identity": "B", "seed": 1, "low_latency": True}
+    vertices = np.concatenate([*exported.stream(np.split(speech, [1, 9000]), **options)])  # type: ignore[arg-type]
+    animation = exported.animate(speech, 16_000, **options)  # type: ignore[call-overload]
+    assert np.abs(vertices - animation.vertices).max() < 1e-6 * np.ptp(vertices)
 
 
-def test_gated_stream_gives_what_the_file_gives(folder: Path) -> None:
-    runtime = RuntimeModel.open(folder)
+def test_exported_folder_animates_in_python_as_the_checkpoint_does(model: AnimationModel, folder: Path) -> None:
     speech = np.concatenate([np.zeros(20_000, np.float32), sound(2.0), np.zeros(20_000, np.float32)])
-    stream = gated_stream(runtime.stream(identity="A", seed=2))
-    made = np.concatenate([*map(stream.feed, np.split(speech, [1, 9000, 40_000])), stream.finish()])
-    wanted = runtime.animate(speech, identity="A", seed=2).vertices
-    assert np.abs(made - wanted).max() < 1e-6 * np.ptp(wanted)
-    assert np.abs(made - runtime.animate(speech, identity="A", seed=2, gate=None).vertices).max() > 1e-4 * np.ptp(
-        wanted
-    )
+    exported, trained = facediff.load(folder), facediff.Animator(model)
+    animation = exported.animate(speech, 16_000, identity="A", seed=2)
+    assert largest(animation.vertices, trained.animate(speech, 16_000, identity="A", seed=2).vertices) < 1e-4
+    pieces = np.split(speech, [1, 9000, 40_000])
+    vertices = np.concatenate([*exported.stream(pieces, identity="A", seed=2)])
+    assert np.abs(vertices - animation.vertices).max() < 1e-6 * np.ptp(vertices)
+    moving = exported.animate(speech, 16_000, identity="A", seed=2, voice_gate="off").vertices
+    assert np.abs(vertices - moving).max() > 1e-4 * np.ptp(vertices)
 
 
 @pytest.mark.parametrize("frames", [1, 7, 130])  # the graph was recorded with 50
@@ -204,14 +204,14 @@ def test_style_of_motion_is_that_of_the_model(model: AnimationModel, folder: Pat
     runtime = RuntimeModel.open(folder)
     found = runtime.encode_style(motion)
     np.testing.assert_allclose(found.vector, wanted, atol=1e-5 * np.abs(wanted).max())
-    made = [runtime.animate(sound(0.5), style=style, gate=None).vertices for style in (found, None)]
+    made = [runtime.animate(sound(0.5), style=style).vertices for style in (found, None)]
     assert np.abs(made[0] - made[1]).max() > 1e-5
 
 
 def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Path, tmp_path: Path) -> None:
     runtime = RuntimeModel.open(folder)
     vertices = (model.assets.references["B"].motion + model.assets.template("B")).numpy()
-    animation = replace(runtime.animate(sound(1.0), identity="B", gate=None), vertices=vertices, speech=None)
+    animation = replace(runtime.animate(sound(1.0), identity="B"), vertices=vertices, speech=None)
     write_archive(tmp_path / "b.npz", animation)
     np.save(tmp_path / "B_1.npy", animation.vertices)  # a bare array, whose name says whose face it is
     own = runtime.arrays["styles"][runtime.description.styles.index("B")]
@@ -237,9 +237,8 @@ def test_impossible_style_is_refused(words: str, folder: Path, tmp_path: Path, m
 
 
 def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:
-    runtime = RuntimeModel.open(folder)
-    still = runtime.animate(np.zeros(32_000, np.float32), gate=EnergyGate())
-    weights = runtime.arrays["rest_weights"][0]
+    still = facediff.load(folder).animate(np.zeros(32_000, np.float32), 16_000)
+    weights = RuntimeModel.open(folder).arrays["rest_weights"][0]
     assert np.allclose(still.vertices[:, weights == 1], still.template[weights == 1])
 
 
@@ -283,7 +282,7 @@ def test_fewer_bits_make_a_smaller_folder(
     assert description.sizes["speech.onnx"] < whole
 
 
-def test_without_pytorch_the_command_animates(folder: Path, tmp_path: Path) -> None:
+def test_without_pytorch_the_commands_animate_and_perform(folder: Path, tmp_path: Path) -> None:
     """A process in which torch, SciPy and Lightning cannot be imported."""
     import soundfile
 
@@ -291,14 +290,19 @@ def test_without_pytorch_the_command_animates(folder: Path, tmp_path: Path) -> N
     program = (
         "import sys\n"
         "for name in ('torch', 'scipy', 'lightning', 'transformers', 'torchmetrics'): sys.modules[name] = None\n"
-        "from facediff.runtime.app import main\n"
-        "sys.exit(main(sys.argv[1:]))"
+        "import facediff\n"
+        "from facediff.cli.app import main\n"
+        "folder, speech, out = sys.argv[1:]\n"
+        "for name in ('out.npz', 'out.glb', 'out.html'):\n"
+        "    assert main(['animate', speech, '--checkpoint', folder, '-o', f'{out}/{name}', '--threads', '1']) == 0\n"
+        "assert main(['live', folder, speech, '--to', f'jsonl:{out}/out.jsonl?weights=false', '--quiet']) == 0\n"
+        "facediff.load(folder).animate(speech).save(f'{out}/python.npz')\n"
     )
-    for name in ("out.npz", "out.glb", "out.html"):
-        words = [str(folder), str(tmp_path / "speech.wav"), "-o", str(tmp_path / name)]
-        done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=60)
-        assert done.returncode == 0, done.stderr
-        assert (tmp_path / name).stat().st_size > 1000
+    command = [sys.executable, "-c", program, str(folder), str(tmp_path / "speech.wav"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    sizes = {path.name: path.stat().st_size for path in tmp_path.glob("*.*")}
+    assert all(sizes[name] > 1000 for name in ("out.npz", "out.glb", "out.html", "out.jsonl", "python.npz"))
 
 
 BROKEN = {
@@ -360,13 +364,36 @@ def test_unknown_choice_is_refused(given: dict[str, object], named: str, folder:
         RuntimeModel.open(folder).animate(sound(1.0), **given)  # type: ignore[arg-type]
 
 
-def test_command_says_errors_in_one_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(tmp_path / "nowhere"), "speech.wav", "-o", str(tmp_path / "out.npz")]) == 2
-    assert main([str(folder), "-", "-o", str(tmp_path / "out.npz")]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert "nowhere" in lines[0]
-    assert "-:" in lines[1]
+REFUSED = {
+    "--sampler ddim": "--sampler",
+    "--steps 3": "--steps",
+    "--guidance style=1.5": "--guidance",
+    "--precision bf16": "--precision",
+    "--device cuda": "--device",
+    "--expressivity lips=0.5": "--expressivity",
+    "--style nobody.npz": "--style nobody.npz",
+    "--identity Z": "--identity",
+    "--window 0.1": "window",
+}
+"""Options that an exported model cannot follow, and what the error of both commands names."""
+
+
+def test_commands_say_what_an_exported_model_cannot_do(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import soundfile
+
+    soundfile.write(tmp_path / "speech.wav", sound(1.0), 16_000)
+    speech, output = str(tmp_path / "speech.wav"), str(tmp_path / "out.npz")
+    wrong = []
+    for option, named in REFUSED.items():
+        for command in (["animate", speech, "-o", output], ["live", speech, "--to", "jsonl:-?weights=false"]):
+            status = main([*command, "--checkpoint", str(folder), *option.split()])
+            error = capsys.readouterr().err
+            if status != 2 or named not in error or len(error.splitlines()) != 1:
+                wrong.append(f"{command[0]} {option}: {status} {error}")
+    assert not wrong, "\n".join(wrong)
+    assert not (tmp_path / "out.npz").exists()
 
 
 def test_model_that_cannot_be_exported_is_refused(tiny: Tiny, tmp_path: Path) -> None:

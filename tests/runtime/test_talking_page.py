@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import soundfile
 
+import facediff
 from facediff.animation import Animation, read_archive
 from facediff.pipelines.export_model import export_model
-from facediff.runtime import RuntimeModel
 from facediff.runtime.onnxruntime_web import web_runtime
 from facediff.runtime.site import make_site
 from facediff.speech.audio import read_speech
-from facediff.speech.voice_activity import QUICK_GATE, read_gate
 from tests.fakes.contrasts import CONTRASTS
 from tests.runtime.test_every_model import CASES, PLAN, Sources, ready, sources
 from tests.runtime.test_runtime import folder, largest, model, sound
@@ -84,7 +83,7 @@ def record(path: Path, seconds: float) -> Path:
 
 
 def test_page_gives_the_motion_of_the_python_runtime(folder: Path, page: Page, tmp_path: Path) -> None:
-    runtime = RuntimeModel.open(folder)
+    exported = facediff.load(folder)
     assert page.evaluate("crossOriginIsolated")
     choices = {"identity": "B", "style": "A", "seed": 5, "expressivity": 1.5}
     for seconds in (1.6, 4.3):  # in one pass, and by windows of which the last is short
@@ -94,7 +93,7 @@ def test_page_gives_the_motion_of_the_python_runtime(folder: Path, page: Page, t
         choose(page, file)
         found = archive_of(page, tmp_path / "found.npz")
         speech = read_speech(file)
-        wanted = runtime.animate(speech, **choices, name="hello")  # type: ignore[arg-type]
+        wanted = exported.animate(speech, 16_000, **choices, name="hello")  # type: ignore[call-overload]
         assert largest(found.vertices, wanted.vertices) < 1e-4
         np.testing.assert_array_equal(found.speech, speech)
         np.testing.assert_array_equal(found.triangles, wanted.triangles)
@@ -102,8 +101,7 @@ def test_page_gives_the_motion_of_the_python_runtime(folder: Path, page: Page, t
         assert {**found.metadata, "generator": ""} == {**wanted.metadata, "generator": ""}
         assert found.regions.keys() == wanted.regions.keys()
     page.evaluate("facediff.page.animate(facediff.page.choices, facediff.page.delays[0])")
-    runtime.choose_low_latency()
-    wanted = runtime.animate(speech, **choices, gate=read_gate(QUICK_GATE), name="hello")  # type: ignore[arg-type]
+    wanted = exported.animate(speech, 16_000, **choices, low_latency=True)  # type: ignore[call-overload]
     found = archive_of(page, tmp_path / "found.npz")
     assert largest(found.vertices, wanted.vertices) < 1e-4
     assert found.metadata["sampler"] == wanted.metadata["sampler"]
@@ -177,7 +175,7 @@ def test_every_model_moves_in_the_page_as_in_python(
     made = ready(case, tiny_root, sources)
     made.windows = PLAN
     export_model(made, tmp_path / "face")
-    runtime = RuntimeModel.open(tmp_path / "face")
+    exported = facediff.load(tmp_path / "face")
     page = browser.open(serve(make_site(tmp_path / "face", web_files)))
     page.wait_for("window.facediff && (facediff.ready || facediff.errors.length)")
     page.evaluate("document.getElementById('seed').value = 5")
@@ -185,7 +183,7 @@ def test_every_model_moves_in_the_page_as_in_python(
         file = record(tmp_path / "hello.wav", seconds)
         choose(page, file)
         found = archive_of(page, tmp_path / "found.npz")
-        wanted = runtime.animate(read_speech(file), seed=5)
+        wanted = exported.animate(file, seed=5)
         assert largest(found.vertices, wanted.vertices) < 1e-4
         assert {**found.metadata, "generator": ""} == {**wanted.metadata, "generator": ""}
     assert page.problems == []

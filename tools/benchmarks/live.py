@@ -278,7 +278,7 @@ def model(options: argparse.Namespace) -> Iterator[str]:
     rate, seconds = float(description["frame_rate"]), 60 * options.minutes
     samples, written, sizes = speech(seconds), list[float](), list[tuple[float, float]]()
     listeners = Listeners(rate)
-    words = [sys.executable, "-m", "facediff.live.app", str(options.model), "-", "--shapes", str(options.shapes)]
+    words = [sys.executable, "-m", "facediff", "live", str(options.model), "-", "--shapes", str(options.shapes)]
     words += ["--window", str(options.window)] if options.window else []
     words += ["--threads", str(options.threads)] if options.threads else []
     words += [word for address in listeners.addresses for word in ("--to", address)]

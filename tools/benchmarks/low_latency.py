@@ -190,7 +190,7 @@ def sizes(threads: int) -> str:
             runtime.choose_low_latency()
             speech = 0.2 * torch.randn(2 * SAMPLE_RATE, generator=torch.Generator().manual_seed(0))
             row = [encoder, str(dim), str(layers), str(steps), f"{waits * 1000:.0f}"]
-            for stream in (model.stream(identity="A"), runtime.stream(identity="A", gate=None)):
+            for stream in (model.stream(identity="A"), runtime.stream(identity="A")):
                 spent: list[float] = []
                 with torch.inference_mode():
                     fed(lambda piece, stream=stream: stream.feed(piece.numpy()), speech, spent)  # type: ignore[misc]

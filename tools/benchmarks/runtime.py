@@ -2,7 +2,7 @@
 
     python tools/benchmarks/runtime.py demo/puppet.ckpt
 
-installs tools/runtime in a fresh environment, exports the model in float32, float16 and int8, and animates a test
+installs the base package in a fresh environment, exports the model in float32, float16 and int8, and animates a test
 recording of the model's corpus there. The table has for each precision: megabytes of the folder; seconds from the start
 of the process to the written file of that recording; seconds of computing for each second of speech; the largest
 difference from PyTorch as a share of the motion's range; and the lip vertex error on the first test split as a multiple
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command, size = install(folder / "environment")
-        print(f"{processor('cpu')}; tools/runtime in a fresh environment: {size:.0f} MB installed\n")
+        print(f"{processor('cpu')}; facediff without extras in a fresh environment: {size:.0f} MB installed\n")
         print(table(model, folder, command, args.clips))
 
 
@@ -54,7 +54,7 @@ def install(environment: Path) -> tuple[Path, float]:
     """The installed command, and megabytes of all installed packages but pip."""
     venv.create(environment, with_pip=True)
     python = environment / "bin" / "python"
-    words = ["install", "-q", "-c", str(ROOT / "tools" / "constraints.txt"), str(ROOT / "tools" / "runtime")]
+    words = ["install", "-q", "-c", str(ROOT / "tools" / "constraints.txt"), str(ROOT)]
     subprocess.run([str(python), "-m", "pip", *words], check=True)
     packages = next(environment.glob("lib/python3*/site-packages"))
     own = ("pip", "setuptools")
@@ -63,7 +63,7 @@ def install(environment: Path) -> tuple[Path, float]:
         for file in packages.rglob("*")
         if file.is_file() and not file.relative_to(packages).parts[0].startswith(own)
     )
-    return environment / "bin" / "facediff-run", sum(sizes) / 1e6
+    return environment / "bin" / "facediff", sum(sizes) / 1e6
 
 
 def table(model: AnimationModel, folder: Path, command: Path, clips: int) -> str:
@@ -84,14 +84,14 @@ def table(model: AnimationModel, folder: Path, command: Path, clips: int) -> str
         path = folder / precision
         sizes = export_model(model, path, precision=precision, speech=recording).sizes
         began = time.perf_counter()
-        words = [str(path), str(folder / "speech.wav"), "-o", str(folder / f"{precision}.npz")]
+        output = str(folder / f"{precision}.npz")
+        words = ["animate", str(folder / "speech.wav"), "--checkpoint", str(path), "-o", output]
         subprocess.run([str(command), *words], check=True, capture_output=True, env={})
         start = time.perf_counter() - began
         runtime = RuntimeModel.open(path)
         began = time.perf_counter()
         found = [
-            runtime.animate(sample.audio.numpy(), identity=sample.identity_name, seed=1, gate=None).vertices
-            for sample in samples
+            runtime.animate(sample.audio.numpy(), identity=sample.identity_name, seed=1).vertices for sample in samples
         ]
         spent = time.perf_counter() - began
         heard = sum(len(sample.audio) for sample in samples) / SAMPLE_RATE

@@ -151,7 +151,7 @@ class TalkingPage {
   /** Animate a file that the reader has chosen. */
   async open(file) {
     this.clear();
-    if (file.size > MOST_FILE) throw new Error(`${file.name}: is larger than a page can hold; run facediff-run on it`);
+    if (file.size > MOST_FILE) throw new Error(`${file.name}: is larger than a page can hold; run \`facediff animate\` on it`);
     this.say(`reading ${file.name} …`);
     const samples = await this.speechOf(file);
     const audio = find("sound");
@@ -190,7 +190,7 @@ class TalkingPage {
     const frames = new FrameClock(rate, this.about.clock).frames(samples.length);
     if (frames < 1) throw new Error(`${name}: is shorter than one frame; choose a longer recording`);
     if (4 * frames * this.size > MOST_MOTION) {
-      throw new Error(`${name}: ${Math.floor(MOST_MOTION / 4 / this.size / rate)} s of motion are the most that this page keeps; run facediff-run on it`);
+      throw new Error(`${name}: ${Math.floor(MOST_MOTION / 4 / this.size / rate)} s of motion are the most that this page keeps; run \`facediff animate\` on it`);
     }
     this.animated = new Animated(name, samples, frames, this.size, rate);
     this.clock = new SoundClock(find("sound"), rate);
