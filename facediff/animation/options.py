@@ -243,15 +243,24 @@ class DeviceOptions(CheckedOptions):
 
     Attributes:
         device: cpu, cuda …; auto for CUDA where there is one
-        commercial_only: refuse a model that is not cleared for commercial use
         precision: bf16 multiplies in 16 bits, where the processor is faster at it; the motion differs a little
         threads: of the processor, for an exported model (default: its cores)
     """
 
     device: str = "cpu"
-    commercial_only: bool = False
     precision: Precision = "32"
     threads: Annotated[ranges.Threads, Option(metavar="N")] = 0
+
+
+@dataclass(frozen=True)
+class LicenceOptions(CheckedOptions):
+    """Licence.
+
+    Attributes:
+        commercial_only: refuse a model that is not cleared for commercial use
+    """
+
+    commercial_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -309,7 +318,7 @@ class SourceOptions(CheckedOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class AnimationOptions(
-    GenerationOptions, WindowOptions, RecordingOptions, AnimationControls, TargetOptions, DeviceOptions
+    GenerationOptions, WindowOptions, RecordingOptions, AnimationControls, TargetOptions, DeviceOptions, LicenceOptions
 ):
     """All options that decide how speech is animated; the groups that it consists of explain them.
 
@@ -374,7 +383,15 @@ def with_options(options: type, keywords: type) -> Callable[[Function], Function
     return decorate
 
 
-GROUPS = (GenerationOptions, WindowOptions, RecordingOptions, AnimationControls, TargetOptions, DeviceOptions)
+GROUPS = (
+    GenerationOptions,
+    WindowOptions,
+    RecordingOptions,
+    AnimationControls,
+    TargetOptions,
+    DeviceOptions,
+    LicenceOptions,
+)
 """The groups that :class:`AnimationOptions` consists of, in the order of help texts."""
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed, confirm_cost
 from facediff.cli.process import tell
@@ -47,9 +48,9 @@ def adapt(
     corpus: Corpus = None,
     seed: Seed = 0,
     accelerator: str = "auto",
-    commercial_only: bool = False,
     quiet: bool = False,
     yes: bool = False,
+    licence: LicenceOptions,
 ) -> None:
     """Fine-tune a checkpoint on a new speaker, or adapt its audio encoder to other voices or to low latency.
 
@@ -79,9 +80,9 @@ def adapt(
             may be a file of the working folder
         seed: seed of all random numbers
         accelerator: Lightning's: auto, cpu, gpu …
-        commercial_only: refuse a checkpoint that is not cleared for commercial use
         quiet: no progress bar
         yes: start without a question, however long it takes
+        licence: which models are refused.
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
@@ -105,7 +106,8 @@ def adapt(
             chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
         adapt_audio_encoder(
-            *(checkpoint, output, data_root, corpus, device, commercial_only, chosen, audio_encoder), quiet=quiet
+            *(checkpoint, output, data_root, corpus, device, licence.commercial_only, chosen, audio_encoder),
+            quiet=quiet,
         )
         return
     from lightning.pytorch import Trainer, seed_everything
@@ -122,7 +124,7 @@ def adapt(
     content = read_checkpoint(checkpoint)
     name, data = adaptation_data(checkpoint, content, person, mode, data_root, corpus)
     model = build_model(checkpoint, content)
-    if commercial_only:
+    if licence.commercial_only:
         require_cleared(checkpoint, model.licences)
     data.prepare_data()
     if not data.root.is_dir():

@@ -12,6 +12,7 @@ from facediff.animation.options import (
     DeviceOptions,
     ExportOptions,
     GenerationOptions,
+    LicenceOptions,
     RecordingOptions,
     TargetOptions,
     WindowOptions,
@@ -60,6 +61,7 @@ def animate(
     files: ExportOptions,
     batch: BatchOptions,
     place: DeviceOptions,
+    licence: LicenceOptions,
 ) -> int:
     """Animate a face with a recording of speech, with many, or with speech as it comes.
 
@@ -86,6 +88,7 @@ def animate(
         files: how the files are written.
         batch: how several recordings are animated.
         place: where the model computes.
+        licence: which models are refused.
 
     Returns:
         the exit status: 1 if a recording of a batch failed.
@@ -114,7 +117,7 @@ def animate(
     check_output(files, batch.suffix if several else ".npy" if stream else output.suffix)
     files = replace(files, quiet=quiet)
     options = AnimationOptions.of(
-        generation, windows, recording, controls, target, place, checkpoint=checkpoint, quiet=quiet
+        generation, windows, recording, controls, target, place, licence, checkpoint=checkpoint, quiet=quiet
     )
     if stream:
         from facediff.pipelines.stream import animate_stream

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.process import tell
@@ -37,11 +38,11 @@ def generation_metrics(
     corpus: Corpus = None,
     eyelid_pairs: FileOrList = None,
     device: str = "cpu",
-    commercial_only: bool = False,
     seed: Seed = 0,
     json: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     quiet: bool = False,
+    licence: LicenceOptions,
 ) -> None:
     """Measure diversity, liveliness, calibration and errors of models' samples, on their corpus's test splits.
 
@@ -69,11 +70,11 @@ def generation_metrics(
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
         eyelid_pairs: file with pairs of eyelid vertices (default: regions/eyelid_pairs.txt in the corpus's folder)
         device: cpu, cuda …
-        commercial_only: refuse models that are not cleared for commercial use
         seed: of the first sample; the others follow
         json: write everything as JSON
         csv: write one row for each split and metric
         quiet: no progress bar
+        licence: which models are refused.
     """
     for path in [*checkpoints, *([] if against is None else [against])]:
         check_model_source(path)
@@ -106,7 +107,9 @@ def generation_metrics(
     with progress_bar("clips", total, shown=not quiet) as step:
 
         def results(paths: list[Path]) -> GenerationScores:
-            models = {str(path): partial(load_model, path, device, commercial_only=commercial_only) for path in paths}
+            models = {
+                str(path): partial(load_model, path, device, commercial_only=licence.commercial_only) for path in paths
+            }
             return measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
 
         scores = results(checkpoints)

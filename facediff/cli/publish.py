@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+from facediff.animation.options import LicenceOptions
 from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
@@ -27,7 +28,7 @@ def publish(
     languages: Annotated[Sequence[str] | None, Option(metavar="CODE,…")] = None,
     push: Annotated[str | None, Option(metavar="USER/NAME")] = None,
     private: bool = False,
-    commercial_only: bool = False,
+    licence: LicenceOptions,
 ) -> None:
     """Write a trained model as a folder that others can use, and send it to the Hugging Face hub.
 
@@ -51,7 +52,7 @@ def publish(
         languages: codes of the languages that it was trained on, en,zh-CN (default: those of its corpus)
         push: send the folder to this name on the hub; log in with `hf auth login` before
         private: with --push: a new model is visible to its owner alone
-        commercial_only: refuse a model that is not cleared for commercial use
+        licence: which models are refused.
     """
     hub.check_model_source(checkpoint)
     if push is None:
@@ -66,7 +67,7 @@ def publish(
     from facediff.utils.licences import in_words
 
     found = scores or scores_next_to(checkpoint)
-    model = load_model(checkpoint, commercial_only=commercial_only)
+    model = load_model(checkpoint, commercial_only=licence.commercial_only)
     model.provenance = {"published_from": hub.model_name(checkpoint), **model.provenance}
     model.save_pretrained(
         folder, half=half, license=license, name=name or push, scores=found, languages=languages or None

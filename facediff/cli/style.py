@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
+from facediff.animation.options import LicenceOptions
 from facediff.cli.options import Checkpoint, Identity, Output
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
@@ -17,7 +18,7 @@ def extract(
     checkpoint: Checkpoint,
     output: Output,
     identity: Identity = None,
-    commercial_only: bool = False,
+    licence: LicenceOptions,
 ) -> None:
     """Write the style vector of clips, their mean if there are several.
 
@@ -26,7 +27,7 @@ def extract(
         checkpoint: trained model (.ckpt)
         output: vector to write (.npy)
         identity: whose motion it is, where the files' names do not say it; by default the first one trained on
-        commercial_only: refuse a model that is not cleared for commercial use
+        licence: which models are refused.
     """
     if output.suffix != ".npy":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .npy")
@@ -36,7 +37,7 @@ def extract(
     from facediff.models.styles import extract_style
     from facediff.utils.files import atomic
 
-    model = load_model(checkpoint, commercial_only=commercial_only)
+    model = load_model(checkpoint, commercial_only=licence.commercial_only)
     vector = extract_style(clips, identity or model.identities[0], model)
     if not len(vector):
         raise FaceDiffError(f"{checkpoint}: was trained without a dynamic style, so it has no style vectors")
