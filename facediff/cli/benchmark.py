@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,7 +58,7 @@ def benchmark(
     from facediff.utils.workers import processors
 
     check_scheduler(scheduler)
-    read = read_plan(find_plan(plan), corpus_folders(root or []))
+    definition = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline
     from facediff.benchmark.published import find_published
@@ -68,30 +68,31 @@ def benchmark(
     from facediff.utils.files import locked
 
     try:
-        (protocol,) = find_protocols([read.protocol])
-        parse_all(read.metrics)
-        find_published(read.published)
+        (protocol,) = find_protocols([definition.protocol])
+        parse_all(definition.metrics)
+        find_published(definition.published)
     except FaceDiffError as error:
-        raise FaceDiffError(f"{read.file}: {error}") from error
-    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *read.metrics]
-    for column in read.columns:
+        raise FaceDiffError(f"{definition.file}: {error}") from error
+    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *definition.metrics]
+    for column in definition.columns:
         if column not in scores:
-            raise FaceDiffError(f"{read.file}: columns: there is no score {column!r}: {choices(column, scores)}")
-    cells = cells_of(read)
-    folder = output / read.name
+            raise FaceDiffError(f"{definition.file}: columns: there is no score {column!r}: {choices(column, scores)}")
+    cells = cells_of(definition)
+    folder = output / definition.name
     left = pending(cells, folder, retry_failed=retry_failed)
-    count = workers or read.workers or (None if is_cluster(scheduler) else max(1, processors() // read.threads))
-    setting = check_cells(read, cells, left, folder, dry_run=dry_run)
+    count = (
+        workers or definition.workers or (None if is_cluster(scheduler) else max(1, processors() // definition.threads))
+    )
+    setting = check_cells(definition, cells, left, folder, dry_run=dry_run)
     seconds = estimate(left, folder)
-    announce(read, cells, left, seconds, count)
+    announce(definition, cells, left, seconds, count)
     if dry_run:
         return 0
-    command = shlex.join(
-        ["facediff", "benchmark", str(plan), *[w for folder_option in root or [] for w in ("--root", folder_option)]]
-    )
+    roots = [word for folder_of_corpus in root or [] for word in ("--root", folder_of_corpus)]
+    command = shlex.join(["facediff", "benchmark", str(plan), *roots])
     failed = 0
     with locked(folder / "benchmark.lock", "facediff benchmark"):
-        outline = outline_of(read, cells, command)
+        outline = outline_of(definition, cells, command)
         write_outline(folder, outline)
         with closing(run_cells(left, setting, workers=count, scheduler=scheduler)) as outcomes:
             for number, (cell, outcome) in enumerate(outcomes, 1):
@@ -233,50 +234,53 @@ def check_cells(
     kinds: dict[str, type[SpeechMotionDataModule]] = {}
     for cell in left:
         for training in cell.trainings:
-            checkpoints = {step.name: Path(f"{step.name}.ckpt") for step in cell.trainings}
-            options = fit_options(training, {}, cell)
-            unknown = [step for step in checkpoints if f"{{{step}}}" in map(str, options.values())]
-            options = {name: value for name, value in options.items() if value not in [f"{{{s}}}" for s in unknown]}
+            # A checkpoint of an earlier training does not exist yet: options that name it are left out.
+            earlier = {f"{{{step.name}}}" for step in cell.trainings}
+            options = {
+                name: value for name, value in fit_options(training, {}, cell).items() if str(value) not in earlier
+            }
             command_line = ["--config", str(training.config), *option_words({**options, "seed_everything": 0})]
             mark = " ".join(command_line)
             if mark in seen:
                 continue
             seen.add(mark)
-            try:
+            with naming(plan, cell):
                 class_path, arguments = parse_fit(command_line)
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
                 kinds[cell.corpus] = type(data_of(prepared, class_path, arguments, make=not dry_run))
-            except FaceDiffError as error:
-                if "--data.root must be given" in str(error):
-                    remedy = f"give it with --root {cell.corpus}=FOLDER; docs/data.md says how to obtain it"
-                    raise FaceDiffError(f"{plan.file}: the corpus {cell.corpus} has no folder; {remedy}") from error
-                raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
         if cell.kind == "checkpoint" and cell.data is not None:
             class_path, arguments = read_data(cell.data)
             kinds[cell.corpus] = data_class(class_path)
             if not class_path.startswith("facediff.") and "." in class_path:
                 classes[cell.corpus] = class_path
-            if (
-                arguments.get("root") is not None
-            ):  # a published model knows no folder, and another machine's is not here
+            # A published model names no folder, and one of another machine names a folder that is not here.
+            if arguments.get("root") is not None:
                 roots[cell.corpus] = str(arguments["root"])
         if cell.kind == "predictions" and cell.corpus not in truths and cell.data is not None:
-            try:
+            with naming(plan, cell):
                 class_path, arguments = read_data(cell.data)
                 arguments |= {} if cell.root is None else {"root": str(cell.root)}
                 data = data_of(prepared, class_path, arguments, make=not dry_run)
                 if not (dry_run and not data.root.is_dir()):
                     truths[cell.corpus], clips[cell.corpus] = truth_words(data), test_clips(data)
-            except FaceDiffError as error:
-                raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
     for cell in left:
         if cell.kind == "checkpoint":
-            try:
+            with naming(plan, cell):
                 check_checkpoint(cell, kinds.get(cell.corpus), classes.get(cell.corpus), roots.get(cell.corpus))
-            except FaceDiffError as error:
-                raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
     return replace(setting, clips=clips, truths=truths, classes=classes, roots=roots)
+
+
+@contextmanager
+def naming(plan: BenchmarkPlan, cell: Cell) -> Iterator[None]:
+    """Errors inside it name the plan, the row and the corpus; a missing folder is asked for with --root."""
+    try:
+        yield
+    except FaceDiffError as error:
+        if "--data.root must be given" in str(error):
+            remedy = f"give it with --root {cell.corpus}=FOLDER; docs/data.md says how to obtain it"
+            raise FaceDiffError(f"{plan.file}: the corpus {cell.corpus} has no folder; {remedy}") from error
+        raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
 
 
 def check_test_options(plan: BenchmarkPlan) -> None:
