@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -92,6 +93,49 @@ def test_the_table_has_no_circle() -> None:
     while free := {package for package, packages in left.items() if not packages}:
         left = {package: packages - free for package, packages in left.items() if package not in free}
     assert not left
+
+
+def module_of(file: Path) -> str:
+    parts = ["facediff", *file.relative_to(PACKAGE).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def circle_of_files(*, types: bool) -> list[str]:
+    """One circle of imports between files, those inside functions included; empty if there is none.
+
+    Args:
+        types: whether imports count that only type checkers run.
+    """
+    modules = {module_of(file): file for file in FILES}
+    graph: dict[str, set[str]] = {}
+    for module, file in modules.items():
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        checks = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n.test)]
+        typed = {line for check in checks for line in range(check.lineno, (check.body[-1].end_lineno or 0) + 1)}
+        names = [name for line, name in imported(file) if types or line not in typed]
+        # A name is a module, or stands in one.
+        targets = {name if name in modules else name.rpartition(".")[0] for name in names}
+        graph[module] = (targets & modules.keys()) - {module}
+    for one, other in TYPED_CIRCLES if types else ():
+        graph[one].discard(other)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+TYPED_CIRCLES = (
+    ("facediff.cli.paths", "facediff.cli.parsing"),
+    ("facediff.runtime.sampling", "facediff.runtime.model"),
+    ("facediff.runtime.styles", "facediff.runtime.model"),
+)
+"""Imports of types alone, from a file to one that imports it; goal: none."""
+
+
+@pytest.mark.parametrize("types", [False, True])
+def test_no_files_import_each_other(types: bool) -> None:
+    assert circle_of_files(types=types) == []
 
 
 def test_the_drawing_has_every_package_above_what_it_may_import() -> None:

@@ -66,7 +66,21 @@ def whole(fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "puppet" / "version_0"
 
 
-def test_a_run_stopped_by_an_error_and_a_signal_continues_in_its_folder(
+def test_a_run_stopped_by_a_signal_continues_in_its_folder(
+    fit: Fit, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [*LONGER, f"--trainer.logger.save_dir={tmp_path}"]
+    with monkeypatch.context() as patched:
+        stop_at(6, patched, signal.SIGTERM)
+        with pytest.raises(SystemExit):
+            fit(*words)
+    assert fit(*words, "--ckpt_path=last") == 0
+    run = tmp_path / "puppet" / "version_0"
+    assert (curve(run), weights(run), files(run)) == (curve(whole), weights(whole), files(whole))
+
+
+@pytest.mark.slow
+def test_a_run_stopped_by_an_error_and_two_signals_continues_in_its_folder(
     fit: Fit, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [*LONGER, f"--trainer.logger.save_dir={tmp_path}"]

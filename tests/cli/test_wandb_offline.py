@@ -112,6 +112,7 @@ def runs(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Off
     return OfflineRun(first), OfflineRun(second), printed, said.getvalue()
 
 
+@pytest.mark.slow  # tests/cli/test_lightning.py trains with wandb offline in the quick suite
 def test_a_line_says_why_and_how_to_upload(runs: tuple[OfflineRun, OfflineRun, str, str]) -> None:
     *_, no_key, no_network = runs
     for printed, reason in ((no_key, "no API key found"), (no_network, r"http://127\.0\.0\.1:\d+ does not answer")):
@@ -120,6 +121,7 @@ def test_a_line_says_why_and_how_to_upload(runs: tuple[OfflineRun, OfflineRun, s
         assert re.search(rf"^wandb: {reason}.*upload it later with `wandb sync \w+/wandb/offline-run-\*`", lines[0])
 
 
+@pytest.mark.slow  # tests/cli/test_lightning.py trains with wandb offline in the quick suite
 def test_every_documented_name_is_recorded(runs: tuple[OfflineRun, OfflineRun, str, str]) -> None:
     trained, tested, *_ = runs
     found = trained.names | tested.names
@@ -133,6 +135,7 @@ def test_every_documented_name_is_recorded(runs: tuple[OfflineRun, OfflineRun, s
     assert trained.config["config"]["trainer"]["max_epochs"] == 1
 
 
+@pytest.mark.slow  # tests/cli/test_lightning.py trains with wandb offline in the quick suite
 def test_every_metric_that_is_recorded_is_documented(runs: tuple[OfflineRun, OfflineRun, str, str]) -> None:
     trained, tested, *_ = runs
     words = {re.sub("<[a-z]+>", "[A-Za-z0-9_]+", name) for name in LOGGED}
@@ -142,6 +145,7 @@ def test_every_metric_that_is_recorded_is_documented(runs: tuple[OfflineRun, Off
     assert not strange
 
 
+@pytest.mark.slow  # tests/cli/test_lightning.py trains with wandb offline in the quick suite
 def test_numbers_and_norms_come_with_every_step(runs: tuple[OfflineRun, OfflineRun, str, str]) -> None:
     trained, *_ = runs
     steps = [row for row in trained.history if "train/loss" in row]
