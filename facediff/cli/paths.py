@@ -13,17 +13,35 @@ import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from facediff.errors import FaceDiffError
 from facediff.utils.destinations import protect, refuse_equal, refuse_overwriting
 from facediff.utils.files import check_folder_writable, check_writable
-
-if TYPE_CHECKING:
-    from facediff.cli.parsing import Parameter
+from facediff.utils.option import Option
 
 
-def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
+class PathParameter(Protocol):
+    """What the checks read of a :class:`facediff.cli.parsing.Parameter`."""
+
+    @property
+    def name(self) -> str:
+        """Name of the value."""
+
+    @property
+    def option(self) -> Option:
+        """Whether a path is read or written."""
+
+    @property
+    def is_path(self) -> bool:
+        """Whether a value is a path; texts may hold one as well."""
+
+    @property
+    def shown(self) -> str:
+        """The name as errors show it."""
+
+
+def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) -> None:
     """Refuse, before any work is done, files that cannot be read or written, and outputs that are inputs.
 
     The inputs are protected from then on: nothing that the command writes replaces one of them.
@@ -53,18 +71,18 @@ def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> N
     protect(inputs)
 
 
-def given_paths(parameter: Parameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
+def given_paths(parameter: PathParameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
     """The paths in a value; in a text, such as ``NAME=FOLDER`` or ``a.npy:0.3,b.npy:0.7``, all that may be one."""
     option = parameter.option
     if value is None or not (parameter.is_path or option.reads or option.writes):
         return
-    for each in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(each, Path):
-            yield each
-        elif isinstance(each, str) and option.writes:
-            yield Path(each)
-        elif isinstance(each, str):
-            parts = [each, *each.split(",")]
+    for entry in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(entry, Path):
+            yield entry
+        elif isinstance(entry, str) and option.writes:
+            yield Path(entry)
+        elif isinstance(entry, str):
+            parts = [entry, *entry.split(",")]
             parts += [part.partition("=")[2] for part in parts]
             parts += [re.split(r"[:>]", part)[0] for part in parts]
             yield from (Path(part) for part in dict.fromkeys(parts) if part and exists(part))
@@ -78,7 +96,7 @@ def exists(text: str) -> bool:
         return False
 
 
-def check_dash(parameter: Parameter) -> None:
+def check_dash(parameter: PathParameter) -> None:
     """Refuse ``-`` for standard output where a command does not write to it."""
     if not parameter.option.dash:
         raise FaceDiffError(
@@ -86,7 +104,7 @@ def check_dash(parameter: Parameter) -> None:
         )
 
 
-def check_output(parameter: Parameter, path: Path) -> None:
+def check_output(parameter: PathParameter, path: Path) -> None:
     """Refuse a file or a folder that cannot be written."""
     kind = parameter.option.writes
     try:
@@ -99,7 +117,7 @@ def check_output(parameter: Parameter, path: Path) -> None:
         raise FaceDiffError(f"{parameter.shown} {reason}") from error
 
 
-def check_input(parameter: Parameter, path: Path) -> None:
+def check_input(parameter: PathParameter, path: Path) -> None:
     """Refuse a name that no file can have, and what is neither file nor folder; missing files are reported later."""
     try:
         mode = path.stat().st_mode
