@@ -212,7 +212,7 @@ class Animation:
             labels: names to show, the truth's first.
 
         Returns:
-            the page, which plays in a notebook and can be written with :meth:`Page.save`.
+            the page, which plays in a notebook and can be written with its ``save``.
 
         Raises:
             FaceDiffError: if the two cannot be compared, or the file cannot be written.

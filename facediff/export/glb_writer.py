@@ -49,7 +49,7 @@ class GlbWriter:
 
         Args:
             array: float32, uint16 or uint32.
-            target: what a graphics card uses it for, such as :data:`ARRAY_BUFFER`.
+            target: what a graphics card uses it for, such as ``ARRAY_BUFFER``.
             bounds: whether the least and the greatest numbers are written, as positions and times need.
         """
         array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))

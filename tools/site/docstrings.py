@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import importlib
+import importlib.util
 import inspect
 import re
 import sys
@@ -78,6 +79,9 @@ def unpack(function: griffe.Function) -> None:
             continue
         options = function.package[path.removeprefix("facediff.")]
         del function.parameters[packed.name]
+        if function.docstring:  # what it says of the parameter as a whole describes none that is shown
+            line = re.compile(rf"^ +{packed.name}: .*\n(?: {{8,}}.*\n)*", re.MULTILINE)
+            function.docstring.value = line.sub("", function.docstring.value)
         for option in options.all_members.values():
             if option.is_attribute and option.name not in function.parameters:
                 function.parameters.add(
@@ -98,7 +102,7 @@ def plain(obj: griffe.Object) -> str:
 
     def link(role: re.Match[str]) -> str:
         target = named(obj, role[1])
-        if target is None and (hasattr(builtins, role[1]) or role[1].split(".")[0] in sys.stdlib_module_names):
+        if target is None and (hasattr(builtins, role[1]) or is_elsewhere(obj, role[1])):
             return f"`{role[1]}`"
         if target is None:
             log.warning("%s: its docstring refers to %s, which does not exist", obj.path, role[1])
@@ -111,6 +115,15 @@ def plain(obj: griffe.Object) -> str:
         return f'<autoref identifier="{target}" optional>`{name[1]}`</autoref>' if target else name[0]
 
     return ROLE.sub(link, NAME.sub(link_if_there, text))
+
+
+def is_elsewhere(obj: griffe.Object, name: str) -> bool:
+    """Whether a name is of another package, or inherited from one, which griffe does not read."""
+    first = name.split(".")[0]
+    if first in sys.stdlib_module_names or ("." in name and importlib.util.find_spec(first) is not None):
+        return True
+    module = importlib.import_module(obj.module.path)
+    return any(hasattr(member, name) for member in vars(module).values() if inspect.isclass(member))
 
 
 def named(obj: griffe.Object, name: str) -> str | None:
