@@ -352,6 +352,8 @@ def periodic_bias(
     rows = torch.arange(start, start + frames, device=device)[:, None]
     distance = rows - torch.arange(start + frames, device=device)
     slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
+    # ALiBi's slopes (Press et al. 2022), with whole periods in place of frames: within one period no frame is nearer
+    # than another, as published.
     bias = -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
     return bias.masked_fill(distance < 0, -torch.inf)
 
@@ -440,6 +442,8 @@ class AutoregressiveNetwork(SpokenDecoder):
         # the width of the decoder, and the vertices are needed only once, at the end.
         first, last = self.motion_in, self.motion_out
         with torch.autocast(memory.device.type, enabled=False):
+            # In the weights' own precision: autocast would round the product to half precision, and it is applied in
+            # every frame to the result of the one before.
             turn = first.weight @ last.weight
             shift = first.weight @ last.bias + first.bias
         state, token, features = self.decoder.start(memory), style[:, None], []
@@ -467,6 +471,7 @@ def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts) -> i
     """
     weights.shape(name, 3)
     table = weights.get(name)[0].float()
+    # The published table repeats its rows, so the first row that equals row 0 is one period away.
     same = (table[1:] - table[0]).abs().amax(1) < 1e-6
     period = int(same.int().argmax()) + 1 if bool(same.any()) else len(table)
     expected = periodic_positions(len(table), table.shape[1], period)

@@ -363,6 +363,7 @@ def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEn
 def held(motion: BatchMotion, frames: Int[Tensor, " batch"], lengths: Int[Tensor, " batch"]) -> BatchMotion:
     """Motion of ``wanted`` frames of each clip: cut, or with its last frame held; zero on padding."""
     longest = int(lengths.max())
+    # An index past the last frame becomes the last frame, which holds it.
     places = torch.arange(longest, device=motion.device)[None].minimum(frames[:, None] - 1)
     rows = torch.arange(len(motion), device=motion.device)[:, None]
     return motion[rows, places] * frame_mask(lengths, longest)[..., None, None]

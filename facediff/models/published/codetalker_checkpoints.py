@@ -49,6 +49,7 @@ def convert_prior(weights: AuthorsWeights, prefix: str = "") -> dict[str, Any]:
         for name in weights.names(f"{own}{half}_transformer.net."):
             place, _, rest = name.removeprefix(f"{own}{half}_transformer.net.").partition(".")
             part, _, kind = rest.rpartition(".")
+            # The authors number attention (even) and feed-forward layers (odd) in one list.
             number = int(place) if place.isdecimal() else -1
             if part not in BLOCK_NAMES[number % 2] or number < 0:
                 raise FaceDiffError(

@@ -357,6 +357,7 @@ class AdaptedLayer(nn.Module):
         """
         normed, own = self.norms[0](x), self.self_attention
         frames = ProjectedKeysValues(*map(joined, own.keys_values(tokens), own.keys_values(normed)))
+        # Normalised before each part, and not after it as in FaceFormer's decoder.
         x = x + self.dropout(own.attend(own.queries(normed), frames, bias))
         heard, count = self.cross_attention, x.shape[1]
         # Each frame has the two tokens and one moment of speech to attend to, side by side.
@@ -470,6 +471,7 @@ def mutual_bias(
     """
     places = torch.arange(frames, device=device)
     distance = places[:, None] - places
+    # The authors flip a causal table to make the other half, which leaves later frames one nearer than earlier ones.
     distance = torch.where(distance < 0, -distance - 1, distance)
     slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
     return -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")

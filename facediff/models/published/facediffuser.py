@@ -224,6 +224,7 @@ class Posterior:
     def __init__(self, steps: int) -> None:
         self.betas = torch.tensor(cosine_betas(steps), dtype=torch.float64)
         self.signal = torch.cumprod(1.0 - self.betas, 0)
+        # At step 0 nothing is noised before, hence ᾱ of 1.
         before = torch.cat([self.signal.new_ones(1), self.signal[:-1]])
         self._clean = self.betas * before.sqrt() / (1.0 - self.signal)
         self._noisy = (1.0 - before) * (1.0 - self.betas).sqrt() / (1.0 - self.signal)

@@ -175,6 +175,7 @@ class AuthorsWeights:
         config = backbone_config(self, prefix, kind, facts.audio_config)
         old = ("weight_g", "parametrizations.weight.original0"), ("weight_v", "parametrizations.weight.original1")
         self.move_all(prefix, "audio_encoder.network.", old)
+        # Without the vector that SpecAugment puts on masked frames, the network is made without masking.
         if f"{prefix}masked_spec_embed" not in self:
             config.update(mask_time_prob=0.0, mask_feature_prob=0.0)
             settings["spec_augment"] = False
@@ -216,6 +217,7 @@ def backbone_config(
                 f"{{audio_config}}: its {name} is {quoted(config[name])}, and the tensors of {weights.source} say "
                 f"{value}; give the config.json of the very network"
             )
+    # What the shapes say comes last: a configuration may only add what no shape tells.
     config = {"do_stable_layer_norm": large, "mask_time_prob": 0.05, **config, **sizes, "model_type": kind}
     if "num_attention_heads" not in config:
         if hidden % 64:

@@ -145,6 +145,7 @@ class Voca(DirectModel):
         mask = frame_mask(frames, windows.shape[1])
         clips = mask.nonzero()[:, 0]
         valid = self.mixed(windows[mask], weights[clips])
+        # Back to (batch, frames, components) once the batch norm has been passed.
         padded = valid.new_zeros(*mask.shape, valid.shape[-1])
         padded[mask] = valid
         return padded
