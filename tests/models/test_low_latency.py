@@ -15,7 +15,7 @@ from facediff.models.inference import SpeechStream, WindowNoise
 from facediff.speech.voice_activity import QUICK_GATE, Openness, read_gate
 from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_STEPS, FramePlan, WindowPlan
 from tests.fakes.tiny import Tiny
-from tests.models.test_windows import CPU, Array, Echo, clip
+from tests.models.test_inference import CPU, Array, Echo, clip
 
 PLANS = [
     WindowPlan(0.04, 0.0, before=0.2, after=0.12, above=0, past=0.4),  # a frame each, after ten frames of the past
