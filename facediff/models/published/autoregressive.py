@@ -96,6 +96,8 @@ class AutoregressiveModel(PublishedModel):
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
         """Speech features: as many as frames, or two for each where speech comes in pairs."""
+        # At 25 frames a second two of the 50 speech steps belong to a frame and nothing is interpolated; at 30 the
+        # convolutions' output is interpolated before the Transformer, which then runs at the motion's rate.
         steps = 2 * frames if self.pairs else frames
         rule: StepRule = "features_cut" if self.pairs else "features"
         cached = batch.cached_features or ()
@@ -133,6 +135,8 @@ class OffsetModel(AutoregressiveModel):
         if self.teacher_forcing:
             predicted = self.network.teacher_forced(style, memory, truth)
         else:
+            # The published training: every frame follows generated ones and gradients pass through the whole chain. It
+            # is slow, but the network meets its own errors, as it will in inference.
             predicted = self.network.generate(style, memory, self.loop)
         return (predicted - truth).square(), frames
 
@@ -165,6 +169,8 @@ class ProjectedAttention(nn.Module):
     def __init__(self, dim: int, num_heads: int, dropout: float) -> None:
         super().__init__()
         self.num_heads, self.dropout = num_heads, dropout
+        # PyTorch initialises the stacked map as one matrix of 3·dim rows, which gives smaller weights than three maps
+        # of their own would get; training from scratch should start where the published training did.
         self.project = nn.Linear(dim, 3 * dim)
         self.out = nn.Linear(dim, dim)
         nn.init.xavier_uniform_(self.project.weight)
@@ -230,6 +236,8 @@ class DecoderLayer(nn.Module):
             past: keys and values of all frames that they may see, themselves included.
             bias: added to the attention's scores.
         """
+        # Post-norm with a ReLU, the defaults of torch.nn.TransformerDecoderLayer when these methods were published; the
+        # released weights do not fit a pre-norm layer.
         heard = self.self_attention.attend(self.self_attention.queries(x), past, bias)
         x = self.norms[0](x + self.dropout(heard))
         heard = self.cross_attention.attend_own(self.cross_attention.queries(x), speech)
@@ -279,6 +287,8 @@ class PeriodicDecoder(nn.Module):
         frames = tokens.shape[1]
         x, bias = self.dropout(tokens + self.positions(frames)), self.bias(frames)
         for layer in self.layers:
+            # A prefix of the frames hears a prefix of the speech: the literal loop decodes 1, 2, 3 … frames of the same
+            # clip.
             speech = layer.cross_attention.keys_values(memory[:, : frames * self.steps])  # type: ignore[union-attr, operator]
             x = layer(x, speech, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
         return x
@@ -308,6 +318,8 @@ class Continuation:
     def step(self, token: Float[Tensor, "batch 1 dim"]) -> Float[Tensor, "batch 1 dim"]:
         """The next frame; its position is added to the token here."""
         decoder, at, steps = self.decoder, self.frame, self.decoder.steps
+        # Masks are causal and a frame's row of the bias depends on its own number only, so that what earlier frames
+        # computed stays exact; one frame then costs one token and not all tokens so far.
         x, bias = decoder.dropout(token + self._positions[at]), decoder.bias(1, at)
         for number, layer in enumerate(decoder.layers):
             past = self._with(number, layer.self_attention.keys_values(x))  # type: ignore[union-attr, operator]
@@ -323,6 +335,8 @@ class Continuation:
             keys.append(new.key)
             values.append(new.value)
             return ProjectedKeysValues(torch.cat(keys, 2), torch.cat(values, 2))
+        # Room for all frames is taken once. Concatenating in every frame would copy all earlier keys and values again,
+        # which for T frames is work of the order T².
         if self._kept is None:
             batch, heads, _, width = new.key.shape
             self._kept = [
@@ -351,6 +365,8 @@ def periodic_bias(
     """−2^(−8(h+1)/heads)·⌊(i − j)/period⌋ for head h, frame i and position j ≤ i; −∞ for j > i."""
     rows = torch.arange(start, start + frames, device=device)[:, None]
     distance = rows - torch.arange(start + frames, device=device)
+    # ALiBi's slopes (Press et al. 2022) on the distance in whole periods, as in FaceFormer, so that the frames of one
+    # period count alike. Added to the scaled scores, as PyTorch does with a float mask.
     slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
     # ALiBi's slopes (Press et al. 2022), with whole periods in place of frames: within one period no frame is nearer
     # than another, as published.
@@ -383,6 +399,7 @@ class SpokenDecoder(nn.Module):
         self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor
     ) -> Float[Tensor, "batch frames dim"]:
         """The decoder's result for every frame from motion (B, T, 3V) of the frame before it, zero before the first."""
+        # Shifted by one frame: a frame must not see the motion that it is to predict.
         before = F.pad(motion, (0, 0, 1, 0))[:, :-1]
         features: Tensor = self.decoder(self.motion_in(before) + style[:, None], memory)
         return features
@@ -435,6 +452,8 @@ class AutoregressiveNetwork(SpokenDecoder):
             motion = self.motion_out(self.decoder(tokens, memory))
             if tokens.shape[1] == frames:
                 return motion
+            # Only the newest frame is fed back. The frames before it are computed again from the same tokens and come
+            # out the same, as the mask is causal.
             tokens = torch.cat([tokens, self.motion_in(motion[:, -1:]) + style[:, None]], 1)
 
     def _cached(self, style: Tensor, memory: Tensor, frames: int) -> Tensor:
@@ -472,6 +491,7 @@ def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts) -> i
     weights.shape(name, 3)
     table = weights.get(name)[0].float()
     # The published table repeats its rows, so the first row that equals row 0 is one period away.
+    # The period is no entry of the checkpoint, but the first row that repeats row 0 tells it.
     same = (table[1:] - table[0]).abs().amax(1) < 1e-6
     period = int(same.int().argmax()) + 1 if bool(same.any()) else len(table)
     expected = periodic_positions(len(table), table.shape[1], period)

@@ -138,6 +138,9 @@ class CodeTalker(AutoregressiveModel):
         self.commitment, self.quantisation_weight = commitment, quantisation_weight
         self.feature_weight = feature_weight
         # The project's two data sets differ in these.
+        # VOCASET's predictor has 6 layers and 16 tokens of 64 channels a frame, BIWI's 12 layers and 8 tokens of 128;
+        # the product is 1024 both times. BIWI's prior alone has linear maps around its tokens, and no bias in its last
+        # map.
         self.decoder_options["num_layers"] = num_layers or (12 if self.pairs else 6)
         tokens = tokens or (8 if self.pairs else 16)
         token_maps = self.pairs if token_maps is None else token_maps
@@ -163,6 +166,8 @@ class CodeTalker(AutoregressiveModel):
             self.windows = type(self.windows)(above=math.inf)
             self.unseen_identity = "style_only"  # whoever it is, the same motion is reconstructed
             return
+        # The second stage speaks a language that is fixed: were the prior trained along, the codes that are its targets
+        # would move with the prediction.
         self.prior.requires_grad_(False)
         self.network = Predictor(
             audio_width=self.audio_width,
@@ -277,6 +282,9 @@ class CodeTalker(AutoregressiveModel):
         tokens = self.prior.encode_clips(truth, frames)
         codes = self.prior.quantise(tokens)
         error = masked_mean((self.prior.decode_clips(codes.values, frames) - truth).abs(), frames)
+        # The two halves of the VQ-VAE objective (van den Oord et al. 2017, eq. 3). Each stops the other's gradient:
+        # without it a token and its code would run towards each other at one rate, and the table, which many clips
+        # share, would follow single clips.
         committed = masked_mean((codes.chosen.detach() - tokens).square(), frames)
         moved = masked_mean((codes.chosen - tokens.detach()).square(), frames)
         quantisation = self.commitment * committed + moved
@@ -298,10 +306,14 @@ class CodeTalker(AutoregressiveModel):
         if self.history == "own":
             before = torch.zeros_like(truth)
             with torch.no_grad():
+                # A random number of passes, so that the predictor meets the face at rest as well as its own motion. No
+                # gradient goes through them, since each would keep the graph of a decoding of all codes.
                 for _ in range(int(torch.randint(3, (), generator=generator, device=truth.device))):
                     before = self.motion_of(self.network.in_parallel(style, memory, before), frames)
         features = self.network.in_parallel(style, memory, before)
         with torch.no_grad():
+            # The target of the features is the code itself, not the token that it replaced: what is decoded later are
+            # codes.
             true_codes = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
         error = masked_mean((self.motion_of(features, frames) - truth).square(), frames)
         distance = masked_mean((features - true_codes).square(), frames)
@@ -454,6 +466,7 @@ class Predictor(SpokenDecoder):
         dim = int(decoder["dim"])
         self.out = nn.Linear(dim, width, bias=False)
         self.style = SpeakerTable(n_identities, dim, "embedding")
+        # Training starts from one code for all frames, the one nearest to zero, and not from random faces.
         nn.init.zeros_(self.out.weight)
 
     def in_parallel(

@@ -132,6 +132,8 @@ class DiffSpeaker(DiffusionModel):
         self.loss_mean, self.unknown_speaker = loss_mean, unknown_speaker
         self.plan_long_speech(long_speech)
         # The share of the clean motion's variance that is left after each step, in single precision as published.
+        # Scaled-linear variances from 0.00085 to 0.012, the latent-diffusion schedule that the authors' configuration
+        # names.
         self.signal = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, TRAINING_STEPS) ** 2, 0)
         self.network = DiffSpeakerNetwork(
             audio_width=self.audio_width,
@@ -184,6 +186,7 @@ class DiffSpeaker(DiffusionModel):
         """Of the first identity, or of all, as ``unknown_speaker`` says."""
         if self.unknown_speaker == "mean":
             return super().unknown_weights()
+        # The published test takes the row of identity 0 for a subject that was not trained on.
         return torch.eye(len(self.identities))[0]
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
@@ -223,6 +226,8 @@ class DiffSpeaker(DiffusionModel):
         if self.loss_mean == "frames":
             position, velocity = masked_mean(error.square(), frames), masked_mean(change.square(), frames - 1)
         else:
+            # Published: the mean over all entries, padding included, in which errors are zero. A short clip next to a
+            # long one counts less; loss_mean=frames removes that.
             position, velocity = error.square().mean(), change.square().sum() / max(1, change.numel())
         return {"reconstruction": position, "velocity": velocity, "loss": position + velocity}
 
@@ -295,6 +300,7 @@ def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
     """The mean of each frame and its two neighbours; a clip's first and last frame stay as they are."""
     if motion.shape[1] < 3:
         return motion
+    # Published for VOCASET alone, and of the result only: training and the sampler do not see it.
     mean = (motion[:, :-2] + motion[:, 1:-1] + motion[:, 2:]) / 3
     inner = frame_mask(frames - 2, motion.shape[1] - 2)[..., None, None]
     return torch.cat([motion[:, :1], torch.where(inner, mean, motion[:, 1:-1]), motion[:, -1:]], 1)
@@ -355,6 +361,8 @@ class AdaptedLayer(nn.Module):
             speech: keys and values of the frames' own moments of the speech.
             bias: added to the scores of the tokens and the frames.
         """
+        # Pre-norm with GELU, unlike FaceFormer's layer. The two tokens join keys and values as they are, before any
+        # norm, and get no query: nothing reads a result of theirs.
         normed, own = self.norms[0](x), self.self_attention
         frames = ProjectedKeysValues(*map(joined, own.keys_values(tokens), own.keys_values(normed)))
         # Normalised before each part, and not after it as in FaceFormer's decoder.
@@ -438,6 +446,7 @@ class DiffSpeakerNetwork(nn.Module):
         frames = memory.shape[1]
         speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
         positions = periodic_positions(frames, self.dim, self.period, device=memory.device)
+        # Two columns of zeros in front: the speaker and the step are equally near to every frame.
         bias = F.pad(mutual_bias(frames, self.num_heads, self.period, device=memory.device), (2, 0))
         if valid is not None:
             bias = bias.masked_fill(~F.pad(valid, (2, 0), value=True)[:, None, None], -torch.inf)
@@ -459,6 +468,8 @@ def step_sinusoids(step: Int[Tensor, " batch"], dim: int) -> Float[Tensor, "batc
     """cos(n·w_k), then sin(n·w_k), w_k = 10000^(−k/(dim/2)), of the step n."""
     exponents = -math.log(10_000.0) * torch.arange(dim // 2, device=step.device).float() / (dim // 2)
     angle = step[:, None].float() * exponents.exp()
+    # Cosines first, as diffusers' flip_sin_to_cos does, with which the authors trained; swapped halves are an error
+    # that no shape check finds.
     return torch.cat([angle.cos(), angle.sin()], 1)
 
 
@@ -548,6 +559,7 @@ class SpeakerMotion(nn.Module):
 
 def smoothed_whole(motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames vertices 3"]:
     """As :func:`smoothed`, of clips without padding and of any length."""
+    # By indices and not by slices: a graph takes clips of any length, and slices of one or two frames would be empty.
     places, last = torch.arange(motion.shape[1]), motion.shape[1] - 1
     before, after = motion[:, (places - 1).clamp_min(0)], motion[:, (places + 1).clamp_max(last)]
     inner = ((places > 0) & (places < last))[:, None, None]

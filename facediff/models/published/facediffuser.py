@@ -92,6 +92,7 @@ class FaceDiffuser(DiffusionModel):
             raise ArgumentError({"skip_steps": skip_steps, "diffusion_steps": self.steps}, "no step would be left")
         self.skip_steps, self.noised = skip_steps, noised
         self.encode_speech, self.sampling_space = encode_speech, sampling_space
+        # 500 steps on BIWI, 1000 elsewhere; a checkpoint tells it by the width of its one-hot step.
         self.posterior = Posterior(self.steps)
         self.network = FaceDiffuserNetwork(
             audio_width=2 * self.audio_width,
@@ -131,6 +132,8 @@ class FaceDiffuser(DiffusionModel):
         counts = []
         for samples, true_frames in zip(batch.audio_lengths.tolist(), batch.frame_lengths.tolist(), strict=True):
             own = (
+                # In double precision as published: 36 480 samples at 25 frames a second give one frame less than exact
+                # arithmetic.
                 true_frames if int(samples / SAMPLE_RATE * self.frame_rate) >= true_frames else self.frames_of(samples)
             )
             counts.append(min(own, self.steps_of(samples) // 2) if self.pairs else own)
@@ -159,11 +162,14 @@ class FaceDiffuser(DiffusionModel):
         frames = self.trained_frames(batch)
         longest = int(frames.max())
         rest = self.rest(batch.template)
+        # Published: absolute vertices are noised, the template included. The same template is added to the network's
+        # output, which therefore learns offsets in either case.
         clean = (batch.motion * self.scale).flatten(2)[:, :longest] + rest
         noisy = self.posterior.add_noise(clean, noise[:, :longest], step)
         network = self.network
         audio = network.audio_map(self.hear(batch, frames))
         hidden = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
+        # δ = 1 as published. Motion in raw units never has errors of that size, so that this is half the squared error.
         error = F.huber_loss(network.motion_out(hidden) + rest, clean, reduction="none")
         return masked_mean(error, frames)
 
@@ -195,11 +201,15 @@ class FaceDiffuser(DiffusionModel):
             state = state * posterior.noise_share(last)
         hidden = speech
         for step in progress(range(last, -1, -1)) if progress is not None else range(last, -1, -1):
+            # The published code runs HuBERT again in each of up to 1000 steps. In evaluation it gives the same result;
+            # the option is there to measure what that costs.
             if self.encode_speech == "every_step" and step < last:
                 speech = network.audio_map(self.hear(batch, frames))
             steps = torch.full((len(batch),), step, device=state.device)
             hidden = network(space.embed(state), steps, speech, style)
             if step:
+                # The posterior q(xₙ₋₁ | xₙ, x̂₀) (Ho et al. 2020, eq. 7) without clipping x̂₀, since vertices have no
+                # range as pixels have.
                 of_clean, of_noisy, of_noise = posterior.shares(step)
                 state = of_clean * space.clean(hidden) + of_noisy * state
                 state = state + of_noise * space.noise(noise(state))
@@ -226,6 +236,7 @@ class Posterior:
         self.signal = torch.cumprod(1.0 - self.betas, 0)
         # At step 0 nothing is noised before, hence ᾱ of 1.
         before = torch.cat([self.signal.new_ones(1), self.signal[:-1]])
+        # At step 0 these are 1, 0 and 0: the last prediction itself.
         self._clean = self.betas * before.sqrt() / (1.0 - self.signal)
         self._noisy = (1.0 - before) * (1.0 - self.betas).sqrt() / (1.0 - self.signal)
         self._deviation = (self.betas * (1.0 - before) / (1.0 - self.signal)).sqrt()
@@ -274,6 +285,7 @@ class FaceDiffuserNetwork(nn.Module):
         self.smooth = nn.Conv1d(1, 1, kernel_size=9, padding=4)
         self.step = nn.Linear(steps, dim)
         self.norm = nn.LayerNorm(3 * dim)
+        # Forward only, so that a frame's motion does not depend on later speech but for HuBERT's own attention.
         self.gru = nn.GRU(3 * dim, dim, num_layers, batch_first=True, dropout=dropout if num_layers > 1 else 0.0)
         self.style = SpeakerTable(n_identities, dim)
         self.motion_out = nn.Linear(dim, 3 * n_vertices)
@@ -296,6 +308,8 @@ class FaceDiffuserNetwork(nn.Module):
         # A one-hot step times a matrix is one of its columns.
         embedded = F.mish(self.step.weight.T[step] + self.step.bias)[:, None].expand(-1, frames, -1)
         joined = self.norm(torch.cat([audio, motion, embedded.to(motion.dtype)], -1))
+        # The style scales the recurrent states and is not added to them: as published, between the GRU and the last
+        # map.
         return all_states(self.gru, joined) * style[:, None]
 
 

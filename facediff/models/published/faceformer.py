@@ -47,6 +47,8 @@ class FaceFormer(OffsetModel):
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)
+        # The style is a map of the one-hot identity without a bias, hence a table of rows; its order is that of the
+        # training command line, which no checkpoint records.
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,

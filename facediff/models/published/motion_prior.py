@@ -37,6 +37,8 @@ class PriorBlock(nn.Module):
     def __init__(self, dim: int, num_heads: int, hidden_dim: int, scale: PriorScale) -> None:
         super().__init__()
         self.num_heads = num_heads
+        # Published: h^−0.5 of the whole width 1024, where a head has 128 channels. The scores are √8 times smaller than
+        # usual and the attention flatter; the released weights were trained with it.
         self.scale = (dim if scale == "width" else dim // num_heads) ** -0.5
         self.attention_norm, self.hidden_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.project = nn.Linear(dim, 3 * dim, bias=False)
@@ -49,6 +51,8 @@ class PriorBlock(nn.Module):
         """The frames, or only the last ``newest`` of them, which attend to all."""
         normed, dim = self.attention_norm(x), x.shape[-1]
         last = slice(0 if newest is None else x.shape[1] - newest, None)
+        # In generation only the newest frame is wanted of the last layer, so only its query is projected; keys and
+        # values are still those of all frames, since the normalisation before has changed all of them.
         if newest is None:
             query, key, value = self.project(normed).chunk(3, -1)
         else:
@@ -88,6 +92,7 @@ class Half(nn.Module):
     ) -> None:
         super().__init__()
         self.leak, self.positions = leak, positions
+        # Replicated edges, as published: zeros would pull a clip's first and last frames towards the face at rest.
         self.smooth = nn.Conv1d(dim, dim, kernel, padding=kernel // 2, padding_mode="replicate")
         self.embed = nn.Linear(dim, dim)
         self.blocks = nn.ModuleList(PriorBlock(dim, num_heads, hidden_dim, scale) for _ in range(num_layers))
@@ -101,6 +106,8 @@ class Half(nn.Module):
         # Instance normalisation: over a clip's frames, for each channel. Written as a layer norm over time, which takes
         # a single frame as well: zeros come of it, as they do of two equal frames.
         x = self.embed(F.layer_norm(smooth, (frames,)).transpose(1, 2))
+        # The published table is indexed by the batch's size, 1 at inference, so that every frame gets row 0. The
+        # released weights need this; options ask for true positions.
         count = 1 if self.positions == "constant" else frames
         x = x + periodic_positions(count, dim, count, device=x.device)
         for block in self.blocks[:-1]:
@@ -154,6 +161,8 @@ class MotionPrior(nn.Module):
         self.motion_in = nn.Linear(3 * n_vertices, dim)
         self.encoder = Half(dim=dim, **options)
         self.to_tokens = nn.Linear(dim, self.width) if token_maps else nn.Identity()
+        # Uniform in ±1/codes, as in the public VQ-VAE implementations that the released code follows: all codes start
+        # so close that every one of them has a chance of being the nearest.
         self.codebook = nn.Parameter(torch.empty(codes, token_dim).uniform_(-1 / codes, 1 / codes))
         self.from_tokens = nn.Linear(self.width, dim) if token_maps else nn.Identity()
         self.decoder = Half(dim=dim, **options)
@@ -168,9 +177,13 @@ class MotionPrior(nn.Module):
         with torch.autocast(tokens.device.type, enabled=False):  # codes that are near each other must stay apart
             tokens = tokens.float()
             flat = tokens.reshape(-1, self.codebook.shape[1])
+            # |z|² + |e|² − 2 z·e in the published order of terms: another order rounds differently, a near tie gives
+            # another code, and all frames that follow differ from it on.
             distances = flat.square().sum(1, keepdim=True) + self.codebook.square().sum(1) - 2 * flat @ self.codebook.T
             numbers = distances.argmin(1)
             chosen = self.codebook[numbers].view(tokens.shape)
+            # The straight-through estimator: the value is the code's, the gradient the token's, since the choice of a
+            # code has no derivative.
             values = tokens + (chosen - tokens).detach()
         return Codes(values, chosen, numbers.view(*tokens.shape[:2], self.tokens))
 

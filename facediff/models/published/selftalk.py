@@ -268,6 +268,8 @@ class SelfTalkNetwork(nn.Module):
         """Speech is what is decoded, and what is attended to; every frame sees all of it, and no frame its number."""
         tokens = self.audio_map(speech)
         padding = None if frames is None else padding_of(frames, tokens.shape[1])
+        # The published decoder attends to its own input in both attentions, without positions and without a causal
+        # mask: the order of frames reaches it through the features of speech alone.
         features = self.decoder(tokens, tokens, tgt_key_padding_mask=padding, memory_key_padding_mask=padding)
         moved: Tensor = self.motion_out(features)
         return moved
@@ -334,8 +336,10 @@ class LipReader(nn.Module):
         steps: Int[Tensor, " batch"],
     ) -> Read:
         """Read offsets of all vertices, each clip in so many steps."""
+        # Offsets without the template: a lip reader that saw faces would tell speakers by their lips' shape.
         mapped = self.lip_map(motion[..., self.columns])
         counts = zip(mapped, frames.tolist(), steps.tolist(), strict=True)
+        # Clip by clip, as ends are aligned: interpolated together, a short clip's last step would lie in its padding.
         parts = [interpolate_ends(clip[None, :count], length)[0] for clip, count, length in counts]
         x = nn.utils.rnn.pad_sequence(parts, batch_first=True)
         padding = padding_of(steps, x.shape[1])
@@ -384,6 +388,8 @@ class TextNetwork(nn.Module):
     @torch.no_grad()
     def forward(self, audio: Waves, audio_lengths: Lengths) -> Transcription:
         """Hear speech, each clip by itself."""
+        # ε = 1e-7, as transformers has had it since 4.26, which SelfTalk was trained with; FaceFormer's 1e-5 differs by
+        # 0.5 % for quiet speech.
         features, steps = by_length(standardise(audio, audio_lengths), audio_lengths, self._hidden)
         letters: Tensor = self.network.lm_head(features).argmax(-1)
         return Transcription(features, letters, steps, self.blank)

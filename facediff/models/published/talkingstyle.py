@@ -97,6 +97,7 @@ class TalkingStyle(OffsetModel):
     def mouth_columns(self) -> Int[Tensor, " columns"]:
         """The coordinates that the loss takes for the mouth's."""
         lips = self.assets.regions["lips"].to(self.device)
+        # Published: vertex numbers index the flattened coordinates, so that others than the mouth's are weighted.
         if self.mouth_loss == "flattened":
             return lips
         return (3 * lips[:, None] + torch.arange(3, device=self.device)).flatten()
@@ -128,6 +129,8 @@ class SpeakerStyle(nn.Module):
 
     def forward(self, weights: Float[Tensor, "batch identities"]) -> Float[Tensor, "batch dim"]:
         """Styles of speakers, or of mixtures of them."""
+        # The published attention sees each of the style's numbers as a sequence of length one, so that it never
+        # compares two of them; the released weights need that form.
         components = self.second(weights)[..., None]
         if self.over == "one_key":
             # The softmax over one key is 1: what is left of the attention are the maps of its values.

@@ -70,7 +70,8 @@ class Voca(DirectModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
-        self.windows = type(self.windows)(above=math.inf)  # a frame hears its own window alone
+        # Frames do not see one another, so that cutting long speech into windows would only cost overlap.
+        self.windows = type(self.windows)(above=math.inf)
         self.speech_window, self.velocity_weight, self.shapes = speech_window, velocity_weight, shapes
         self.rows_per_frame = rows_per_frame or max(1, round(PUBLISHED_RATE / self.frame_rate))
         self.network = VocaNetwork(
@@ -120,6 +121,7 @@ class Voca(DirectModel):
         step, rows = self.rows_per_frame, self.row_counts(heard.audio_lengths)
         cached = heard.cached_features or ()
         features = self.audio_encoder.at_rate(heard.audio, heard.audio_lengths, rows, self.frame_rate * step, *cached)
+        # Zeros of logits past the ends, as published, and not the logits of silence.
         before, most = self.speech_window // 2, int(frames.max()) if not exporting() else features.shape[1] // step
         # A graph has as many rows for each frame, of which the last ones may not be valid; they are zero.
         missing = (most - 1) * step - features.shape[1] if not exporting() else -step
@@ -161,6 +163,8 @@ class Voca(DirectModel):
         if bool(((weights == 1).sum(1) == 1).all() and ((weights == 0).sum(1) == weights.shape[1] - 1).all()):
             coefficients: Tensor = self.network(windows, weights)
             return coefficients
+        # The network is not linear in the speaker: mixing one-hot vectors at its input would be another speaker
+        # altogether. So every speaker who takes part is computed and the results are mixed.
         speakers = torch.eye(weights.shape[1], device=weights.device, dtype=weights.dtype)
         used = weights.any(0).nonzero().flatten().tolist()
         parts = [weights[:, k, None] * self.network(windows, speakers[k].expand(len(windows), -1)) for k in used]
@@ -231,6 +235,8 @@ class VocaNetwork(nn.Module):
         components: int,
     ) -> None:
         super().__init__()
+        # One mean and one variance over all 16 × 29 numbers of a window, as TensorFlow's batch norm has it for an image
+        # of one channel; ε 1e-5, where TensorFlow's default is 1e-3.
         self.norm = nn.BatchNorm1d(1, eps=1e-5, momentum=0.1)
         widths = [audio_width, *channels]
         self.convolutions = nn.ModuleList(
@@ -273,6 +279,8 @@ def padded_same(x: Float[Tensor, "*channels rows"], taps: int) -> Float[Tensor, 
     tensor([1., 1., 1., 1., 0.])
     """
     rows = x.shape[-1]
+    # ⌈rows / 2⌉ results must come out. An odd zero goes behind; PyTorch's symmetric padding would put it in front and
+    # shift all 16 rows by one.
     missing = max(0, (-(-rows // 2) - 1) * 2 + taps - rows)
     return F.pad(x, (missing // 2, missing - missing // 2))
 
