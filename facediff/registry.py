@@ -299,6 +299,9 @@ export_format = Kind(
     "a file format that animations are written in",
     aliases=False,
 )
+puppet_voice = Kind(
+    "puppet_voice", "facediff.synthetic.voices", "speaks the sentences of the built-in corpus", aliases=False
+)
 receiver = Kind(
     "receiver",
     "facediff.live.receivers",
@@ -323,7 +326,10 @@ COMPONENTS: dict[str, Kind] = {
 
 KINDS: dict[str, Kind] = {
     **COMPONENTS,
-    **{kind.kind: kind for kind in (model, corpus, metric, augmentation, voice_gate, acting, export_format, receiver)},
+    **{
+        kind.kind: kind
+        for kind in (model, corpus, metric, augmentation, voice_gate, acting, puppet_voice, export_format, receiver)
+    },
 }
 """Everything that can be chosen by name."""
 

@@ -34,6 +34,7 @@ ADDED = {
     ("augmentation", "reversed"),
     ("voice_gate", "above_level"),
     ("acting", "raised_brows"),
+    ("puppet_voice", "hummer"),
     ("export_format", "bounds"),
     ("receiver", "counter"),
 }

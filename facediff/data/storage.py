@@ -11,11 +11,14 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_stretch
-from facediff.utils.arrays import ArrayStore, in_range, open_vertices
-from facediff.utils.limits import COORDINATE, quoted
+from facediff.utils.arrays import ArrayStore, in_range, open_array, open_vertices
+from facediff.utils.limits import COORDINATE, LIMITS, quoted
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Folders with absolute vertices, in order of preference; the second is ProbTalk3D's."""
+
+WEIGHTS_FOLDER, RIGS_FOLDER = "weights_npy", "rigs"
+"""Where a corpus keeps motion as weights of shapes, and each speaker's shapes."""
 
 CHUNK = 8
 """Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
@@ -51,6 +54,9 @@ class ClipStorage(Protocol):
 class ClipFolder:
     """Clips as files of a folder, ``wav/<clip>.wav`` and ``vertices_npy/<clip>.npy``, which are memory-mapped.
 
+    Motion may also be kept as weights, ``weights_npy/<identity>_<sentence>.npy`` with ``rigs/<identity>.npy``; where a
+    clip has both, the vertices are read.
+
     Args:
         root: the folder.
         n_vertices: vertices of its meshes.
@@ -59,6 +65,7 @@ class ClipFolder:
     def __init__(self, root: Path, n_vertices: int) -> None:
         self.root = root
         self.n_vertices = n_vertices
+        self._rigs: dict[str, npt.NDArray[np.floating]] = {}
 
     def names(self) -> list[str]:
         """The clips that have both files, sorted."""
@@ -68,13 +75,27 @@ class ClipFolder:
                 raise FaceDiffError(
                     f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"
                 )
-            if motion_path(self.root, name).is_file():
+            if self._path(name).is_file():
                 names.append(name)
         return names
 
-    def open(self, name: str) -> VertexFile:
+    def _path(self, name: str) -> Path:
+        """The file that holds a clip's motion."""
+        vertices, weights = motion_path(self.root, name), self.root / WEIGHTS_FOLDER / f"{name}.npy"
+        return weights if weights.is_file() and not vertices.is_file() else vertices
+
+    def open(self, name: str) -> ClipMotion:
         """Map a clip's file into memory."""
-        return VertexFile(motion_path(self.root, name), self.n_vertices)
+        path = self._path(name)
+        if path.parent.name != WEIGHTS_FOLDER:
+            return VertexFile(path, self.n_vertices)
+        return WeightFile(path, self._rig(name.rpartition("_")[0]))
+
+    def _rig(self, identity: str) -> npt.NDArray[np.floating]:
+        """A speaker's shapes, which all of their clips share."""
+        if identity not in self._rigs:
+            self._rigs[identity] = open_vertices(self.root / RIGS_FOLDER / f"{identity}.npy", self.n_vertices)
+        return self._rigs[identity]
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
@@ -82,7 +103,7 @@ class ClipFolder:
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""
-        facts = motion_path(self.root, name).stat()
+        facts = self._path(name).stat()
         return facts.st_size, facts.st_mtime_ns
 
 
@@ -119,6 +140,45 @@ class VertexFile:
                 np.copyto(chunk, stored[first : first + CHUNK], casting="same_kind")
             refuse_out_of_range(chunk, picks[first : first + CHUNK], self.path)
             chunk -= template
+        return motion
+
+
+class WeightFile:
+    """Motion of a clip as weights of a speaker's shapes, decoded to vertices frame by frame.
+
+    Args:
+        path: the ``.npy`` file of weights (T, K).
+        rig: the speaker's face at rest, followed by the displacements of the shapes at weight 1, (1 + K, V, 3).
+
+    Raises:
+        FaceDiffError: if the file is unreadable, or has weights of other shapes.
+    """
+
+    def __init__(self, path: Path, rig: npt.NDArray[np.floating]) -> None:
+        self.path = path
+        self.weights = open_array(path, kinds="f")
+        self.rig = rig
+        if self.weights.ndim != 2 or not len(self.weights) or self.weights.shape[1] != len(rig) - 1:
+            raise FaceDiffError(
+                f"{path}: has shape {self.weights.shape}; expected (frames, {len(rig) - 1}), the weights of the "
+                f"speaker's shapes in {RIGS_FOLDER}"
+            )
+        LIMITS.check("frames", len(self.weights), path)
+
+    @property
+    def frames(self) -> int:
+        """Frames in the file."""
+        return len(self.weights)
+
+    def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Offsets from the template of some frames."""
+        picks = within(picks, self.frames)
+        weights = np.asarray(self.weights[np.array(picks, np.intp)], np.float32)
+        shapes = np.asarray(self.rig[1:], np.float32).reshape(len(self.rig) - 1, -1)
+        motion = (weights @ shapes).reshape(len(weights), -1, 3)
+        motion += np.asarray(self.rig[0], np.float32)
+        refuse_out_of_range(motion, picks, self.path)
+        motion -= template
         return motion
 
 

@@ -150,7 +150,7 @@ def generate_clip(clip: SyntheticClip, seed: int = 0) -> tuple[NDArray[np.int16]
     samples[before : before + spoken.samples.size] = spoken.samples * (_PEAK / np.abs(spoken.samples).max())
     samples = samples[: frames * _SAMPLES_PER_FRAME]
     end = frames / FRAME_RATE
-    phonemes = _in_quiet(spoken.phonemes, before / SAMPLE_RATE, end)
+    phonemes = in_quiet(spoken.phonemes, before / SAMPLE_RATE, end)
     # The index of a speaker seeds the random part, so it must not depend on how many speakers are drawn.
     speakers = (*SPEAKERS, *drawn_names(MOST_DRAWN))
     random = np.random.default_rng([seed, speakers.index(clip.identity), clip.number])
@@ -160,7 +160,7 @@ def generate_clip(clip: SyntheticClip, seed: int = 0) -> tuple[NDArray[np.int16]
     return np.rint(samples * 32767.0).astype(np.int16), weights, phonemes
 
 
-def _in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) -> tuple[SpokenPhoneme, ...]:
+def in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) -> tuple[SpokenPhoneme, ...]:
     """Shift phonemes by the quiet before speech and fill up with pauses to the end of the clip."""
     moved = [SpokenPhoneme(p.start + before, min(p.end + before, end), p.ipa) for p in phonemes]
     moved = [p for p in moved if p.end > p.start]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -103,6 +104,36 @@ def through(knots: ArrayLike, values: ArrayLike, at: ArrayLike) -> Array:
         + t**2 * (3 - 2 * t) * y[piece + 1]
         + t**2 * (t - 1) * step[piece] * tangent[piece + 1]
     )
+
+
+def spline(knots: ArrayLike, values: ArrayLike) -> Callable[[ArrayLike], Array]:
+    """A natural cubic spline, which unlike :func:`through` has continuous curvature.
+
+    Knots (n,) rise; values (n, K). The function takes places of any shape and gives (..., K); outside the knots the end
+    values hold.
+    """
+    x, y = np.asarray(knots, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    step = np.diff(x)
+    slope = np.diff(y, axis=0) / step[:, None]
+    # The second derivatives at the knots: continuity of the first ones, and 0 at both ends.
+    system, right = np.eye(x.size), np.zeros_like(y)
+    for knot in range(1, x.size - 1):
+        system[knot, knot - 1 : knot + 2] = step[knot - 1], 2 * (step[knot - 1] + step[knot]), step[knot]
+        right[knot] = 6 * (slope[knot] - slope[knot - 1])
+    bend = np.linalg.solve(system, right)
+
+    def at(places: ArrayLike) -> Array:
+        inside = np.clip(np.asarray(places, dtype=np.float64), x[0], x[-1])
+        piece = np.clip(np.searchsorted(x, inside, side="right") - 1, 0, x.size - 2)
+        width, before = step[piece][..., None], (inside - x[piece])[..., None]
+        after = width - before
+        return np.asarray(
+            (bend[piece] * after**3 + bend[piece + 1] * before**3) / (6 * width)
+            + (y[piece] / width - bend[piece] * width / 6) * after
+            + (y[piece + 1] / width - bend[piece + 1] * width / 6) * before
+        )
+
+    return at
 
 
 def rise(values: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""What is chosen by name around a model: an augmentation, a voice gate, acting, and a receiver of live frames."""
+"""Chosen by name around a model: augmentation, voice gate, acting, synthesiser, and a receiver of live frames."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from facediff.data.augmentation import SpeechAugmentation
 from facediff.editing.acting import Acting, Performer
 from facediff.live import Address, LiveFrame, Performance, Receiver
 from facediff.speech.voice_activity import Listener, VoiceGate
+from facediff.synthetic.speech import SpokenPhoneme, Utterance
+from facediff.synthetic.voices import Delivery, Synthesiser
 
 
 class Reversed(SpeechAugmentation):
@@ -74,6 +76,24 @@ class _RaisedBrows(Performer):
     def finish(self, frames: int) -> npt.NDArray[np.float64]:
         """Brows, then lids and the angles of the head, which stay at rest."""
         return np.tile([self.brows, 0.0, 0.0, 0.0, 0.0], (frames, 1))
+
+
+class Hummer(Synthesiser):
+    """Hums an m for as long as a text has letters."""
+
+    install = "it is part of this package"
+
+    @classmethod
+    def voices(cls) -> list[str]:
+        """One voice."""
+        return ["plain"]
+
+    def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
+        """A tone of 120 Hz, a twentieth of a second for each letter."""
+        seconds = 0.05 * max(len(text), 2) / delivery.rate
+        times = np.arange(round(16_000 * seconds)) / 16_000
+        samples = 0.3 * np.sin(2 * np.pi * 120.0 * 2.0 ** (delivery.pitch / 12.0) * times)
+        return Utterance(samples.astype(np.float32), (SpokenPhoneme(0.0, seconds, "m"),))
 
 
 class Counter(Receiver):

@@ -1,0 +1,240 @@
+"""People who differ: smooth deformations of space that turn the average head into a person's, and their colours.
+
+A :class:`Face` is a function of points and not a table of vertices, so that a pose of the average head can be sent
+through it as well as the head at rest, and the rig moves in the person's own proportions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facediff.synthetic.geometry import Array, bump, rise
+from facediff.synthetic.head.layout import MOUTH_Y, lay_out
+from facediff.synthetic.head.mesh import QuadMesh
+from facediff.synthetic.head.parts import EYE_CENTRE, HAIR, SKIN, hairline
+from facediff.synthetic.head.surface import level_of
+
+HairStyle = Literal["short", "cropped", "bald", "bob", "long", "bun"]
+
+SKIN_TONES = {
+    "pale": (238, 200, 180),
+    "fair": (226, 178, 154),
+    "olive": (206, 158, 122),
+    "tan": (178, 124, 90),
+    "brown": (136, 90, 64),
+    "dark": (92, 60, 46),
+}
+HAIR_COLOURS = {
+    "black": (34, 28, 26),
+    "brown": HAIR,
+    "auburn": (112, 58, 36),
+    "blond": (186, 148, 92),
+    "grey": (150, 148, 146),
+    "white": (222, 220, 216),
+}
+EYE_COLOURS = {"blue": (96, 128, 150), "grey": (120, 130, 132), "green": (98, 122, 84), "brown": (98, 66, 42)}
+
+
+@dataclass(frozen=True)
+class Complexion:
+    """The colours of a person and how the hair is worn."""
+
+    skin: str = "fair"  # A name in SKIN_TONES
+    hair: str = "brown"  # A name in HAIR_COLOURS
+    eyes: str = "grey"  # A name in EYE_COLOURS
+    style: HairStyle = "short"
+
+
+@dataclass(frozen=True)
+class Face:
+    """How a head differs from the average one; every number is about -1 to 1, and 0 changes nothing.
+
+    The first three are what people of a group have in common, the others what is left to each.
+    """
+
+    sex: float = 0.0  # -1 as women's faces are on average, 1 as men's
+    age: float = 0.0  # Older: fuller lower face, thinner lips, longer nose and ears, deeper folds
+    weight: float = 0.0  # Fuller cheeks, neck and chin
+    width: float = 0.0  # Whole head wider
+    length: float = 0.0  # Lower face longer
+    depth: float = 0.0  # Back of the head fuller
+    jaw: float = 0.0  # Jaw wider at its angle
+    chin_width: float = 0.0
+    chin: float = 0.0  # Chin longer and further forward
+    neck: float = 0.0  # Neck thicker
+    nose_length: float = 0.0
+    nose_width: float = 0.0
+    nose_bridge: float = 0.0  # Bridge higher
+    nose_tip: float = 0.0  # Tip further forward
+    nose_up: float = 0.0  # Tip turned up
+    eye_size: float = 0.0
+    eye_gap: float = 0.0  # Eyes further apart
+    eye_tilt: float = 0.0  # Outer corners higher
+    brow_height: float = 0.0
+    brow_ridge: float = 0.0
+    brow_tilt: float = 0.0  # Outer ends of the brows higher
+    lips: float = 0.0  # Lips fuller
+    mouth_width: float = 0.0
+    mouth_forward: float = 0.0
+    cheekbones: float = 0.0
+    cheeks: float = 0.0
+    forehead: float = 0.0  # Forehead higher and rounder
+    ears: float = 0.0  # Ears larger and further from the head
+
+    def __call__(self, points: Array) -> Array:
+        """Where points (..., 3) of the average head lie in this person's, both in mm."""
+        moves = _moves(np.abs(points[..., 0]), points[..., 1], points[..., 2])
+        moved = np.sum([weight * moves[name] for name, weight in self.details().items()], axis=0)
+        side = np.sign(points[..., 0])
+        return np.asarray(points + moved * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=-1))
+
+    def details(self) -> dict[str, float]:
+        """The numbers after the first three, with what these add to them."""
+        own = {item.name: float(getattr(self, item.name)) for item in fields(self)}
+        groups = {name: own.pop(name) for name in _GROUPS}
+        for group, shares in _GROUPS.items():
+            for name, share in shares.items():
+                own[name] += groups[group] * share
+        return own
+
+
+# Directions of the differences after Farkas' tables (1994) for sex and after Farkas and others (J. Craniofac. Surg. 15,
+# 2004) for age: men's faces are longer and broader with a stronger jaw, brow ridge and nose and thinner lips; with age
+# the nose and the ears grow, the lips thin and the lower face fills.
+_GROUPS: dict[str, dict[str, float]] = {
+    "sex": {
+        **{"width": 0.35, "length": 0.4, "jaw": 0.7, "chin_width": 0.6, "chin": 0.4, "neck": 0.8, "nose_width": 0.35},
+        **{"nose_bridge": 0.4, "brow_ridge": 0.8, "brow_height": -0.5, "lips": -0.4, "eye_size": -0.3, "cheeks": -0.3},
+        **{"forehead": -0.4, "ears": 0.3},
+    },
+    "age": {
+        **{"nose_length": 0.5, "nose_up": -0.5, "lips": -0.6, "ears": 0.5, "cheeks": 0.2, "jaw": 0.2, "eye_size": -0.3},
+        **{"brow_height": -0.4, "eye_tilt": -0.3},
+    },
+    "weight": {"cheeks": 1.0, "neck": 0.8, "jaw": 0.5, "width": 0.3, "chin_width": 0.4, "cheekbones": -0.3},
+}
+
+
+def _moves(x: Array, y: Array, z: Array) -> dict[str, Array]:
+    """Displacement in mm of every point of the left half for each detail at 1."""
+    front = rise(z, 0.0, 50.0)
+    zero = np.zeros_like(x)
+
+    def move(dx: Array = zero, dy: Array = zero, dz: Array = zero) -> Array:
+        return np.stack(np.broadcast_arrays(dx, dy, dz), axis=-1)
+
+    below_nose = rise(y, -8.0, -92.0) * rise(y, -152.0, -107.0)
+    mouth = bump(x, y, (0, MOUTH_Y), (26, 14)) * front
+    tip = bump(x, y, (0, -13), (9, 9)) * rise(z, 78.0, 106.0)
+    nose = bump(x, y, (0, -12), (16, 15)) * front
+    # The eyeball must stay a ball: within its reach every move is one translation or one scale about its centre.
+    eye_x, eye_y, eye_z = x - EYE_CENTRE[0], y - EYE_CENTRE[1], z - EYE_CENTRE[2]
+    reach = np.sqrt(eye_x**2 + eye_y**2 + (0.7 * eye_z) ** 2)
+    eye = rise(reach, 34.0, 14.0)
+    brow = bump(x, y, (30, 44), (22, 9)) * front * rise(reach, 14.0, 20.0)
+    chin = bump(x, y, (0, -84), (20, 17)) * front
+    ear = rise(x, 66.0, 80.0) * bump(y, z, (6, -14), (30, 24))
+    return {
+        "width": move(0.06 * x * rise(y, -152.0, -60.0) * (1 - eye) + eye * 0.06 * EYE_CENTRE[0]),
+        "length": move(dy=-10.0 * below_nose),
+        "depth": move(dz=0.07 * np.minimum(z + 5.0, 0.0)),
+        "jaw": move(7.0 * bump(y, z, (-52, 14), (22, 34)) * rise(x, 8.0, 50.0)),
+        "chin_width": move(5.0 * bump(y, z, (-86, 74), (14, 25)) * rise(x, 0.0, 20.0) * rise(x, 75.0, 30.0)),
+        "chin": move(dy=-5.0 * chin, dz=5.0 * chin),
+        "neck": move(0.13 * x * rise(y, -72.0, -112.0), dz=0.10 * (z + 20.0) * rise(y, -90.0, -120.0)),
+        "nose_length": move(dy=-4.5 * nose),
+        "nose_width": move(0.30 * x * bump(x, y, (0, -18), (15, 10)) * front),
+        "nose_bridge": move(dz=4.0 * bump(x, y, (0, 16), (6, 14)) * front),
+        "nose_tip": move(dz=4.0 * tip),
+        "nose_up": move(dy=3.0 * tip, dz=-0.5 * tip),
+        "eye_size": move(0.10 * eye_x * eye, 0.10 * eye_y * eye, 0.10 * eye_z * eye),
+        "eye_gap": move(3.0 * rise(reach, 40.0, 14.0)),
+        "eye_tilt": move(dy=0.14 * eye_x * eye * rise(reach, 12.4, 15.0)),
+        "brow_height": move(dy=3.6 * brow),
+        "brow_ridge": move(dy=-0.8 * brow, dz=3.0 * bump(x, y, (24, 43), (20, 6)) * front * rise(reach, 14.0, 20.0)),
+        "brow_tilt": move(dy=0.15 * (x - 28.0) * brow),
+        "lips": move(dy=0.30 * (y - MOUTH_Y) * mouth, dz=1.6 * bump(x, y, (0, MOUTH_Y), (15, 9)) * front),
+        "mouth_width": move(0.16 * x * mouth),
+        "mouth_forward": move(dz=3.5 * bump(x, y, (0, MOUTH_Y), (26, 20)) * front),
+        "cheekbones": move(
+            3.5 * bump(y, z, (0, 46), (13, 22)) * rise(x, 25.0, 58.0),
+            dz=3.0 * bump(x, y, (46, 0), (13, 11)) * front * rise(reach, 14.0, 22.0),
+        ),
+        "cheeks": move(
+            6.0 * bump(y, z, (-34, 44), (20, 24)) * rise(x, 20.0, 55.0),
+            dz=4.0 * bump(x, y, (42, -34), (15, 18)) * front,
+        ),
+        "forehead": move(dy=0.06 * np.maximum(y - 50.0, 0.0), dz=4.5 * bump(x, y, (0, 78), (45, 22)) * front),
+        "ears": move(4.0 * ear, 0.12 * (y - 6.0) * ear, -2.0 * ear),
+    }
+
+
+# How hair is worn: how thick the shell is, as a share of short hair, and how far its lower edge hangs down, in mm.
+_STYLES: dict[HairStyle, tuple[float, float]] = {
+    "short": (1.0, 0.0),
+    "cropped": (0.35, 0.0),
+    "bald": (-0.35, 0.0),
+    "bob": (1.5, 62.0),
+    "long": (1.3, 118.0),
+    "bun": (0.75, 0.0),
+}
+
+
+def dressed(vertices: Array, mesh: QuadMesh, complexion: Complexion) -> Array:
+    """The head (V, 3) with its hair worn as a person wears it; ``vertices`` has the short hair of the average head."""
+    thickness, hanging = _STYLES[complexion.style]
+    points = vertices.copy()
+    layout = lay_out()
+    theta, level = layout.plane.T
+    inside = level - level_of(hairline(theta))
+    kept = np.unique(layout.quads[(inside > -16.0)[layout.quads].all(axis=1)])
+    below, shell = mesh.groups["skin"][kept], mesh.groups["hair"]
+    theta, inside = theta[kept], inside[kept]
+    for side in (slice(None), mesh.mirror):
+        skin, hair = (np.arange(len(vertices))[side][index] for index in (below, shell))
+        off = vertices[hair] - vertices[skin]
+        share = np.where(inside > -9.0, thickness, 1.0)[:, None]
+        points[hair] = vertices[skin] + (
+            off * share if thickness > 0 else np.minimum(np.abs(off), 3.0) * np.sign(off) * thickness
+        )
+        # Long hair falls from behind the ears; it stands off the neck, whose outline it does not follow.
+        fall = rise(theta, 1.15, 1.55) * rise(inside, 46.0, -6.0)
+        away = np.stack([np.sign(points[hair, 0]) * np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=1)
+        points[hair] += fall[:, None] * (away * min(hanging, 40.0) * 0.35 - np.array([0.0, hanging, 0.0]))
+        if complexion.style == "bun":
+            knot = bump(inside, theta, (120.0, np.pi), (26.0, 0.42))
+            points[hair] += knot[:, None] * away * 34.0
+    crown, hair_crown = mesh.groups["crown"], mesh.groups["hair_crown"]
+    points[hair_crown] = vertices[crown] + (12.0 * thickness if thickness > 0 else -3.0) * np.array([0.0, 1.0, 0.0])
+    return points
+
+
+def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
+    """The head's colours (V, 3) in a person's complexion."""
+    colours = mesh.colours.astype(np.float64)
+    tint = np.array(SKIN_TONES[complexion.skin]) / np.array(SKIN)
+    skin = mesh.both("skin", "crown", "mouth_far", "mouth_near", "lip_border", "eye_", "ear_", "nostril", "lid_")
+    hair_tint = np.array(HAIR_COLOURS[complexion.hair]) / np.array(HAIR)
+    layout = lay_out()
+    theta, level = layout.plane.T
+    scalp = 0.85 * rise(level - level_of(hairline(theta)), -7.0, 3.0)
+    under = mesh.groups["skin"]
+    for index in (under, mesh.mirror[under]):
+        # The darkened scalp takes the colour of the hair, and that of the skin where there is no hair.
+        scalp_colour = np.array(SKIN) if complexion.style == "bald" else 1.2 * np.array(HAIR) * hair_tint / tint
+        colours[index] += scalp[:, None] / 0.85 * (scalp_colour - colours[index])
+    colours[skin] *= tint
+    lips = mesh.both("lip_outer", "lip_crest", "lip_front", "lip_inner")
+    colours[lips] *= 0.45 + 0.55 * tint
+    for name in ("hair", "brow_"):
+        colours[mesh.both(name)] *= hair_tint
+    if complexion.style == "bald":  # the shell lies below the skin, whose colour it takes where they cross
+        colours[mesh.both("hair")] = np.array(SKIN) * tint
+    iris = np.array(EYE_COLOURS[complexion.eyes])
+    for name, shade in (("iris_rim", 0.7), ("iris_middle", 1.0), ("iris_inner", 0.62)):
+        colours[mesh.both(name)] = shade * iris
+    return np.asarray(np.clip(np.rint(colours), 0, 255), dtype=np.uint8)

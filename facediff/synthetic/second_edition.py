@@ -1,0 +1,334 @@
+"""Writing the second edition of the built-in corpus: heads with a rig, performances, and speech of several voices.
+
+The truth of a clip is kept as weights of ARKit's shapes with gaze and head next to them, and each speaker's rig once: a
+head is a hundred times as many numbers as its weights. ``facediff.data`` decodes them to vertices as it reads a clip.
+Clips that are validated or tested with have their vertices next to them, so that any program can score against them.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facediff.errors import FaceDiffError
+from facediff.synthetic.articulation import speech_sounds
+from facediff.synthetic.cast import CAST, KEPT_OUT_PEOPLE, SEEN, UNSEEN, drawn_names, member_of
+from facediff.synthetic.corpus import MANIFEST, in_quiet, write_ply
+from facediff.synthetic.further_speech import WORDS
+from facediff.synthetic.head.parts import AROUND_EYE, build_head
+from facediff.synthetic.head.people import Complexion, coloured, dressed
+from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
+from facediff.synthetic.motion import analyse
+from facediff.synthetic.performance import MOODS, FaceMotion, perform
+from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION, turn
+from facediff.synthetic.speech import SpokenPhoneme, Utterance
+from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.checksums import describe_files, same_sizes
+from facediff.utils.files import atomic_folder
+from facediff.utils.jobs import run_tasks
+from facediff.utils.plain_files import read_json, write_json, write_table
+from facediff.utils.workers import WorkerDied
+
+GENERATOR = "2.0"
+CORPUS = "facediff-puppet-2"
+FRAME_RATE = 25
+_QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
+_PEAK = 0.6
+_DRAWS = 7  # Performances of a test sentence of which the one of middle liveliness is taken
+_TRAIN_EACH, _REFERENCES_EACH, _TEST_EACH, _TEST_C_EACH = 32, 24, 10, 5
+
+
+@dataclass(frozen=True)
+class PerformedClip:
+    """One clip of the second edition.
+
+    Attributes:
+        identity: who speaks.
+        split: ``train``, ``val``, ``test_a``, ``test_b``, ``test_c``, or ``references`` for those of unseen speakers
+            that belong to no split.
+        number: of the sentence in its list, from 1.
+        text: what is said.
+        mood: a name in :data:`facediff.synthetic.performance.MOODS`.
+        voice: what speaks, where it is not the speaker's own voice.
+    """
+
+    identity: str
+    split: str
+    number: int
+    text: str
+    mood: str
+    voice: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Name of the sentence, such as ``t07``: training and reference sentences are e, those of test C c."""
+        letter = {"val": "v", "test_a": "t", "test_b": "t", "test_c": "c"}.get(self.split, "e")
+        return f"{letter}{self.number:02d}"
+
+    @property
+    def name(self) -> str:
+        """Name of the clip and stem of its files, such as ``F1_t07``."""
+        return f"{self.identity}_{self.sentence}"
+
+
+def performed_clips(drawn: int = 0) -> tuple[PerformedClip, ...]:
+    """All clips, speaker by speaker; moods take turns, so that every speaker has each of them equally often.
+
+    Every speaker says other sentences in training, so that no sentence can be known by heart. On test A and B all
+    speakers have :data:`TEST` sentences that nobody is trained on; on test C the voices are new instead of the faces.
+    """
+    plan: list[tuple[str, str, list[tuple[int, str]], str]] = []
+    for place, identity in enumerate(SEEN):
+        plan.append((identity, "train", turn(TRAIN, 11 * place, _TRAIN_EACH), ""))
+        plan.append((identity, "val", turn(VALIDATION, place, 3), ""))
+        plan.append((identity, "test_a", turn(TEST, 3 * place, _TEST_EACH), ""))
+    for place, identity in enumerate(UNSEEN):
+        plan.append((identity, "references", turn(TRAIN, 17 * place, _REFERENCES_EACH), ""))
+        plan.append((identity, "test_b", turn(TEST, 4 * place + 1, _TEST_EACH), ""))
+    for identity, voice in zip(SEEN, _voices_of_test_c(), strict=False):
+        texts = turn(GERMAN if voice.startswith("espeak:de") else TEST[-6:], 0, _TEST_C_EACH)
+        plan.append((identity, "test_c", texts, voice))
+    plan += [(name, "train", turn(TRAIN, 5 * place, 24), "") for place, name in enumerate(drawn_names(drawn))]
+    moods = tuple(MOODS)
+    return tuple(
+        PerformedClip(identity, split, number, text, moods[(number + place) % len(moods)], voice)
+        for place, (identity, split, texts, voice) in enumerate(plan)
+        for number, text in texts
+    )
+
+
+def _voices_of_test_c() -> tuple[str, ...]:
+    """Voices kept out of training: a variant of espeak-ng, a language, and one of people where it is installed."""
+    people = [name for name in KEPT_OUT_PEOPLE if name.partition(":")[2] in Flite.voices()]
+    return ("espeak:en+m8", "espeak:de+f3", *people)
+
+
+def people_voices() -> tuple[str, ...]:
+    """Voices made from recordings of people that are installed and may be trained on."""
+    voices = installed_voices()
+    names = [f"{program}:{voice}" for program in ("flite", "festival") for voice in voices.get(program, [])]
+    # kal is there twice, and as diphones in Festival; one of them is enough.
+    return tuple(name for name in names if name not in KEPT_OUT_PEOPLE and not name.endswith(("kal", "kal_diphone")))
+
+
+def generate_second(
+    root: Path,
+    *,
+    seed: int = 0,
+    drawn: int = 0,
+    people: Sequence[str] = (),
+    workers: int | None = None,
+    scheduler: str | None = "",
+    progress: bool = True,
+    only: Sequence[str] | None = None,
+) -> None:
+    """Write the second edition, unless the folder holds it already; it appears whole or not at all.
+
+    Args:
+        root: the folder to make.
+        seed: seed of what is left to chance; the same seed gives the same bytes.
+        drawn: how many drawn speakers say training sentences, besides the cast of ten.
+        people: voices of people that every second drawn speaker speaks with; see :func:`people_voices`.
+        workers: how many processes share the work.
+        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
+        progress: whether to show a progress bar.
+        only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
+
+    Raises:
+        FaceDiffError: if the folder holds something else, cannot be written, or a synthesiser is missing.
+    """
+    clips = [clip for clip in performed_clips(drawn) if only is None or clip.name in only]
+    if only is None and is_second_complete(root, seed=seed, drawn=drawn, people=people):
+        return
+    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != CORPUS:
+        raise FaceDiffError(f"{root}: is not empty and holds no second edition of the built-in corpus; choose another")
+    with atomic_folder(root, replace=True) as folder:
+        _write_common(folder, clips, people)
+        tasks = run_tasks(
+            partial(_write_clip, folder, seed=seed, people=tuple(people)),
+            clips,
+            workers=workers or 1,
+            scheduler=scheduler,
+            writes=folder,
+            progress="Puppet corpus" if progress else "",
+        )
+        frames = 0
+        with closing(tasks):
+            for clip, count in tasks:
+                if isinstance(count, WorkerDied):
+                    raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
+                frames += count
+        counts = {"subjects": len(CAST) + drawn, "vertices": len(build_head().vertices), "frames": frames}
+        facts = _facts(seed, len(clips), drawn, people)
+        write_json(folder / MANIFEST, {**facts, **counts, "files": describe_files(folder)})
+
+
+def is_second_complete(root: Path, *, seed: int = 0, drawn: int = 0, people: Sequence[str] = ()) -> bool:
+    """Whether a folder holds the whole corpus of this version, seed and voices; compares sizes, not contents."""
+    manifest = read_json(Path(root) / MANIFEST) or {}
+    facts, files = _facts(seed, len(performed_clips(drawn)), drawn, people), manifest.get("files")
+    same = all(manifest.get(key) == value for key, value in facts.items())
+    return same and isinstance(files, dict) and same_sizes(Path(root), files)
+
+
+def _facts(seed: int, count: int, drawn: int, people: Sequence[str]) -> dict[str, object]:
+    facts = {"corpus": CORPUS, "format": 1, "generator": GENERATOR, "seed": seed, "clips": count, "drawn": drawn}
+    return {**facts, "people": list(people)}
+
+
+@lru_cache(maxsize=4)
+def rig_of(identity: str) -> NDArray[np.float32]:
+    """A speaker's head at rest and the displacements of :data:`SHAPES`, in metres, (55, V, 3).
+
+    The average head's poses are sent through the speaker's deformation of space, so that lips that meet on the one meet
+    on the other.
+    """
+    member, mesh, shapes = member_of(identity), build_head(), head_shapes()
+    rest = member.face(mesh.vertices)
+    rig = np.zeros((1 + len(SHAPES), *rest.shape), np.float32)
+    rig[0] = dressed(rest, mesh, member.complexion) / 1000.0
+    for number, name in enumerate(SHAPES, start=1):
+        moved = np.flatnonzero(np.abs(shapes[name]).max(axis=1) > 1e-9)
+        posed = member.face(mesh.vertices[moved] + shapes[name][moved])
+        rig[number, moved] = (posed - rest[moved]) / 1000.0
+    return rig
+
+
+def vertex_count() -> int:
+    """Vertices of a head."""
+    return len(build_head().vertices)
+
+
+def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] = ()) -> NDArray[np.float32]:
+    """Five to eight random words by one of some speakers, (S,) at 16 kHz; the same number gives the same speech."""
+    random = np.random.default_rng([number, len(WORDS), 2])
+    text = " ".join(random.choice(WORDS, size=random.integers(5, 9)))
+    identity = identities[int(random.integers(len(identities)))]
+    return speak_clip(PerformedClip(identity, "train", 1, text, str(random.choice([*MOODS]))), people).samples
+
+
+def region_vertices() -> dict[str, NDArray[np.int64]]:
+    """Vertices of the regions ``lve`` (both lips) and ``fdd`` (forehead, brows and round the eyes)."""
+    mesh = build_head()
+    x, y, z = mesh.vertices.T
+    skin = np.zeros(len(x), dtype=bool)
+    skin[mesh.both("skin")] = True
+    forehead = np.flatnonzero(skin & (y > 32.0) & (y < 80.0) & (np.abs(x) < 60.0) & (z > 35.0))
+    eyes = mesh.both(*AROUND_EYE, "lid_edge", "brow_")
+    return {
+        "lve": mesh.both("lip_border", "lip_outer", "lip_crest", "lip_front", "lip_inner"),
+        "fdd": np.union1d(forehead, eyes),
+    }
+
+
+def speak_clip(clip: PerformedClip, people: Sequence[str] = ()) -> Utterance:
+    """What a clip sounds like: the speaker's voice, or the clip's own, in the clip's mood, with quiet at both ends.
+
+    The waveform lasts a whole number of frames at 25 a second.
+    """
+    member, mood = member_of(clip.identity, people), MOODS[clip.mood]
+    delivery = Delivery(member.rate * mood.rate, member.pitch + mood.pitch, member.pitch_range * mood.pitch_range)
+    spoken = open_voice(clip.voice or member.voice).speak(clip.text, delivery)
+    speech = spoken.samples * (_PEAK / max(float(np.abs(spoken.samples).max()), 1e-6))
+    speech = np.clip(coloured_speech(speech, mood.loudness, mood.brightness), -1.0, 1.0)
+    before, frame = round(_QUIET_BEFORE * SAMPLE_RATE), SAMPLE_RATE // FRAME_RATE
+    frames = round((before + len(speech) + round(_QUIET_AFTER * SAMPLE_RATE)) / frame)
+    samples = np.zeros(max(frames * frame, before + len(speech)), dtype=np.float32)
+    samples[before : before + len(speech)] = speech
+    return Utterance(samples[: frames * frame], in_quiet(spoken.phonemes, before / SAMPLE_RATE, frames / FRAME_RATE))
+
+
+def perform_clip(
+    clip: PerformedClip, spoken: Utterance, seed: int = 0, frame_rate: float = FRAME_RATE
+) -> tuple[FaceMotion, FaceMotion]:
+    """The motion of a clip, and another that its speaker could have made with the same speech.
+
+    Of several performances of a test sentence the one is taken whose upper face is of middle liveliness, so that the
+    truth of a few sentences is typical of all; the other is the first of those that are left.
+    """
+    member, sounds = member_of(clip.identity), speech_sounds(spoken.phonemes)
+    contours = analyse(spoken.samples, SAMPLE_RATE)
+    frames = round(len(spoken.samples) / SAMPLE_RATE * frame_rate)
+    everybody = (*CAST, *drawn_names(99))
+    key = [seed, everybody.index(clip.identity), *map(ord, clip.sentence)]
+    draws = _DRAWS if clip.split.startswith("test") else 1
+    performances = [
+        perform(sounds, contours, frames, frame_rate, member.habits, clip.mood, np.random.default_rng([*key, draw]))
+        for draw in range(draws)
+    ]
+    if draws == 1:
+        return performances[0], performances[0]
+    brows = [SHAPES.index(name) for name in SHAPES if name.startswith(("brow", "eyeBlink"))]
+    lively = [float(performance.weights[:, brows].std(axis=0).mean()) for performance in performances]
+    middle = int(np.argsort(lively)[draws // 2])
+    return performances[middle], performances[0 if middle else 1]
+
+
+def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str]) -> None:
+    """Write everything that is not a clip."""
+    for name in (
+        "wav",
+        "vertices_npy",
+        "weights_npy",
+        "gaze_npy",
+        "head_npy",
+        "another_weights_npy",
+        "rigs",
+        "phonemes",
+        "regions",
+    ):
+        (folder / name).mkdir()
+    mesh = build_head()
+    templates = {}
+    for identity in dict.fromkeys((*CAST, *(clip.identity for clip in clips))):
+        rig = rig_of(identity)
+        np.save(folder / "rigs" / f"{identity}.npy", rig)
+        templates[identity] = rig[0].astype(np.float64)
+    with (folder / "templates.pkl").open("wb") as stream:
+        pickle.dump(templates, stream, protocol=2)
+    mean = np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0
+    write_ply(folder / "PUPPET.ply", mean, mesh.faces, coloured(mesh, Complexion()))
+    for name, index in region_vertices().items():
+        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, index.tolist())) + "\n")
+    for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
+        pairs = zip(*(side.tolist() for side in sides), strict=True)
+        (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
+    write_table(folder / "shapes.csv", [["shape"], *([name] for name in SHAPES)])
+    table = [["clip", "subject", "sentence", "split", "mood", "voice", "text"]]
+    for clip in clips:
+        voice = clip.voice or member_of(clip.identity, people).voice
+        table.append([clip.name, clip.identity, clip.sentence, clip.split, clip.mood, voice, clip.text])
+    write_table(folder / "clips.csv", table)
+
+
+def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str]) -> int:
+    """Write sound, motion and phonemes of a clip and return its number of frames."""
+    import soundfile
+
+    spoken = speak_clip(clip, people)
+    performance, another = perform_clip(clip, spoken, seed)
+    soundfile.write(
+        folder / "wav" / f"{clip.name}.wav", np.rint(spoken.samples * 32767.0).astype(np.int16), SAMPLE_RATE
+    )
+    for name, track in (("weights", performance.weights), ("gaze", performance.gaze), ("head", performance.head)):
+        np.save(folder / f"{name}_npy" / f"{clip.name}.npy", track.astype(np.float32))
+    if clip.split.startswith(("test", "val")):
+        rig = rig_of(clip.identity)
+        vertices = rig[0] + np.einsum("tk,kvc->tvc", performance.weights.astype(np.float32), rig[1:])
+        np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
+    if clip.split.startswith("test"):
+        np.save(folder / "another_weights_npy" / f"{clip.name}.npy", another.weights.astype(np.float32))
+    write_table(folder / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *map(_row, spoken.phonemes)])
+    return len(performance.weights)
+
+
+def _row(phoneme: SpokenPhoneme) -> list[str]:
+    return [f"{phoneme.start:.4f}", f"{phoneme.end:.4f}", phoneme.ipa]

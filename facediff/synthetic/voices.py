@@ -1,0 +1,252 @@
+"""Synthesisers that speak for the built-in corpus, by name, such as ``espeak:en-us+f2`` or ``flite:slt``.
+
+espeak-ng comes with ``pip install "facediff[puppet]"`` and speaks a hundred languages by rule. flite and Festival are
+programs of their own (packages of the same names in Debian, Ubuntu, Fedora and Homebrew); their voices are made from
+recordings of people, so that what is trained on them knows more of people's voices. All of them print when each phoneme
+is spoken, which no recogniser has to guess. Where one is missing, its voices say how to install it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facediff.errors import FaceDiffError, choices
+from facediff.registry import puppet_voice
+from facediff.synthetic.speech import EspeakVoice, SpokenPhoneme, Utterance, speak
+from facediff.utils import SAMPLE_RATE
+
+_SECONDS = 120.0  # After which a synthesiser is taken to hang
+_SEMITONE = 2.0 ** (1.0 / 12.0)
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """How a voice says a sentence.
+
+    Attributes:
+        rate: speed as a factor.
+        pitch: semitones above the voice's own pitch.
+        pitch_range: range of the melody as a factor.
+    """
+
+    rate: float = 1.0
+    pitch: float = 0.0
+    pitch_range: float = 1.0
+
+
+class Synthesiser(ABC):
+    """A program that speaks, with one of its voices.
+
+    Subclass it and register the subclass as a ``puppet_voice`` to add a synthesiser.
+
+    Args:
+        voice: the name of one of its voices.
+    """
+
+    install: ClassVar[str]
+    """How to install the program, for an error."""
+
+    def __init__(self, voice: str) -> None:
+        self.voice = voice
+
+    @classmethod
+    @abstractmethod
+    def voices(cls) -> list[str]:
+        """Names of the voices that are installed; none where the program is missing."""
+
+    @abstractmethod
+    def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
+        """Speak a sentence; the same arguments give the same samples.
+
+        Raises:
+            FaceDiffError: if the program fails.
+        """
+
+
+def open_voice(name: str) -> Synthesiser:
+    """The voice of a name such as ``flite:slt``.
+
+    Raises:
+        FaceDiffError: if there is no such synthesiser, it is not installed, or it lacks the voice.
+    """
+    program, colon, voice = name.partition(":")
+    synthesiser = puppet_voice.get(program)
+    if not colon or not voice:
+        raise FaceDiffError(f'voice "{name}": names no voice; expected SYNTHESISER:VOICE, such as flite:slt')
+    installed = synthesiser.voices()
+    if not installed:
+        raise FaceDiffError(f'voice "{name}": {program} is not installed; {synthesiser.install}')
+    if voice.split("+")[0] not in installed:
+        raise FaceDiffError(f'voice "{name}": {program} has no voice "{voice}"; {choices(voice, installed)}')
+    return synthesiser(voice)
+
+
+def installed_voices() -> dict[str, list[str]]:
+    """Voices by synthesiser, where there are any."""
+    return {name: voices for name in puppet_voice.names() if (voices := puppet_voice.get(name).voices())}
+
+
+@puppet_voice.register("espeak")
+class Espeak(Synthesiser):
+    """espeak-ng: a hundred languages by rule, with variants such as ``+f2``; what pip installs."""
+
+    install = 'pip install "facediff[puppet]"'
+
+    @classmethod
+    def voices(cls) -> list[str]:
+        """espeak-ng's languages."""
+        try:
+            import espeakng_loader
+        except ImportError:
+            return []
+        folder = Path(espeakng_loader.get_data_path()) / "lang"
+        return sorted(path.name.lower() for path in folder.rglob("*") if path.is_file())
+
+    def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
+        """Speak a sentence."""
+        # espeak-ng's pitch of 0 to 99 spans about two octaves, and 50 is the voice's own.
+        pitch = int(np.clip(round(50 + 4 * delivery.pitch), 0, 99))
+        spread = int(np.clip(round(50 * delivery.pitch_range), 0, 99))
+        return speak(text, EspeakVoice(self.voice, round(155 * delivery.rate), pitch, spread))
+
+
+# The phones of CMU's dictionary, as flite and Festival name them, in the International Phonetic Alphabet.
+_CMU_PHONES = {
+    **{"aa": "ɑ", "ae": "æ", "ah": "ʌ", "ao": "ɔ", "aw": "aʊ", "ax": "ə", "axr": "ɚ", "ay": "aɪ", "eh": "ɛ", "er": "ɝ"},
+    **{"ey": "eɪ", "ih": "ɪ", "iy": "i", "ow": "oʊ", "oy": "ɔɪ", "uh": "ʊ", "uw": "u", "el": "əl", "em": "əm"},
+    **{"en": "ən", "b": "b", "ch": "tʃ", "d": "d", "dh": "ð", "dx": "ɾ", "f": "f", "g": "ɡ", "hh": "h", "hv": "ɦ"},
+    **{
+        "jh": "dʒ",
+        "k": "k",
+        "l": "l",
+        "m": "m",
+        "n": "n",
+        "nx": "ɾ",
+        "ng": "ŋ",
+        "p": "p",
+        "q": "ʔ",
+        "r": "ɹ",
+        "s": "s",
+    },
+    **{
+        "sh": "ʃ",
+        "t": "t",
+        "th": "θ",
+        "v": "v",
+        "w": "w",
+        "y": "j",
+        "z": "z",
+        "zh": "ʒ",
+        "pau": "",
+        "h#": "",
+        "brth": "",
+    },
+}
+
+
+@puppet_voice.register("flite")
+class Flite(Synthesiser):
+    """flite: five English voices made from recordings of people."""
+
+    install = "install the package flite (apt install flite, dnf install flite, brew install flite)"
+
+    @classmethod
+    def voices(cls) -> list[str]:
+        """Flite's voices, without those that can tell the time only."""
+        if shutil.which("flite") is None:
+            return []
+        names = _run(["flite", "-lv"]).partition(":")[2].split()
+        return [name for name in names if not name.endswith("_time")]
+
+    def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
+        """Speak a sentence."""
+        settings = {
+            "duration_stretch": 1.0 / delivery.rate,
+            "f0_shift": _SEMITONE**delivery.pitch,
+            "int_f0_target_stddev": 12.0 * delivery.pitch_range,
+        }
+        with tempfile.TemporaryDirectory() as folder:
+            sound = Path(folder) / "speech.wav"
+            options = [word for name, value in settings.items() for word in ("--setf", f"{name}={value:g}")]
+            printed = _run(["flite", "-voice", self.voice, *options, "-psdur", "-t", text, "-o", str(sound)])
+            ends = [phone.rpartition(":")[::2] for phone in printed.split() if ":" in phone]
+            return _utterance(sound, ((name, float(end)) for name, end in ends), f"flite:{self.voice}")
+
+
+@puppet_voice.register("festival")
+class Festival(Synthesiser):
+    """Festival: diphone voices of people in several languages, one package each (festvox-…)."""
+
+    install = "install the packages festival and festvox-kallpc16k (apt install festival festvox-kallpc16k)"
+
+    @classmethod
+    def voices(cls) -> list[str]:
+        """Festival's voices, one package each."""
+        if shutil.which("festival") is None:
+            return []
+        listed = _run(["festival", "-b", "(print (voice.list))"])
+        return sorted(listed.strip().strip("()").split())
+
+    def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
+        """Speak a sentence."""
+        with tempfile.TemporaryDirectory() as folder:
+            sound, labels = Path(folder) / "speech.wav", Path(folder) / "speech.lab"
+            quoted = text.replace("\\", " ").replace('"', " ")
+            program = (
+                f"(begin (voice_{self.voice}) (Parameter.set 'Duration_Stretch {1.0 / delivery.rate:g})"
+                f' (set! u (Utterance Text "{quoted}")) (utt.synth u) (utt.save.segs u "{labels}")'
+                f' (utt.save.wave u "{sound}" "riff"))'
+            )
+            _run(["festival", "-b", program])
+            rows = [line.split() for line in labels.read_text().splitlines() if len(line.split()) == 3]
+            return _utterance(sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}")
+
+
+def _run(command: Sequence[str]) -> str:
+    """What a synthesiser prints."""
+    try:
+        done = subprocess.run(  # noqa: S603 - a program on the path, without a shell
+            command, capture_output=True, text=True, check=False, timeout=_SECONDS
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise FaceDiffError(f"{command[0]}: {error}; try it in a terminal") from error
+    if done.returncode:
+        raise FaceDiffError(f"{command[0]}: failed ({done.stderr.strip()[-200:]}); try it in a terminal")
+    return done.stdout
+
+
+def _utterance(sound: Path, ends: Iterable[tuple[str, float]], voice: str) -> Utterance:
+    """A sound file at 16 kHz with its phones, which are given by name and end in seconds."""
+    import soundfile
+    import soxr
+
+    if not sound.is_file():
+        raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')
+    native, rate = soundfile.read(sound, dtype="float32")
+    samples = native if rate == SAMPLE_RATE else soxr.resample(native, rate, SAMPLE_RATE, quality="HQ")
+    phonemes, start = [], 0.0
+    for name, end in ends:
+        if end > start:
+            phonemes.append(SpokenPhoneme(start, end, _CMU_PHONES.get(name, name)))
+        start = max(start, end)
+    if not any(phoneme.ipa for phoneme in phonemes):
+        raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')
+    return Utterance(np.asarray(samples, dtype=np.float32), tuple(phonemes))
+
+
+def coloured_speech(samples: NDArray[np.float32], loudness: float, brightness: float) -> NDArray[np.float32]:
+    """Speech (S,) at 16 kHz made louder by decibels and brighter by decibels per octave above 500 Hz."""
+    spectrum = np.fft.rfft(samples)
+    frequencies = np.fft.rfftfreq(len(samples), 1.0 / SAMPLE_RATE)
+    gain = loudness + brightness * np.log2(np.maximum(frequencies, 500.0) / 500.0)
+    return np.fft.irfft(spectrum * 10.0 ** (gain / 20.0), len(samples)).astype(np.float32)

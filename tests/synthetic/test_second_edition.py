@@ -1,0 +1,112 @@
+"""The second edition on disk: bytes, splits, and truth that decodes to what its regions and pairs describe."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.data import Puppet
+from facediff.data.storage import ClipFolder, WeightFile
+from facediff.errors import FaceDiffError
+from facediff.synthetic.cast import KEPT_OUT, SEEN, UNSEEN, drawn_names, member_of
+from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.rig import SHAPES, lip_pairs
+from facediff.synthetic.second_edition import generate_second, perform_clip, performed_clips, rig_of, speak_clip
+from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION
+
+ONLY = ("F1_e01", "F1_t01", "M5_t14")
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("second") / "corpus"
+    generate_second(root, only=ONLY, progress=False)
+    return root
+
+
+def test_tests_can_tell() -> None:
+    clips = performed_clips(drawn=3)
+    count = Counter(clip.split for clip in clips)
+    assert count["test_a"] >= 60
+    assert count["test_b"] >= 40
+    assert len({clip.name for clip in clips}) == len(clips)
+    assert {clip.identity for clip in clips if clip.split == "test_b"} == set(UNSEEN)
+    assert len(UNSEEN) == 4
+    for first, second in ((TRAIN, TEST), (TRAIN, VALIDATION), (VALIDATION, TEST), (TRAIN, GERMAN)):
+        assert not set(first) & set(second)
+    spoken = {(clip.identity, clip.text) for clip in clips if clip.split == "train"}
+    assert len(spoken) == count["train"]
+    for identity in SEEN:
+        moods = Counter(clip.mood for clip in clips if clip.identity == identity and clip.split == "train")
+        assert max(moods.values()) - min(moods.values()) <= 2
+
+
+def test_voices_that_are_kept_out_are_not_trained_with() -> None:
+    voices = {member_of(name).voice for name in (*SEEN, *drawn_names(99))}
+    assert not voices & set(KEPT_OUT)
+    of_test_c = {clip.voice for clip in performed_clips() if clip.split == "test_c"}
+    assert len(of_test_c) >= 2
+    assert not of_test_c & voices
+
+
+def test_the_same_seed_gives_the_same_bytes_on_two_processes(corpus: Path, tmp_path: Path) -> None:
+    generate_second(tmp_path / "again", only=ONLY, workers=2, progress=False)
+    assert digests(tmp_path / "again") == digests(corpus)
+    generate_second(tmp_path / "other", only=ONLY[1:2], seed=1, progress=False)
+    name = f"weights_npy/{ONLY[1]}.npy"
+    assert digests(tmp_path / "other")[name] != digests(corpus)[name]
+
+
+def test_vertices_are_what_weights_decode_to(corpus: Path) -> None:
+    weights = np.load(corpus / "weights_npy" / "F1_t01.npy")
+    vertices = np.load(corpus / "vertices_npy" / "F1_t01.npy").reshape(len(weights), -1, 3)
+    rig = rig_of("F1")
+    assert np.allclose(vertices, rig[0] + np.einsum("tk,kvc->tvc", weights, rig[1:]), atol=1e-6)
+    assert rig.shape == (1 + len(SHAPES), len(build_head().vertices), 3)
+
+
+def test_the_data_module_decodes_weights(corpus: Path) -> None:
+    folder = ClipFolder(corpus, len(build_head().vertices))
+    assert folder.names() == sorted(ONLY)
+    template = rig_of("F1")[0]
+    stored = folder.open("F1_t01").offsets(range(5, 9), template)  # from vertices
+    weights = np.load(corpus / "weights_npy" / "F1_t01.npy")
+    decoded = WeightFile(corpus / "weights_npy" / "F1_t01.npy", rig_of("F1")).offsets(range(5, 9), template)
+    assert np.allclose(stored, decoded, atol=1e-6)
+    assert isinstance(folder.open("F1_e01"), WeightFile)
+    with pytest.raises(FaceDiffError, match="F1_e01"):
+        WeightFile(corpus / "weights_npy" / "F1_e01.npy", rig_of("F1")[:-1])
+    data = Puppet(root=str(corpus), edition=2)
+    assert data.n_vertices == len(template)
+    assert len(weights) == folder.open("F1_t01").frames
+
+
+def test_truth_closes_its_lips_and_another_truth_differs() -> None:
+    clip = next(clip for clip in performed_clips() if clip.name == "M5_t14")
+    spoken = speak_clip(clip)
+    truth, another = perform_clip(clip, spoken)
+    assert len(spoken.samples) == len(truth.weights) * 640
+    rig = rig_of("M5").astype(np.float64)
+    upper, lower = lip_pairs(build_head())
+    vertices = rig[0] + np.einsum("tk,kvc->tvc", truth.weights, rig[1:])
+    gaps = 1000.0 * np.linalg.norm(vertices[:, upper] - vertices[:, lower], axis=-1).max(axis=1)
+    closures = [p for p in spoken.phonemes if p.ipa[:1] in ("p", "b", "m")]
+    assert closures
+    for phoneme in closures:
+        assert gaps[int(0.5 * (phoneme.start + phoneme.end) * 25)] < 0.6, phoneme
+    assert gaps.max() > 4.0
+    assert np.abs(truth.weights - another.weights).max() > 0.1
+    jaw = SHAPES.index("jawOpen")  # which speech decides
+    assert np.abs(truth.weights[:, jaw] - another.weights[:, jaw]).max() < 0.1
