@@ -69,9 +69,6 @@ def read_animation(
         overrides: facts that take precedence over those of an archive.
         defaults: facts that neither the file nor ``overrides`` have; those of another topology only if they hold for
             any.
-
-    Raises:
-        FaceDiffError: if the file is unreadable, an array lacks a frame rate, or the parts do not fit one another.
     """
     overrides = overrides or {}
     if path.suffix == ".npz":
@@ -129,9 +126,6 @@ def write_archive(path: Path, animation: Animation) -> None:
 
     The entries are the arrays of :class:`Animation` under their own names, ``region_<name>`` for each region, and
     ``about``: JSON with name, frame rate, unit, sample rate and metadata.
-
-    Raises:
-        FaceDiffError: if the file cannot be written, or the motion is not finite.
     """
     animation.refuse_not_finite()
     arrays: dict[str, Any] = {name: getattr(animation, name) for name in ARRAYS if getattr(animation, name) is not None}
@@ -150,11 +144,7 @@ def write_archive(path: Path, animation: Animation) -> None:
 
 
 def read_archive(path: Path) -> Animation:
-    """Read a file of :func:`write_archive`.
-
-    Raises:
-        FaceDiffError: if the file is missing, damaged, or no archive of an animation.
-    """
+    """Read a file of :func:`write_archive`."""
     expected = "expected an animation that `facediff animate … -o hello.npz` wrote"
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; {expected}")

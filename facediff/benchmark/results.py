@@ -128,11 +128,7 @@ def cell_file(folder: Path, cell: Cell) -> Path:
 
 
 def read_result(path: Path) -> Result | None:
-    """A cell's result; None if there is none yet.
-
-    Raises:
-        FaceDiffError: if the file is damaged, or of a later format.
-    """
+    """A cell's result; None if there is none yet."""
     if not path.is_file():
         return None
     content = load_json(path, remedy=REMEDY)

@@ -51,11 +51,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
     ) -> None:
-        """Write the file whole or not at all; the previous one stays until then.
-
-        Raises:
-            FaceDiffError: if the disk is full or the folder cannot be written.
-        """
+        """Write the file whole or not at all; the previous one stays until then."""
         target = Path(path)
         try:
             with atomic(target) as temporary, temporary.open("wb") as stream:
@@ -71,11 +67,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | os.PathLike[str], map_location: object = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a file by the door that every checkpoint goes through; nothing in it can ask for a less safe one.
-
-        Raises:
-            FaceDiffError: if it is no checkpoint of facediff's, or names anything that is not known.
-        """
+        """Read a file by the door that every checkpoint goes through; nothing in it can ask for a less safe one."""
         if Path(path).name == TRANSFER and (weights := only_weights(Path(path))) is not None:
             return weights
         return read_checkpoint(path)

@@ -333,9 +333,6 @@ def draw_clip(
 
     The motion is offsets from the template, and the files get the clip's name; ``error_scale`` (in the corpus's unit),
     ``size`` and ``view`` are those of :class:`SamplingPreview`.
-
-    Raises:
-        FaceDiffError: if the corpus has no mesh, the motion is not finite, or a file cannot be written.
     """
     assets = model.assets
     if assets.faces is None:

@@ -231,9 +231,6 @@ def write_distilled(
 
     Returns:
         the remaining error, as :func:`facediff.models.audio_distillation.distil_audio_encoder` gives it.
-
-    Raises:
-        FaceDiffError: if there is no such encoder, or it cannot be replaced.
     """
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.models.adaptation import with_audio_encoder

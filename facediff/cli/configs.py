@@ -20,11 +20,7 @@ SHORT = 32  # characters of a value that can neither expand nor recurse
 
 
 def check_config(path: Path | str) -> None:
-    """Refuse a file that is no config.
-
-    Raises:
-        FaceDiffError: naming the file and the line.
-    """
+    """Refuse a file that is no config."""
     expected = "expected a YAML file such as configs/experiment/puppet.yaml"
     if check_yaml(yaml_text(path, expected), path) is not dict:
         raise FaceDiffError(f"{path}: holds no options (key: value); {expected}")

@@ -128,11 +128,7 @@ def generation_metrics(
 def corpus_of_checkpoint(
     checkpoint: Path, data_root: Path | None, corpus: str | None, eyelid_pairs: str | None
 ) -> SpeechMotionDataModule:
-    """The corpus that a checkpoint was trained on.
-
-    Raises:
-        FaceDiffError: if its class is not known, or its folder is not there.
-    """
+    """The corpus that a checkpoint was trained on."""
     from facediff.models.checkpoint import read_checkpoint
 
     module, options = corpus_and_folder(checkpoint, read_checkpoint(checkpoint), corpus, data_root)

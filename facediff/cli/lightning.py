@@ -47,11 +47,7 @@ FREE = (
 
 
 def lightning(name: str, arguments: Sequence[str]) -> int:
-    """Run one of Lightning's subcommands; the exit status.
-
-    Raises:
-        FaceDiffError: if an option, a name or a file is wrong.
-    """
+    """Run one of Lightning's subcommands; the exit status."""
     refuse_repeated(arguments)
     run_cli(name, arguments)
     return 0
@@ -90,9 +86,6 @@ def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
 
     Returns:
         class and options of the data module.
-
-    Raises:
-        FaceDiffError: as ``facediff fit`` itself.
     """
     check_options("fit", arguments)
     options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
@@ -126,11 +119,7 @@ def exit_statuses() -> Iterator[None]:
 
 
 def check_options(name: str, arguments: Sequence[str]) -> None:
-    """Refuse options that no model or corpus can have, and too few of them.
-
-    Raises:
-        FaceDiffError: naming the option, or what is needed.
-    """
+    """Refuse options that no model or corpus can have, and too few of them."""
     names = [*OPTIONS, *OWN_OPTIONS.get(name, ())]
     for word in arguments:
         match = re.match(r"--(\w[\w-]*)", word)
@@ -152,11 +141,7 @@ def check_options(name: str, arguments: Sequence[str]) -> None:
 
 
 def refuse_repeated(arguments: Sequence[str]) -> None:
-    """Refuse an option that is given twice with different values: the last one would win without a word.
-
-    Raises:
-        FaceDiffError: naming the option.
-    """
+    """Refuse an option that is given twice with different values: the last one would win without a word."""
     values: dict[str, str] = {}
 
     def note(flag: str, value: str) -> str:
@@ -178,9 +163,6 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
         checkpoint: its content.
         chosen: the class that the user names; None if the checkpoint's is to be used.
         option: the command's option for it.
-
-    Raises:
-        FaceDiffError: if the class cannot be imported, or none is named and the checkpoint's is not known.
     """
     from facediff.cli.data import find_own_module
     from facediff.data import SpeechMotionDataModule
@@ -217,9 +199,6 @@ def corpus_and_folder(
         checkpoint: its content.
         corpus: the class that the user names by ``--corpus``, if any.
         root: where the user says that the corpus is; None for where the checkpoint says.
-
-    Raises:
-        FaceDiffError: as :func:`import_corpus`.
     """
     from facediff.models.checkpoint import corpus_of
 
@@ -254,11 +233,7 @@ def value_of(arguments: Sequence[str], flag: str) -> str | None:
 
 
 def find_config(flag: str, value: str) -> str:
-    """The file of a --config; bundled ones are named ``configs/experiment/biwi.yaml`` or ``experiment/biwi``.
-
-    Raises:
-        FaceDiffError: if there is no such file.
-    """
+    """The file of a --config; bundled ones are named ``configs/experiment/biwi.yaml`` or ``experiment/biwi``."""
     is_config = flag in ("-c", "--config")
     if os.path.isfile(value) and (is_config or value.endswith((".yaml", ".yml"))):  # noqa: PTH113
         check_config(value)
@@ -295,9 +270,6 @@ def fresh_component(flag: str, value: str) -> str:
 
     jsonargparse hands options of the same name on from the component that stood there before, even where those were
     mere defaults: ``--model.sampler=ddpm`` would silently keep the 25 steps of ``ddim``.
-
-    Raises:
-        FaceDiffError: if there is no component of that name.
     """
     kind = registry.COMPONENTS.get(flag.rpartition(".")[2]) if flag.startswith("--model.") else None
     if kind is None or not re.fullmatch(r"[a-z]\w*", value) or Path(value).is_file() or value == "null":
@@ -308,11 +280,7 @@ def fresh_component(flag: str, value: str) -> str:
 
 
 def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list[str]:
-    """A checkpoint's model and data module as a config, for validate, test and predict; ``fit`` resumes by itself.
-
-    Raises:
-        FaceDiffError: if the checkpoint cannot be used, or a flag would change the model: its weights fit no other.
-    """
+    """A checkpoint's model and data module as a config, for validate, test and predict; ``fit`` resumes by itself."""
     import yaml
 
     from facediff.cli.lightning_cli import LINKS

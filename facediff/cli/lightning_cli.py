@@ -118,11 +118,7 @@ def parsing(arguments: Sequence[str], experiment: Callable[..., str]) -> Iterato
 
 
 def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
-    """Parse the words of ``fit`` and make nothing of them; class and options of the data module.
-
-    Raises:
-        FaceDiffError: in one sentence, where an option, a name or a value is wrong.
-    """
+    """Parse the words of ``fit`` and make nothing of them; class and options of the data module."""
     try:
         with parsing(arguments, lambda *, _root_: "benchmark"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -426,9 +422,6 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
 
     Args:
         trainer: the trainer's options as parsed, before anything is made of them.
-
-    Raises:
-        FaceDiffError: if wandb is not installed or the key is malformed.
     """
     from lightning.pytorch.utilities import rank_zero_only
 

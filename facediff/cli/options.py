@@ -77,9 +77,6 @@ def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0
         lower: the options that lower the cost.
         seconds: roughly how long it takes on two processor cores.
         size: bytes that it takes in memory, or on disk until it has ended.
-
-    Raises:
-        FaceDiffError: if there is nobody to ask, or the answer is no.
     """
     if yes or (seconds <= LONG and size <= LARGE):
         return

@@ -114,11 +114,7 @@ class Parameter:
         return not (self.positional or self.is_switch or repeated)
 
     def read(self, word: str) -> Any:  # noqa: ANN401 - the type of the hint
-        """One word of the command line as a value.
-
-        Raises:
-            FaceDiffError: naming the option, and what was expected.
-        """
+        """One word of the command line as a value."""
         if self.range is not None and self.is_number:
             try:
                 return self.range.read(self.flag, word, whole=self.value_type is int)
@@ -327,11 +323,7 @@ def parse(
 
 
 def refuse_repeated(parameters: Collection[Parameter], arguments: Sequence[str]) -> None:
-    """Refuse an option that is given twice: argparse would drop the first value without a word.
-
-    Raises:
-        FaceDiffError: naming the option.
-    """
+    """Refuse an option that is given twice: argparse would drop the first value without a word."""
     once = {flag: parameter for parameter in parameters if parameter.given_once for flag in parameter.flags}
     seen: set[str] = set()
     for word in arguments:
@@ -352,9 +344,6 @@ def refuse_idle(reason: str, **given: bool) -> None:
     Args:
         reason: where the options have an effect, as in "is for --stream".
         given: whether an option was given, by its name.
-
-    Raises:
-        FaceDiffError: naming the first of them.
     """
     for name, is_given in given.items():
         if is_given:

@@ -49,9 +49,6 @@ def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) 
     Args:
         parameters: of the command.
         values: what was given for them, by name.
-
-    Raises:
-        FaceDiffError: naming the option and the file.
     """
     inputs: list[Path] = []
     outputs: list[Path] = []

@@ -98,9 +98,6 @@ def explained(options: Mapping[str, Any], prefix: str = "--trainer.") -> Iterato
     Args:
         options: the trainer's options.
         prefix: what the user writes before their names.
-
-    Raises:
-        FaceDiffError: naming the options that the error speaks of.
     """
     from lightning.fabric.utilities.exceptions import MisconfigurationException
 

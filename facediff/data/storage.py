@@ -149,9 +149,6 @@ class WeightFile:
     Args:
         path: the ``.npy`` file of weights (T, K).
         rig: the speaker's face at rest, followed by the displacements of the shapes at weight 1, (1 + K, V, 3).
-
-    Raises:
-        FaceDiffError: if the file is unreadable, or has weights of other shapes.
     """
 
     def __init__(self, path: Path, rig: npt.NDArray[np.floating]) -> None:

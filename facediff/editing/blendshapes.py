@@ -414,9 +414,6 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
         path: the table.
         weights: what is written.
         key_tolerance: as :meth:`Weights.save` takes it.
-
-    Raises:
-        FaceDiffError: if a file cannot be written, or no shape has one of ARKit's names.
     """
     column = {name: index for index, name in enumerate(weights.names)}
     if not any(name in column for name in ARKIT):
@@ -468,9 +465,6 @@ def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> N
         path: the table.
         weights: what is written.
         key_tolerance: as :meth:`Weights.save` takes it.
-
-    Raises:
-        FaceDiffError: if a file cannot be written.
     """
     header = ["time", *weights.names, "residual_rms_mm", "residual_max_mm"]
     rows = (

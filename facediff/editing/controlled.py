@@ -68,9 +68,6 @@ class ControlledFace:
         regions: vertex indices by name.
         unit: of length.
         name: what errors call it.
-
-    Raises:
-        FaceDiffError: if a region is unknown, or what is wanted needs eyes or brows and nobody says where they are.
     """
 
     def __init__(
@@ -280,9 +277,6 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
         animation: with frames as the model made them.
         controls: what is changed.
         seed: of blinks, gaze, sway and acting, unless the controls have their own.
-
-    Raises:
-        FaceDiffError: naming the option that does not fit the animation, or if its head moves already.
     """
     if controls.is_off:
         return animation

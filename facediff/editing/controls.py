@@ -19,11 +19,7 @@ UNCHECKED = FRAME_RATES[1]
 
 
 def check_controls(controls: AnimationControls) -> None:
-    """Refuse animation controls that contradict each other, and files that do not exist.
-
-    Raises:
-        FaceDiffError: naming the option whose value is impossible, or the file that is missing.
-    """
+    """Refuse animation controls that contradict each other, and files that do not exist."""
     if controls.expressiveness is not None:
         from facediff.editing.expressiveness import read_factors
 
@@ -61,9 +57,6 @@ def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) ->
     Args:
         direction: a file, a :class:`~facediff.editing.direction.Direction`, or the rows of one.
         frame_rate: of frames and timecodes, where the keys do not say it; not checked yet if None.
-
-    Raises:
-        FaceDiffError: naming the file, the row and the field that is wrong.
     """
     if direction is None:
         return None

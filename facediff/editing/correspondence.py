@@ -84,9 +84,6 @@ def correspond(
         shown: numbers of the target's triangles that the face is searched for in; all if None. Teeth and a tongue among
             the others follow the jaw, and the rest of them stands still.
 
-    Raises:
-        FaceDiffError: if a mesh is broken, or a landmark names a vertex that does not exist.
-
     Example:
         >>> vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3.0]])
         >>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

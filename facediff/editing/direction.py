@@ -264,9 +264,6 @@ class Direction:
             content: the object, a list of rows, or the text of either.
             source: what messages call it.
             frame_rate: of frames and timecodes, where the content does not say it.
-
-        Raises:
-            FaceDiffError: naming the row and the field that is wrong.
         """
         if isinstance(content, str):
             content = parse_json(content, source)
@@ -296,9 +293,6 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
     Args:
         path: .json or .csv, or an animation (.npz) that was made with a direction.
         frame_rate: of frames and timecodes, where the file does not say it.
-
-    Raises:
-        FaceDiffError: naming the file, and the row and the field that is wrong.
     """
     path = Path(path)
     if not path.is_file():

@@ -69,11 +69,7 @@ class FitReport:
 
 
 def refuse_poor(source: object, report: FitReport) -> None:
-    """Refuse a result that cannot be used.
-
-    Raises:
-        FaceDiffError: beginning with ``source`` and naming the first fault.
-    """
+    """Refuse a result that cannot be used."""
     if not report.good:
         raise OptionError.naming(
             f"{source}: {report.faults[0]}. Look at it with `facediff retarget --show`, show places that are the same "

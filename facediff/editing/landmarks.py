@@ -317,9 +317,6 @@ def read_landmarks(
         source: named places of the source; None for none.
         target: of the target.
         counts: vertices of both meshes, which a .json must have been picked on; None if they are not known.
-
-    Raises:
-        FaceDiffError: if the file is missing or damaged, belongs to other meshes, or a name is not known on the mesh.
     """
     if path.suffix.lower() == ".json":
         content = load_json(

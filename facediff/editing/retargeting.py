@@ -58,10 +58,6 @@ def retarget(
             searched for in all of them if there are none.
         judge: called with the result before a new correspondence is written; raises where it should not be. Where it
             raises and both meshes are of known topologies, their named landmarks are tried.
-
-    Raises:
-        FaceDiffError: if a file is unreadable, or a mesh is not the correspondence's or has its vertices in another
-            order.
     """
     triangles = animation.triangles  # refuses an animation without triangles before the other mesh is read
     mesh = read_mesh(mesh_path)
@@ -283,9 +279,6 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
 
     The shapes are carried as an animation would be, and the result is checked likewise. Where it fails, or the shapes
     are a whole figure's or look another way, their face is laid onto the animation's first.
-
-    Raises:
-        FaceDiffError: if the shapes cannot be read, come without a neutral face with triangles, or do not fit.
     """
     files = read_shape_files(path)
     if files.neutral is None or files.faces is None:

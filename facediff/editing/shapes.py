@@ -171,10 +171,6 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
             ``puppet`` for those of the built-in face, whose speaker with the nearest face they are taken from.
         template: (V, 3) the animation's neutral face.
         unit: the template's unit of length.
-
-    Raises:
-        FaceDiffError: if a file is missing or damaged, has another topology or vertices in another order, or a name
-            occurs twice.
     """
     files = _built_in(np.asarray(template, np.float64) * metres_per_unit(unit)) if is_built_in(path) else None
     return fitted(files or read_shape_files(path, len(template)), template, unit)
@@ -276,9 +272,6 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
     Args:
         path: the folder or file.
         vertices: of the mesh that they are for, by which the parts of a .glb are chosen; None for all that have shapes.
-
-    Raises:
-        FaceDiffError: if it is missing or damaged, holds no shapes, or its meshes differ in topology or vertex order.
     """
     if is_built_in(path):
         return _built_in(None)

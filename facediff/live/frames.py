@@ -134,9 +134,6 @@ class Receiver(ABC):
         """Open what the performance is sent through: a socket, a file, a server.
 
         A program that does not listen yet is no error: every frame is sent to it.
-
-        Raises:
-            FaceDiffError: if it cannot work at all: the port is taken, the file cannot be written.
         """
 
     @abstractmethod
@@ -212,11 +209,7 @@ def read_address(text: str) -> Address:
 
 
 def open_receiver(text: str) -> Receiver:
-    """The receiver at an address, which is not open yet.
-
-    Raises:
-        FaceDiffError: if the address is malformed, nothing has its scheme, or an option is unknown or impossible.
-    """
+    """The receiver at an address, which is not open yet."""
     address = read_address(text)
     try:
         implementation = receiver.get(address.scheme)

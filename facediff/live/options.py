@@ -46,11 +46,7 @@ class LiveOptions(CheckedOptions):
     speech: Annotated[str | None, Option(hidden=True)] = None
 
     def check(self) -> None:
-        """Refuse options that contradict each other.
-
-        Raises:
-            FaceDiffError: naming the option.
-        """
+        """Refuse options that contradict each other."""
         if (self.speech is None) == (self.microphone is None):
             raise FaceDiffError(
                 "speech: comes from one place; give a recording, - for samples on standard input, or --microphone"

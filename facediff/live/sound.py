@@ -57,11 +57,7 @@ class SoundOut(Receiver):
         self._clock, self._pacer = clock, pacer
 
     def open(self, performance: Performance) -> None:
-        """Begin to play silence.
-
-        Raises:
-            FaceDiffError: if the device cannot be opened.
-        """
+        """Begin to play silence."""
         try:
             self._stream = self._sound.OutputStream(
                 device=self._device,

@@ -67,9 +67,6 @@ class Played(SpeechSource):
 
     Args:
         path: of any format, rate and number of channels that :func:`~facediff.speech.audio.read_speech` takes.
-
-    Raises:
-        FaceDiffError: naming the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -209,9 +206,6 @@ def find_device(library: Any, device: str, kind: str) -> tuple[int, dict[str, An
         library: of :func:`sound_library`.
         device: its number or a part of its name; ``default`` for the system's choice.
         kind: ``input`` or ``output``.
-
-    Raises:
-        FaceDiffError: naming the devices that there are.
     """
     word = "--microphone" if kind == "input" else "--sound"
     try:

@@ -63,11 +63,7 @@ class Flame:
 
     @classmethod
     def read(cls, path: Path) -> Flame:
-        """Read a model file: FLAME 2019, 2020 or 2023 as distributed (``.pkl``), or ``.npz`` with the same keys.
-
-        Raises:
-            FaceDiffError: if the file is missing, is no FLAME model, or asks for code to be run; it is not run.
-        """
+        """Read a model file: FLAME 2019, 2020 or 2023 as distributed (``.pkl``), or ``.npz`` with the same keys."""
         return cls(read_flame_arrays(path))
 
     @property

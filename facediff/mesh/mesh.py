@@ -30,11 +30,7 @@ class Mesh:
 
 
 def check_coordinates(points: npt.NDArray[np.floating], source: object) -> None:
-    """Refuse positions or displacements that are not finite, or so large that computing with them overflows.
-
-    Raises:
-        FaceDiffError: beginning with ``source``, and naming the range.
-    """
+    """Refuse positions or displacements that are not finite, or so large that computing with them overflows."""
     if not in_range(points):
         raise FaceDiffError(
             f"{source} holds NaN, infinity or absurd coordinates; expected numbers up to {COORDINATE:g} in size"

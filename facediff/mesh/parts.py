@@ -49,9 +49,6 @@ def mesh_parts(path: Path) -> list[MeshPart]:
 def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     r"""Which triangles of a file's mesh are in the parts that are named so; ``*`` stands for any letters.
 
-    Raises:
-        FaceDiffError: if the file cannot be read, has no names, or none of its parts is named so.
-
     Example:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "two.obj"

@@ -44,11 +44,7 @@ Progress = Callable[[int, int], object]
 
 
 def check_options(options: AnimationOptions) -> None:
-    """Refuse options that contradict each other and files that are not there, before a model is loaded.
-
-    Raises:
-        FaceDiffError: naming the option.
-    """
+    """Refuse options that contradict each other and files that are not there, before a model is loaded."""
     expressivity_of(options)
     read_scales(options.guidance)
     gate_of(options)
@@ -175,11 +171,7 @@ class AnimationPipeline(ABC):
         """What errors call the model's faces."""
 
     def direct(self, direction: Direction | None) -> None:
-        """Follow other keys over time from now on.
-
-        Raises:
-            FaceDiffError: naming the channel that the model or its face cannot follow.
-        """
+        """Follow other keys over time from now on."""
         self.direction = direction
         self.face = None
         finished = None if direction is None else direction.without_model_channels()
@@ -220,9 +212,6 @@ class AnimationPipeline(ABC):
 
         Returns:
             the files, and the first animation.
-
-        Raises:
-            FaceDiffError: if a file cannot be written.
         """
         from facediff.export import write_animations
 
@@ -416,9 +405,6 @@ class AnimationPipeline(ABC):
 
 def read_scales(guidance: Scales | None) -> dict[str, float]:
     """Scales of guidance by condition; empty for None.
-
-    Raises:
-        FaceDiffError: if the text holds none, a condition comes twice, or a scale is out of range.
 
     Example:
         >>> read_scales("style=1.5,speech=1.2")

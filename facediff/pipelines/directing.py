@@ -123,9 +123,6 @@ def plan_runs(
         style: what holds without keys of style.
         condition: what holds without keys of condition.
         style_template: as ``--style-template`` takes it.
-
-    Raises:
-        FaceDiffError: naming the channel that the model cannot follow, or if there are too many combinations.
     """
     if direction is None:
         return [ConditionedRun(style, condition, model.choices())]

@@ -27,9 +27,6 @@ class ExportedPipeline(AnimationPipeline):
     Args:
         options: the choices.
         model: a model that is open already, which stays as it is. None to open the folder.
-
-    Raises:
-        FaceDiffError: naming an option that an exported model cannot follow, or whose value it does not know.
     """
 
     def __init__(self, options: AnimationOptions, *, model: RuntimeModel | None = None) -> None:

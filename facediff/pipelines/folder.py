@@ -69,9 +69,6 @@ def animate_folder(
 
     Returns:
         the exit status: 0 if all animations are there, 1 if a recording failed.
-
-    Raises:
-        FaceDiffError: if nothing can be made at all: the folder, the options or the checkpoint cannot be used.
     """
     if suffix not in FORMATS:
         raise OptionError("suffix", f"there is no such format: {choices(suffix, FORMATS)}", suffix)

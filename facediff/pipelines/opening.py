@@ -14,9 +14,6 @@ if TYPE_CHECKING:
 def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
     """The pipeline for the model that the options name: trained, with PyTorch, or exported, without.
 
-    Raises:
-        FaceDiffError: if the model, the style or another option cannot be used.
-
     Example::
 
         pipeline = open_pipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))

@@ -30,9 +30,6 @@ class TrainedPipeline(AnimationPipeline):
         options: the choices.
         model: a model that is loaded already, on its device; it keeps what the options choose. None to load the
             checkpoint.
-
-    Raises:
-        FaceDiffError: if the checkpoint, the style or another option cannot be used.
     """
 
     def __init__(self, options: AnimationOptions, *, model: AnimationModel | None = None) -> None:

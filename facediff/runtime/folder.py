@@ -147,11 +147,7 @@ KINDS: dict[str, type | tuple[type, ...]] = {
 
 
 def read_folder(folder: Path) -> tuple[Description, Arrays]:
-    """Description and arrays of an exported model.
-
-    Raises:
-        FaceDiffError: naming the file, if it is missing, damaged, or of another version.
-    """
+    """Description and arrays of an exported model."""
     if not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; {EXPECTED}")
     path = folder / DESCRIPTION

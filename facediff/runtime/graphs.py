@@ -52,9 +52,6 @@ class ExportedGraphs:
             folder: the folder.
             threads: of the processor; as many as it has cores if 0.
             providers: what computes, by ONNX Runtime's names; the processor if None.
-
-        Raises:
-            FaceDiffError: naming the file that is missing or damaged.
         """
         import onnxruntime
 

@@ -75,9 +75,6 @@ class RuntimeModel(ExportedGraphs):
             seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
             expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
             name: of the animation.
-
-        Raises:
-            FaceDiffError: if a name is unknown, a number is out of range, or the speech is shorter than a frame.
         """
         stream = self.stream(identity=identity, condition=condition, style=style, seed=seed, expressivity=expressivity)
         audio = np.ascontiguousarray(audio, np.float32)

@@ -73,11 +73,7 @@ class Package:
     integrity: str
 
     def check(self, name: str, content: bytes) -> bytes:
-        """The content, if it is the package's.
-
-        Raises:
-            FaceDiffError: naming what it is called, if it is anything else.
-        """
+        """The content, if it is the package's."""
         integrity = f"sha512-{base64.b64encode(hashlib.sha512(content).digest()).decode('ascii')}"
         if len(content) != self.size or integrity != self.integrity:
             raise FaceDiffError(f"{name}: is not {NAME} (its size or hash differs); {REMEDY}")

@@ -145,11 +145,7 @@ def headers_file() -> str:
 
 
 def write_site(site: Site, folder: Path) -> int:
-    """Write a site as a folder for any web server; how many bytes it has.
-
-    Raises:
-        FaceDiffError: if the folder has content already or cannot be written; nothing half-written stays.
-    """
+    """Write a site as a folder for any web server; how many bytes it has."""
     with atomic_folder(folder) as staged:
         for name, content in site.items():
             path = staged / name

@@ -36,9 +36,6 @@ def read_style(text: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
         text: a style's name, a file, or several of them with weights, ``F1:0.3,b.npz:0.7``.
         model: the model.
         identity: whose motion a bare array (``.npy``) holds, where the file's name does not say it.
-
-    Raises:
-        FaceDiffError: if there is no such style, it cannot be read, or the weights make no mean.
     """
     parts = split_styles(text, model.description.styles)
     if len(parts) == 1:

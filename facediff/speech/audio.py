@@ -66,11 +66,7 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
 
 
 def read_sound(file: IO[bytes], name: str, *, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
-    """Read an open sound file, such as ``io.BytesIO`` of a .wav, as :func:`read_speech` reads one on disk.
-
-    Raises:
-        FaceDiffError: naming ``name``, if it is no sound file, too long, or holds values that are not finite.
-    """
+    """Read an open sound file, such as ``io.BytesIO`` of a .wav, as :func:`read_speech` reads one on disk."""
     length = _Length(Path(name), max_seconds)
     with open_sound(file, name) as sound:
         samples, rate = _decoded(sound, length)
@@ -80,11 +76,7 @@ def read_sound(file: IO[bytes], name: str, *, max_seconds: float | None = None) 
 
 
 def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.NDArray[np.float32]:
-    """Samples (S,) or (S, channels), full scale 1, at any rate as (S',) float32 mono at 16 kHz.
-
-    Raises:
-        FaceDiffError: naming ``name``, if the samples hold values that are not finite.
-    """
+    """Samples (S,) or (S, channels), full scale 1, at any rate as (S',) float32 mono at 16 kHz."""
     import soxr
 
     if not np.isfinite(samples).all():
@@ -118,11 +110,7 @@ class _Length:
         self.path, self.most = path, most
 
     def check(self, samples: float, rate: float) -> None:
-        """Check a number of samples.
-
-        Raises:
-            FaceDiffError: naming the option or the budget.
-        """
+        """Check a number of samples."""
         seconds = samples / rate
         if self.most is not None and seconds > self.most:
             raise OptionError(
@@ -143,9 +131,6 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
     Args:
         source: the file, or its content.
         name: what messages call a content.
-
-    Raises:
-        FaceDiffError: if it cannot be read, now or in the context.
     """
     import soundfile
 

@@ -22,11 +22,7 @@ CUT = "is cut short"
 
 
 def refuse_cut_short(path: Path) -> None:
-    """Refuse a recording that ends before its container says.
-
-    Raises:
-        FaceDiffError: saying what is missing.
-    """
+    """Refuse a recording that ends before its container says."""
     missing = cut_short(path)
     if missing is not None:
         raise FaceDiffError(

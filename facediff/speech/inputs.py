@@ -30,11 +30,7 @@ FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0
 
 
 def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
-    """Speech (S,) of a wav, flac, ogg, mp3 or video file.
-
-    Raises:
-        FaceDiffError: if the file cannot be read, or lasts too short or longer than ``max_seconds``.
-    """
+    """Speech (S,) of a wav, flac, ogg, mp3 or video file."""
     speech = read_speech(path, max_seconds=max_seconds)
     check_speech(speech, str(path))
     return speech
@@ -57,9 +53,6 @@ def speech_of(
             samples as an array or a tensor; or a pair of samples and their rate, in either order.
         rate: sample rate of an array; that of a tensor is 16 kHz if None.
         max_seconds: refuse speech that lasts longer.
-
-    Raises:
-        FaceDiffError: naming the file or the argument, if it is nothing of that kind, or lasts too short or too long.
     """
     if isinstance(speech, Mapping):
         return _of_data_set(speech, rate, max_seconds)
@@ -114,11 +107,7 @@ def _of_data_set(
 
 
 def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
-    """Samples (S,) with full scale 1 from an array or a tensor; channels, along the shorter axis, are averaged.
-
-    Raises:
-        FaceDiffError: naming ``name``, if it holds no samples or is of another kind.
-    """
+    """Samples (S,) with full scale 1 from an array or a tensor; channels, along the shorter axis, are averaged."""
     tensor: Any = samples
     if hasattr(tensor, "detach"):
         tensor = tensor.detach().cpu()

@@ -117,9 +117,6 @@ class Listener(ABC):
 def read_gate(text: str) -> VoiceGate | None:
     """A gate from ``NAME:option=value,option=value``; None for ``off``.
 
-    Raises:
-        FaceDiffError: if there is no such gate or option, or a value is out of range.
-
     Example:
         >>> read_gate("energy:release=0.2").release
         0.2

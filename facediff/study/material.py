@@ -211,11 +211,7 @@ class StudyAnimations:
         return self._templates.get(self.subject(clip), self._facts)
 
     def open(self, name: str) -> StudyClip:
-        """Read and check all animations of a clip.
-
-        Raises:
-            FaceDiffError: if a file is damaged, or the animations cannot be shown side by side.
-        """
+        """Read and check all animations of a clip."""
         motions = {condition: files[name] for condition, files in self._files.items()}
         read = {condition: motion.read() for condition, motion in motions.items()}
         rates = {condition: animation.frame_rate for condition, animation in read.items()}

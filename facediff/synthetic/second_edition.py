@@ -141,9 +141,6 @@ def generate_second(
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
         only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
-
-    Raises:
-        FaceDiffError: if the folder holds something else, cannot be written, or a synthesiser is missing.
     """
     clips = [clip for clip in performed_clips(drawn) if only is None or clip.name in only]
     if only is None and is_second_complete(root, seed=seed, drawn=drawn, people=people):

@@ -74,11 +74,7 @@ class Synthesiser(ABC):
 
 
 def open_voice(name: str) -> Synthesiser:
-    """The voice of a name such as ``flite:slt``.
-
-    Raises:
-        FaceDiffError: if there is no such synthesiser, it is not installed, or it lacks the voice.
-    """
+    """The voice of a name such as ``flite:slt``."""
     program, colon, voice = name.partition(":")
     synthesiser = puppet_voice.get(program)
     if not colon or not voice:

@@ -40,9 +40,6 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
             for floating point, ``fiu`` for whole numbers as well; anything if empty.
         mode: ``r``, or ``c`` for an array that may be written to without changing the file.
         name: what messages call the file, e.g. the option that names it; its path if empty.
-
-    Raises:
-        FaceDiffError: if the file is missing, damaged, an archive, or holds Python objects or numbers of another kind.
     """
     name = name or str(path)
     if not path.is_file():
@@ -86,9 +83,6 @@ def open_vertices(
     """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
 
     Any number of vertices will do if ``n_vertices`` is None; ``mode`` is that of :func:`open_array`.
-
-    Raises:
-        FaceDiffError: if the file is unreadable, of another shape, empty, or not of floating-point numbers.
     """
     array = open_array(path, kinds="f", mode=mode)
     count = vertices_of(array.shape)
@@ -119,9 +113,6 @@ def read_arrays(
         keys: the arrays to read; all if None.
         name: what messages call the file; its path if empty.
         remedy: what messages advise.
-
-    Raises:
-        FaceDiffError: if it is no such file, damaged, or holds anything but arrays of plain types.
     """
     name = name or str(path)
     try:

@@ -128,22 +128,14 @@ class Recipe:
 
     @classmethod
     def of(cls, command: Sequence[str], files: Sequence[Path]) -> Recipe:
-        """Read the files.
-
-        Raises:
-            FaceDiffError: if one is missing.
-        """
+        """Read the files."""
         for path in files:
             if not path.is_file():
                 raise FaceDiffError(f"{path}: no such file")
         return cls(tuple(command), {str(path): sha256(path) for path in files})
 
     def joined(self, files: Sequence[Path]) -> Recipe:
-        """The recipe with further files.
-
-        Raises:
-            FaceDiffError: if one is missing.
-        """
+        """The recipe with further files."""
         return replace(self, files={**self.files, **Recipe.of((), files).files}) if files else self
 
 

@@ -12,11 +12,7 @@ from facediff.utils.jobs import run_tasks
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal.
-
-    Raises:
-        FaceDiffError: if the file cannot be read.
-    """
+    """SHA-256 of a file's bytes, in hexadecimal."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -440,9 +440,6 @@ def slurm_options(scheduler: str) -> dict[str, Any]:
 
     A worker does one task at a time on one processor, so a job has as many worker processes as cores unless
     ``processes`` says otherwise.
-
-    Raises:
-        FaceDiffError: if there is no such option.
     """
     import inspect
 

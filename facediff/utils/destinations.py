@@ -57,11 +57,7 @@ def protect(inputs: Iterable[Path]) -> None:
 
 
 def refuse_protected(path: Path, *, folder: bool = False) -> None:
-    """Refuse to overwrite a file that is being read, under whatever name; for a folder, one that holds such a file.
-
-    Raises:
-        FaceDiffError: naming the file.
-    """
+    """Refuse to overwrite a file that is being read, under whatever name; for a folder, one that holds such a file."""
     place = Path(os.path.realpath(path))
     if place in _read and place.exists():
         raise FaceDiffError(_refusal(path, _read[place]))
@@ -71,11 +67,7 @@ def refuse_protected(path: Path, *, folder: bool = False) -> None:
 
 
 def refuse_overwriting(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
-    """Refuse outputs that are inputs, also through a link or as data in a folder that is read.
-
-    Raises:
-        FaceDiffError: naming the file.
-    """
+    """Refuse outputs that are inputs, also through a link or as data in a folder that is read."""
     sources = {Path(os.path.realpath(path)): path for path in inputs}
     for path in outputs:
         place = Path(os.path.realpath(path))
@@ -91,11 +83,7 @@ def refuse_overwriting(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
 
 
 def refuse_equal(outputs: Iterable[Path]) -> None:
-    """Refuse two outputs that are one file.
-
-    Raises:
-        FaceDiffError: naming the file.
-    """
+    """Refuse two outputs that are one file."""
     places: dict[str, Path] = {}
     for path in outputs:
         if places.setdefault(os.path.realpath(path), path) is not path:

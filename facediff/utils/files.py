@@ -110,9 +110,6 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     Yields:
         a hidden folder next to ``path``, to be filled. It is renamed to ``path`` at the end and removed if anything
         fails; what a killed process has left of the same folder is removed by the next one that writes it.
-
-    Raises:
-        FaceDiffError: if the folder cannot be written, or ``path`` is in the way.
     """
     if path.exists() and (not path.is_dir() or (not replace and any(path.iterdir()))):
         what = "is not empty" if path.is_dir() else "is a file"
@@ -262,11 +259,7 @@ def _refuse_unwritable(path: Path, place: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Make sure, before any work is done, that a file can be written; changes nothing and leaves nothing behind.
-
-    Raises:
-        FaceDiffError: if the folder cannot be made or written, if the path is a folder, or an input of the command.
-    """
+    """Make sure, before any work is done, that a file can be written; changes nothing and leaves nothing behind."""
     with _writing(path):
         target = destination(path)
         if target.is_dir():
@@ -276,11 +269,7 @@ def check_writable(path: Path) -> None:
 
 
 def check_folder_writable(path: Path) -> None:
-    """Make sure, before any work is done, that files can be written into a folder, which need not exist.
-
-    Raises:
-        FaceDiffError: if it is a file, or cannot be made or written.
-    """
+    """Make sure, before any work is done, that files can be written into a folder, which need not exist."""
     with _writing(path):
         folder = destination(path)
         if folder.exists() and not folder.is_dir():
@@ -449,9 +438,6 @@ def locked(path: Path, command: str) -> Iterator[None]:
     """Keep a second process out of a folder while the block runs; the lock of a killed process does not count.
 
     The lock file lies in the folder and is removed at the end; errors call the other process ``command``.
-
-    Raises:
-        FaceDiffError: if another process holds the lock, or the folder cannot be written.
     """
     with ExitStack() as stack:
         with _writing(path.parent):

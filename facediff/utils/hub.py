@@ -58,9 +58,6 @@ def check_model_source(source: str | os.PathLike[str], option: str = "") -> None
     Args:
         source: what the user gave.
         option: the option that names it, for messages.
-
-    Raises:
-        FaceDiffError: if there is no such file, the folder holds no model, or it is no name of the hub either.
     """
     shown = f"{option} {source}".strip()
     if os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
@@ -87,11 +84,7 @@ def check_animating_source(source: str | os.PathLike[str]) -> None:
 
 
 def check_training_source(source: str | os.PathLike[str]) -> None:
-    """Refuse to train on from a published model.
-
-    Raises:
-        FaceDiffError: if there is no such checkpoint, or it is a folder, or a name of the hub.
-    """
+    """Refuse to train on from a published model."""
     check_model_source(source, "--ckpt_path")
     if not os.path.isfile(source):  # noqa: PTH113
         raise FaceDiffError(
@@ -125,9 +118,6 @@ def model_hash(source: str | os.PathLike[str]) -> str:
     """SHA-256 of a model: of the checkpoint's bytes, or over those of a folder's :func:`model_files`.
 
     A folder's card says what people think of a model, and not what it makes: it does not count.
-
-    Raises:
-        FaceDiffError: as :func:`model_path`, or if a file cannot be read.
     """
     path = model_path(source)
     files = model_files(path)

@@ -119,11 +119,7 @@ def known_licence(name: str) -> Commercial:
 
 
 def require_cleared(source: object, licences: Iterable[Licence]) -> None:
-    """Refuse a model whose data or weights are not cleared for commercial use.
-
-    Raises:
-        FaceDiffError: naming the model and what is in the way.
-    """
+    """Refuse a model whose data or weights are not cleared for commercial use."""
     labels = list(licences)
     if commercial_use(labels) == "allowed":
         return
@@ -135,11 +131,7 @@ def require_cleared(source: object, licences: Iterable[Licence]) -> None:
 
 
 def read_licences(source: object, state: object) -> tuple[Licence, ...]:
-    """The labels that a file holds.
-
-    Raises:
-        FaceDiffError: naming the file, if they are anything but short texts by field.
-    """
+    """The labels that a file holds."""
     fields = set(Licence.__dataclass_fields__)
     if not isinstance(state, list | tuple) or len(state) > MOST:
         raise FaceDiffError(f"{source}: its licences are {quoted(state)}; expected a list. The file is damaged")

@@ -66,9 +66,6 @@ class Limits:
             what: the limit's name.
             count: what the file declares.
             source: the file, for the message.
-
-        Raises:
-            FaceDiffError: naming the file, the limit and the variable that raises it.
         """
         limit = getattr(self, what)
         if not 0 <= count <= limit:
@@ -140,9 +137,6 @@ def check_number(
     Returns:
         the number; ``int`` of it is exact where ``whole`` is given.
 
-    Raises:
-        FaceDiffError: naming the file, the number and its range.
-
     Example:
         >>> check_number("manifest.json", "frame_rate", 25, *FRAME_RATES)
         25.0
@@ -174,9 +168,6 @@ def check_format(source: object, stated: object, expected: str | int) -> None:
         source: the file, for the message.
         stated: the file's mark of its format; a text that ends in a number (``facediff take 1``), or a number.
         expected: the mark that this version writes.
-
-    Raises:
-        FaceDiffError: naming both.
     """
     if type(stated) is type(expected) and stated == expected:
         return
@@ -221,9 +212,6 @@ def check_nesting(
         value: dicts, lists, tuples and sets.
         source: the file, for the message.
         parts: what objects of other types hold; None for those that it does not know.
-
-    Raises:
-        FaceDiffError: naming the limit.
     """
     level, count, depth = [value], 1, 0
     while level:

@@ -69,9 +69,6 @@ def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file
         path: the file.
         name: what messages call it; its path if empty.
         remedy: how messages end.
-
-    Raises:
-        FaceDiffError: if there is no such file, or it cannot be read.
     """
     name = name or str(path)
     try:
@@ -115,11 +112,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def json_text(
     path: Path | str, content: Mapping[str, Any], *, indent: int | None = 1, ensure_ascii: bool = False
 ) -> str:
-    """An object as the text of a JSON file, which has no words for numbers that are not finite.
-
-    Raises:
-        FaceDiffError: naming the file, if a number is NaN or infinite.
-    """
+    """An object as the text of a JSON file, which has no words for numbers that are not finite."""
     try:
         return json.dumps(content, indent=indent, ensure_ascii=ensure_ascii, allow_nan=False)
     except ValueError as error:
@@ -195,9 +188,6 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
 
     Yields:
         the cells as :func:`csv_text` gives them; the header is the first.
-
-    Raises:
-        FaceDiffError: if the file cannot be read, or holds more rows or cells than the budget allows.
     """
     cells = 0
     try:

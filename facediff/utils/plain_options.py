@@ -45,9 +45,6 @@ def read_options(source: str, owner: type, options: Mapping[str, Any], component
 
     Returns:
         the arguments as the constructor takes them: a component as ``functools.partial`` of its class.
-
-    Raises:
-        FaceDiffError: naming the file and the option.
     """
     hints = parameters(owner)
     arguments: dict[str, Any] = {}

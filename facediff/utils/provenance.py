@@ -96,11 +96,7 @@ def next_to(folder: Path) -> Path:
 
 
 def read_provenance(folder: Path) -> Provenance | None:
-    """What made a folder; None if it does not say, as folders of other projects do not.
-
-    Raises:
-        FaceDiffError: if the file is damaged, or of a later format.
-    """
+    """What made a folder; None if it does not say, as folders of other projects do not."""
     path = next((path for path in (folder / FILE, next_to(folder)) if path.is_file()), None)
     return None if path is None else provenance_of(load_json(path, remedy=REMEDY), path)
 

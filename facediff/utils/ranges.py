@@ -166,11 +166,7 @@ def mismatch(hint: Any, value: Any, limits: Range = Range()) -> str | None:  # n
 
 
 def check_fields(instance: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
-    """Refuse a dataclass's fields outside the ranges of their type hints; for ``__post_init__``. None is allowed.
-
-    Raises:
-        FaceDiffError: naming the class, the field and the range.
-    """
+    """Refuse a dataclass's fields outside the ranges of their type hints; for ``__post_init__``. None is allowed."""
     _check(type(instance), {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)})
 
 

@@ -51,11 +51,7 @@ def write_safetensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def read_safetensors(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a file, on the CPU.
-
-    Raises:
-        FaceDiffError: if the file is missing, cut short, otherwise damaged, or larger than the budget.
-    """
+    """The tensors of a file, on the CPU."""
     import torch
 
     try:
@@ -87,11 +83,7 @@ def read_safetensors(path: Path) -> dict[str, torch.Tensor]:
 
 
 def _header(path: Path, first: bytes, read: Any, size: int) -> tuple[dict[str, tuple[str, list[int], int]], int]:  # noqa: ANN401
-    """Type, shape and first byte of each tensor by name, and where the tensors begin; all sizes agree.
-
-    Raises:
-        FaceDiffError: if they do not.
-    """
+    """Type, shape and first byte of each tensor by name, and where the tensors begin; all sizes agree."""
     length = int.from_bytes(first, "little")
     if len(first) < 8 or not 2 <= length <= min(HEADER_BYTES, size - 8):
         raise FaceDiffError(

@@ -173,9 +173,6 @@ def run_server(
         host: address to listen at.
         port: to listen at; 0 for any free one.
         ready: called with the page's address as soon as it can be opened.
-
-    Raises:
-        FaceDiffError: if the address cannot be used.
     """
     import uvicorn
 

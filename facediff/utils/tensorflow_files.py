@@ -324,9 +324,6 @@ def read_bundle(index: Path, shards: Sequence[Path] = ()) -> dict[str, Tensor]:
     Args:
         index: the file ``NAME.index``.
         shards: files with the tensors' bytes, by their names; those that are not among them lie next to the index.
-
-    Raises:
-        FaceDiffError: if a file is missing or damaged, or needs more than the budget.
     """
     import torch
 
@@ -373,9 +370,6 @@ class Shard:
 
     Args:
         path: the file.
-
-    Raises:
-        FaceDiffError: if there is no such file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -384,11 +378,7 @@ class Shard:
         self.path, self.size = path, path.stat().st_size
 
     def read_tensor(self, name: str, offset: int, size: int, checksum: int) -> bytes:
-        """The bytes of a tensor.
-
-        Raises:
-            FaceDiffError: if they lie outside of the file, or are damaged.
-        """
+        """The bytes of a tensor."""
         with reading(self.path, BUNDLE):
             if not 0 <= offset <= self.size - size:
                 raise DamagedError(f"the tensor {quoted(name)} lies outside of it")
@@ -412,11 +402,7 @@ def map_file(path: Path) -> memoryview:
 
 
 def read_graph(path: Path) -> dict[str, Tensor]:
-    """The weights of a frozen graph: its constants of one dimension or more that are floating-point numbers, by name.
-
-    Raises:
-        FaceDiffError: if the file is missing or damaged, or needs more than the budget.
-    """
+    """Weights of a frozen graph, by name: its floating-point constants of one dimension or more."""
     import torch
 
     if not path.is_file():

@@ -175,9 +175,6 @@ def open_checkpoint(file: str | os.PathLike[str] | IO[bytes]) -> Iterator[tuple[
 
     Yields:
         the open file, and its name for messages.
-
-    Raises:
-        FaceDiffError: if there is no such file, or it cannot be read.
     """
     if not isinstance(file, str | os.PathLike):
         yield file, str(getattr(file, "name", "checkpoint"))
@@ -199,9 +196,6 @@ def load_tensors(stream: IO[bytes], source: object) -> Any:  # noqa: ANN401
         stream: the open file. It is read twice, so that both readings see the same file even if a running training
             replaces it.
         source: the file's name, for messages.
-
-    Raises:
-        FaceDiffError: if the file is damaged, holds anything else, or needs more than the budget.
     """
     import torch
 
@@ -312,9 +306,6 @@ def read_state_dict(path: Path) -> dict[str, Any]:
 
     Args:
         path: the file.
-
-    Raises:
-        FaceDiffError: if the file is missing or damaged, holds no tensors by name, or needs more than the budget.
     """
     import torch
 

@@ -21,9 +21,6 @@ def load_yaml(path: Path, remedy: str) -> dict[str, Any]:
     Args:
         path: the file.
         remedy: how messages end.
-
-    Raises:
-        FaceDiffError: naming the file, and the line where one is wrong.
     """
     text = yaml_text(path, remedy)
     if check_yaml(text, path) is not dict:
@@ -48,11 +45,7 @@ class _Plain(yaml.SafeLoader):
 
 
 def yaml_text(path: Path | str, remedy: str) -> str:
-    """The text of a YAML file; ``remedy`` is how messages end.
-
-    Raises:
-        FaceDiffError: if it cannot be read, is too large or is not UTF-8.
-    """
+    """The text of a YAML file; ``remedy`` is how messages end."""
     try:
         if os.path.getsize(path) > YAML_BYTES:
             raise FaceDiffError(f"{path}: has more than {YAML_BYTES} bytes; {remedy}")
@@ -87,9 +80,6 @@ def check_yaml(text: str, source: object) -> type | None:
 
     Returns:
         dict or list, as the text holds one of them; None otherwise.
-
-    Raises:
-        FaceDiffError: naming the source and the line.
     """
     levels: list[Level] = []
     sizes: dict[str, int] = {}

@@ -41,9 +41,6 @@ def unpack(
         workers: processes; as many as there are processors if None.
         scheduler: where tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
         quiet: no progress bar.
-
-    Raises:
-        FaceDiffError: if the packed corpus is damaged, or the folder cannot be written; nothing is left then.
     """
     packed = PackedCorpus(source)
     with atomic_folder(out) as folder:

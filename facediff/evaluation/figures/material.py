@@ -105,11 +105,7 @@ class FigureData:
         return list(dict.fromkeys(clips))  # one that was named twice counts once
 
     def open(self, clip: str) -> dict[str, Tensor]:
-        """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length.
-
-        Raises:
-            FaceDiffError: if a file is unreadable, empty, or of another mesh than the truth.
-        """
+        """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length."""
         opened = {TRUTH: read_vertices(self.truths[clip].path, self.n_vertices, self.truth_stride)}
         for method, files in self.methods.items():
             try:

@@ -142,9 +142,6 @@ def draw_training(
         smoothing: weight of the past in the moving average, from 0 (none) to below 1; the values themselves stay
             visible behind it.
         log: whether the values' axis is logarithmic.
-
-    Raises:
-        FaceDiffError: if the smoothing is out of range, or a logarithmic axis has nothing above 0 to show.
     """
     check_output(output)
     paper = paper or Paper()

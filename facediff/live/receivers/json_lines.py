@@ -63,11 +63,7 @@ class JsonLines(Receiver):
         self._words = ""
 
     def open(self, performance: Performance) -> None:
-        """Open the file or the port and describe the performance.
-
-        Raises:
-            FaceDiffError: if the file cannot be written or the port is taken.
-        """
+        """Open the file or the port and describe the performance."""
         self._shapes = performance.shapes
         about: dict[str, object] = {
             "type": "performance",

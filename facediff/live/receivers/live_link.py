@@ -68,11 +68,7 @@ class LiveLink(UdpReceiver):
         self._first: int | None = None
 
     def open(self, performance: Performance) -> None:
-        """Make the socket and the parts of the datagram that stay the same.
-
-        Raises:
-            FaceDiffError: if the host is unknown, the face has no shapes of ARKit's, or a name cannot be sent.
-        """
+        """Make the socket and the parts of the datagram that stay the same."""
         self._weights = ArkitWeights(performance, self.address, ORDER)
         subject = self.subject or performance.subject
         device = self.device or str(uuid.uuid5(uuid.NAMESPACE_DNS, f"{subject}.facediff"))

@@ -62,11 +62,7 @@ class _Osc(UdpReceiver):
     """Shared by both protocols: the messages of a frame, in bundles."""
 
     def open(self, performance: Performance) -> None:
-        """Open the socket.
-
-        Raises:
-            FaceDiffError: if the host is unknown or the face has no shapes of ARKit's.
-        """
+        """Open the socket."""
         self._weights = ArkitWeights(performance, self.address)
         super().open(performance)
 

@@ -70,9 +70,6 @@ class Datagrams:
         address: of the receiver, for reports.
         host: name or number of the machine.
         port: of the program on it.
-
-    Raises:
-        FaceDiffError: if the host is unknown or cannot be reached at all.
     """
 
     def __init__(self, address: Address, host: str, port: int) -> None:
@@ -155,11 +152,7 @@ class UdpReceiver(Receiver):
         self._sending: Datagrams | None = None
 
     def open(self, performance: Performance) -> None:
-        """Open the socket; whether a program listens shows when frames are sent.
-
-        Raises:
-            FaceDiffError: if the host is unknown.
-        """
+        """Open the socket; whether a program listens shows when frames are sent."""
         self.close()
         self._sending = Datagrams(self.address, self.host, self.port)
 
@@ -183,11 +176,7 @@ class UdpReceiver(Receiver):
 
 
 def listen(address: Address, host: str, port: int) -> socket.socket:
-    """A socket that others connect to.
-
-    Raises:
-        FaceDiffError: naming the address, if the port is taken or the host is not this machine's.
-    """
+    """A socket that others connect to."""
     listening = None
     try:
         place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
