@@ -167,6 +167,7 @@ def distil_audio_encoder(
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options.steps))
     errors: list[float] = []
     devices = [] if model.device.type == "cpu" else [model.device]
+    # The caller's random numbers go on as if nothing had been drawn here.
     with torch.random.fork_rng(devices):
         torch.manual_seed(options.seed)
         student.train()
@@ -185,6 +186,8 @@ def distil_audio_encoder(
     student.eval()
     with torch.no_grad():
         for weight, old in zip(weights, before, strict=True):
+            # Between the old and the new weights (Wortsman et al. 2022, robust fine-tuning): most of the robustness,
+            # and clean speech keeps nearly the old features, which the frozen rest of the model was trained with.
             weight.copy_(torch.lerp(old, weight, options.interpolation))
     return float(np.mean(errors[-max(1, options.steps // 10) :]))
 

@@ -110,7 +110,7 @@ class AudioEncoder(nn.Module, ABC):
 
         Args:
             audio: as :meth:`forward` takes it.
-            audio_lengths: likewise.
+            audio_lengths: as :meth:`forward` takes it.
             steps: how many are wanted of each clip.
             rule: where they come from.
             cached: features of the frozen part with their lengths, if they are at hand.
@@ -130,7 +130,7 @@ class AudioEncoder(nn.Module, ABC):
 
         Args:
             audio: as :meth:`forward` takes it.
-            audio_lengths: likewise.
+            audio_lengths: as :meth:`forward` takes it.
             steps: how many are wanted of each clip.
             rate: steps a second.
             cached: features of the frozen part with their lengths, if they are at hand.
@@ -213,6 +213,8 @@ class MelEncoder(AudioEncoder):
 
     def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
         """Encode; see :class:`AudioEncoder`."""
+        # Standardised first, so that the loudness of a recording, which says more about the microphone than about the
+        # mouth, does not reach the network.
         spectrum, lengths = self._log_mel(self.standardise(audio, audio_lengths), audio_lengths)
         # Padding is zeroed again after every layer: a convolution next to it would let its values into the clip.
         x = self.stem(spectrum.transpose(1, 2)).transpose(1, 2)
@@ -432,6 +434,7 @@ class HubertEncoder(AudioEncoder):
 
 def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:
     """Speech with the zeros at either end that make its steps fall where they belong; at least one step long."""
+    # Without the edges 16 000 samples give 49 steps, whose places drift against the frames by nearly a step.
     return nn.functional.pad(wave, (EDGE, EDGE + max(0, 400 - wave.shape[1] - 2 * EDGE)))
 
 
@@ -466,7 +469,7 @@ def fingerprint(layers: int, config: dict[str, Any], parts: dict[str, nn.Module]
 class CtcEncoder(AudioEncoder):
     """Logits of a frozen speech recogniser: a pretrained HuBERT, wav2vec 2.0 or WavLM with its CTC head.
 
-    What the recogniser hears of a voice is mostly gone in its logits over letters, so they suit a model that takes
+    Logits over letters hold little of the speaker's voice, so they suit a model that takes
     content from speech (Chai et al., style-content disentanglement, whose recogniser gave 29 logits 50 times a
     second). The 50 steps a second are interpolated to the motion's frames, or kept where a model asks for 50 a second.
 
@@ -608,7 +611,7 @@ def load_typed(
 
 
 RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
-"""Types of pretrained networks that hear 16 kHz and may have a CTC head, and how their classes' names begin."""
+"""Types of pretrained networks for speech at 16 kHz that may have a CTC head, and how their classes' names begin."""
 
 
 def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - one of transformers' configurations

@@ -411,7 +411,8 @@ class AnimationModel(PersonStyles, ABC):
             at_least: components that the caller needs, whatever its modules do.
 
         Returns:
-            the components of scaled, weighted motion, each as long as its standard deviation; None if nobody needs any.
+            the components of scaled, weighted motion, each as long as its standard deviation; None if no part of
+            the model needs them.
 
         Raises:
             FaceDiffError: if some modules need them and the training motion never changes.

@@ -292,6 +292,8 @@ class GruDecoder(Decoder):
         # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
         packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
+        # A residual around the recurrent layers, and the style last, as in FaceDiffuser, whose style scales the states
+        # before the last map.
         return torch.addcmul(shift, self.norm(hidden + fused), scale)
 
     def prepare(self, style: Tokens, mask: FrameMask) -> GruConstants:

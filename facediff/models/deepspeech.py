@@ -1,4 +1,4 @@
-"""DeepSpeech 0.1.0 (Mozilla's form of Hannun et al., "Deep Speech", 2014), as VOCA hears speech through it.
+"""DeepSpeech 0.1.0 (Mozilla's form of Hannun et al., "Deep Speech", 2014), the audio encoder of VOCA.
 
 From top to bottom: cepstra of speech, the acoustic network, the frozen graph that its weights come in, the encoder. The
 cepstra are those of the library python_speech_features with its defaults, from the formulas, in float64 as there.
@@ -87,6 +87,8 @@ def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch
     Args:
         samples: whole numbers of 16 bits, at 16 kHz.
     """
+    # python_speech_features' arithmetic in float64 and in its order (pre-emphasis 0.97, 25 ms every 10 ms, 26 filters,
+    # lifter 22), since the released DeepSpeech was trained on it and standardising enlarges differences.
     emphasised = torch.cat([samples[:, :1], samples[:, 1:] - 0.97 * samples[:, :-1]], 1)
     steps = 1 + max(0, (samples.shape[1] - FRAME + HOP - 1) // HOP)
     padded = nn.functional.pad(emphasised, (0, (steps - 1) * HOP + FRAME - samples.shape[1]))
@@ -98,12 +100,15 @@ def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch
     else:
         power = torch.fft.rfft(frames, SPECTRUM).abs().square() / SPECTRUM
     filters, transform = tables()
+    # As the library does: exact zeros only, as of digital silence; a floor added to everything would change quiet
+    # speech.
     tiny = torch.finfo(torch.float64).eps
 
     def logarithm(x: Tensor) -> Tensor:
         return torch.where(x == 0, tiny, x).log()
 
     coefficients = logarithm(power @ filters.T) @ transform.T
+    # The first coefficient is replaced by the log energy, the library's ``appendEnergy``.
     return torch.cat([logarithm(power.sum(-1, keepdim=True)), coefficients[..., 1:]], -1)
 
 
@@ -147,6 +152,7 @@ class DeepSpeech(nn.Module):
     def forward(self, x: Float[Tensor, "batch steps inputs"]) -> Float[Tensor, "batch steps logits"]:
         """Logits over letters, space, apostrophe and blank, of clips of one length."""
         for layer in (self.first, self.second, self.third):
+            # ReLU cut at 20, DeepSpeech's own activation; no dropout, since the graph is frozen.
             x = layer(x).clamp(0.0, LOUDEST)
         x = self.fifth(all_states(self.recurrent, x)).clamp(0.0, LOUDEST)
         logits: Tensor = self.logits(x)
@@ -260,7 +266,7 @@ def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
 
 @audio_encoder.register("deepspeech")
 class DeepSpeechEncoder(AudioEncoder):
-    """Logits of the frozen DeepSpeech 0.1.0, as VOCA hears speech.
+    """Logits of the frozen DeepSpeech 0.1.0, the speech features of VOCA.
 
     Its steps are 50 a second. Models that take frames get them interpolated to the motion's frames; VOCA itself takes
     them at the times of its own rate.
@@ -331,6 +337,8 @@ class DeepSpeechEncoder(AudioEncoder):
     ) -> Float[Tensor, "batch most_steps width"]:
         """Encode at the times of another rate; the last logits are held. See :meth:`AudioEncoder.at_rate`."""
         features, lengths = cached or self.frozen_features(audio, audio_lengths)
+        # From time 0 with the last logits held, as VOCA's code resamples, not spread over the clip: a step's time must
+        # not depend on how long the clip is.
         times = torch.arange(longest(steps), dtype=torch.float64) * (RATE / rate)
         places = torch.minimum(times[None], lengths.cpu().double()[:, None] - 1)
         low = places.floor().long()

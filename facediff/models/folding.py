@@ -119,6 +119,7 @@ class FoldedSpace:
         """Noise with the covariance E Eᵀ, independent over frames; zero where ``unit`` is."""
         assert self._fold.root is not None, "folded without noise"  # noqa: S101 - a mistake of a model's author
         with torch.autocast(unit.device.type, enabled=False):
+            # S is symmetric, so that unit noise in rows has the covariance S Sᵀ = E Eᵀ from the right as well.
             return unit @ self._fold.root
 
     def embed(self, state: State) -> Frames:
@@ -267,6 +268,7 @@ class PreconditionedDenoiser(ConditionalDenoiser):
     def denoise(self, state: State, step: Step) -> State:
         """M̂⁰."""
         steps = step_of_rows(step, state)
+        # The state stays as it is and only the network's input is scaled: samplers know nothing of preconditioning.
         scaled = self.preconditioning.into[steps][:, None] * state
         features = self.features(self.network.embed(scaled), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
@@ -374,6 +376,8 @@ class WeightCache(Generic[T]):
 
 def projection(weight: Tensor) -> Tensor:
     """A matrix's product with a fixed random vector; a copy of anything else."""
+    # Vectors are short enough to be kept. Of a matrix of 70 000 × 512 numbers a copy would take 140 MB, and its
+    # projection takes 280 kB at most.
     if weight.dim() != 2:
         return weight.detach().clone()
     return weight @ torch.randn(weight.shape[1], generator=torch.Generator().manual_seed(0)).to(weight)

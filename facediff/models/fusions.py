@@ -68,6 +68,7 @@ class BidirectionalCrossAttention(Fusion):
         super().__init__()
         self.audio_norm = nn.LayerNorm(dim)
         self.motion_norm = nn.LayerNorm(dim)
+        # A norm of its own: F'_a is the sum of two sequences and larger than either of them.
         self.enriched_norm = nn.LayerNorm(dim)
         self.audio_from_motion = Attention(dim, dim, num_heads, rotary=rotary)
         self.motion_from_audio = Attention(dim, dim, num_heads, rotary=rotary)

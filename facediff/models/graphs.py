@@ -1,10 +1,11 @@
 """The parts of a model as computation graphs that run without PyTorch, for the ONNX format.
 
-Every exported model has a graph ``speech``, which hears, and a graph ``motion``, which gives vertices. A model that
-generates all frames at once (``direct``) has nothing else. One that samples has ``step`` between them, which predicts
-clean motion from noisy motion once; the loop over the steps is a table of numbers (:func:`update_table`), since every
-linear sampler is one. The loop is left out of the graphs on purpose: recording ten steps one after the other takes ten
-times as long, and the file would hold the network ten times. What is constant goes along as plain numbers.
+Every exported model has a graph ``speech``, which encodes speech, and a graph ``motion``, which gives vertices. A model
+that generates all frames in one pass (``direct``) has nothing else. One that samples has ``step`` between them, which
+predicts clean motion from noisy motion once; the loop over the steps is a table of numbers (:func:`update_table`),
+since every linear sampler is one. The loop is left out of the graphs on purpose: recording ten steps one after the
+other takes ten times as long, and the file would hold the network ten times. What is constant goes along as plain
+numbers.
 
 Here is what all models share; each method has its own graphs next to its network.
 """
@@ -154,7 +155,7 @@ def update_table(sampler: Sampler) -> list[list[float]]:
 
 @dataclass(frozen=True)
 class Speech:
-    """What a model hears of a batch.
+    """The speech of a batch.
 
     Attributes:
         audio: at 16 kHz, padded.
@@ -227,7 +228,7 @@ class SpeechGraph(nn.Module):
         Args:
             audio: at 16 kHz, padded.
             mean: of each clip, by which it is standardised.
-            deviation: likewise.
+            deviation: of each clip, by which it is divided.
             samples: valid ones of each clip.
             mask: True on each clip's frames of motion.
         """
@@ -242,7 +243,7 @@ def one_each(frames: int) -> int:
 
 
 def speech_graph(model: GraphedModel, hear: Hear, steps_of: Callable[[int], int] = one_each) -> Graph:
-    """The graph that hears; see :class:`SpeechGraph` for the arguments."""
+    """The graph of the audio encoder; see :class:`SpeechGraph` for the arguments."""
     batch, samples = 2, 32_000
     frames = model.clock.frames(samples)
     return Graph(

@@ -82,7 +82,7 @@ class Inference(ABC):
 
     Class attributes:
         samples: whether motion depends on random noise, by a sampler that :meth:`choose_sampler` changes.
-        hears_all: whether the model counts its frames by itself (:attr:`clock`) and hears all samples of a
+        hears_all: whether the model counts its frames by itself (:attr:`clock`) and encodes all samples of a
             recording; else speech is cut or filled up to whole frames.
         chosen: attributes that the methods ``choose_…`` change, and :meth:`choosing` restores.
 
@@ -258,6 +258,7 @@ class Inference(ABC):
             if short:
                 together = self.generate_clips(batch.select(short), seed=seed)
                 motion[short, : together.shape[1]] = together
+            # One by one: windows continue each other, and clips of different lengths would leave rows of a batch idle.
             for i in sorted({*range(len(lengths))} - {*short}):
                 clip, start = batch.select([i]), 0
                 speech = clip.audio[0, : int(clip.audio_lengths[0])]
@@ -374,7 +375,7 @@ class Inference(ABC):
         return self.samples
 
     def choose_low_latency(self) -> None:
-        """Answer speech at once from now on: frame by frame, and in few denoising steps where the model samples."""
+        """Animate with low latency from now on: frame by frame, in few denoising steps where the model samples."""
         self.windows = LOW_LATENCY
 
     def choose_expressivity(self, expressivity: Expressivity) -> None:
@@ -483,6 +484,8 @@ class Inference(ABC):
             the motion, and what to hand over to the next window.
         """
         whole = self.generate_samples(clip, seeds)
+        # The past was animated only so that the network knows it; frames that were given out already must not change
+        # any more.
         motion = whole[:, window.context + window.fixed : window.context + window.frames]
         if before is not None:
             motion = crossfaded(before[0], motion)
@@ -560,7 +563,7 @@ class SpeechStream(SpeechWindows[Motion]):
         self._tail: list[Tensor] | None = None  # what the latest window hands over to the next
 
     def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
-        """Hear more speech at 16 kHz, and give the motion that has become certain; it may have no frames.
+        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames.
 
         Raises:
             FaceDiffError: if the stream was finished.
@@ -573,6 +576,7 @@ class SpeechStream(SpeechWindows[Motion]):
     ) -> Motion:
         """By the model, at the level of all speech so far."""
         clip = with_speech(self.clip, torch.from_numpy(speech).to(self.clip.audio), frames)
+        # At the level of all speech so far: a window's own level would make a pause as loud as a shout.
         level = self.model.speech_encoder.at_level(mean, deviation)
         with level, self.model.expressed(self.expressivity):
             motion, self._tail = self.model.generate_window(clip, window, self.seeds, self._tail)
@@ -704,5 +708,6 @@ def crossfaded(
     """
     shared = before.shape[1]
     share = (torch.arange(shared, device=now.device, dtype=now.dtype) - fixed).clamp_min(0) / max(1, shared - fixed)
+    # Smoothstep: its slope is 0 at both ends, so that velocities have no jump where windows meet.
     smooth = (share * share * (3 - 2 * share)).view(-1, *[1] * (now.dim() - 2))
     return torch.cat([torch.lerp(before, now[:, :shared], smooth), now[:, shared:]], 1)

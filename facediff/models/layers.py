@@ -127,6 +127,8 @@ def interpolate_ends(features: Float[Tensor, "batch steps dim"], frames: int) ->
     Frame i lies at step i·(steps − 1)/(frames − 1), as the published methods of the field have it; see
     :func:`interpolate_frames` for the way in which frames keep their place in time.
     """
+    # align_corners as in the released code of FaceFormer and its successors: the first and the last step stay at the
+    # ends of the clip, and the released weights were trained on the stretched time that follows.
     return F.interpolate(features.transpose(1, 2), size=frames, mode="linear", align_corners=True).transpose(1, 2)
 
 
@@ -268,6 +270,7 @@ class Attention(nn.Module):
 
     def queries(self, x: Frames, rotation: Rotation | None = None) -> Float[Tensor, "batch heads frames head_dim"]:
         """All that ``x`` is needed for."""
+        # Rotated after the split: every head has all wavelengths, so that each may look near or far.
         query = self._split(self.query(x))
         return query if self.rotary is None else self.rotary(query, rotation)
 

@@ -87,6 +87,7 @@ class _FusedLosses(torch.autograd.Function):
         of_weight = torch.empty_like(weight) if needed[1] else None
         of_bias = torch.empty_like(bias) if bias is not None and needed[2] else None
         for block, rows in enumerate(blocks.rows):
+            # Rows are whole vertices, three coordinates each, since L_face needs a vertex's length.
             part = weight[rows]
             prediction = frames @ part.T if bias is None else torch.addmm(bias[rows], frames, part.T)
             # The prediction exists for one block at a time, and its memory becomes the gradient's.
@@ -177,6 +178,7 @@ class _Blocks:
     def losses(self, block: int, prediction: Tensor) -> tuple[Tensor, Tensor | None]:
         """The terms' values (4,) over a block, and the gradient of the weighted sum; the prediction is overwritten."""
         truth, (upper, shares) = self.truth[..., self.rows[block]], self.upper_face[block]
+        # First, while the prediction is still there: the differences below are written over it.
         face, pull = prediction.new_zeros(()), None
         if len(upper):
             face, pull = self._face(prediction, truth, upper, shares)
@@ -218,6 +220,8 @@ class _Blocks:
 
     def _spread(self, length: Tensor) -> tuple[Tensor, Tensor]:
         """What valid frames are off their clip's mean by (B, T, R), and its standard deviation (B, 1, R)."""
+        # The population's deviation over valid frames, as losses.masked_std has it; the two must agree, or training and
+        # its readable form drift apart.
         mean = (length * self.valid).sum(1, keepdim=True) / self.count
         off = (length - mean) * self.valid
         return off, (off.square().sum(1, keepdim=True) / self.count).sqrt()
@@ -233,6 +237,7 @@ def _huber_and_slope(gap: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
 
     With c, the gap clamped to ±1, the loss is c · (gap − c / 2) and its slope is c.
     """
+    # Without branches: |gap| ≤ 1 gives gap²/2, |gap| > 1 gives |gap| − ½, from one clamp that is the derivative too.
     slope = gap.clamp(-1, 1)
     gap.sub_(slope, alpha=0.5)
     slope *= share

@@ -1,7 +1,7 @@
 """The motion that a diffusion model noises: all vertices, as in the paper, or principal components of the corpus.
 
 From top to bottom: the two spaces, and the preconditioning that a space with known variances makes possible. Choosing
-``components`` changes three things at once:
+``components`` changes three things:
 
 - A frame is a few dozen numbers, whatever the mesh.
 - The noise hides the motion: vertices move together, so independent noise on thousands of them averages out, and a
@@ -229,5 +229,7 @@ class Preconditioning(nn.Module):
         self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
 
     def clean(self, noisy: Coordinates, features: Coordinates, step: Int[Tensor, " batch"]) -> Coordinates:
-        """The prediction of clean motion from the noisy one and what the network says of it."""
+        """The prediction of clean motion from the noisy one and the network's output."""
+        # c_skip and c_out of Karras et al. (2022, eq. 7), one for each component and step. At the clean end skip is 1
+        # and out 0, so that a network's errors no longer reach the sample.
         return self.skip[step][:, None] * noisy + self.out[step][:, None] * features

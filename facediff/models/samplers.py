@@ -449,6 +449,8 @@ class DpmSolverSampler(Sampler):
         # e^{−h} − 1: with many steps h is small, and the difference would lose its digits.
         decay = math.expm1(-h)
         signal = self.signal_rate[i + 1]
+        # The exact solution of the probability-flow equation for a prediction that stays constant over the step: the
+        # first order of DPM-Solver++, which is DDIM. All higher orders correct it.
         moved = self.noise_rate[i + 1] / self.noise_rate[i] * noisy - signal * decay * clean
         if order == 1:
             return moved
@@ -458,6 +460,7 @@ class DpmSolverSampler(Sampler):
         if order == 2:
             return moved - 0.5 * signal * decay * slope
         before = (self.time[i - 1] - self.time[i - 2]) / h
+        # The divided difference of second order: steps need not be equally long in λ.
         bend = (slope - (predictions[-2] - predictions[-3]) / before) / (ratio + before)
         slope = slope + ratio * bend
         # Third order (Lu et al. 2022, appendix): φ₂ = (e^{−h} − 1)/h + 1 weights the slope, φ₃ = (e^{−h} − 1 + h)/h² −

@@ -220,6 +220,8 @@ class TcnGruTransformer(StyleEncoder):
             packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
             x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
         # The position embedding P, stretched to each clip's length, and the Transformer (eq. 6).
+        # By relative place: a table of absolute positions would leave rows for long references untrained, and the
+        # reference's length is chosen by the user.
         rows = torch.full_like(lengths, self.positions.shape[0])
         positions = interpolate_frames(self.positions.expand(lengths.shape[0], -1, -1), rows, lengths)
         x = x + nn.functional.pad(positions, (0, 0, 0, mask.shape[1] - positions.shape[1]))
@@ -243,6 +245,8 @@ class TemporalBlock(nn.Module):
         super().__init__()
         reach = dilation * (kernel_size - 1)
         self.padding = (reach, 0) if causal else (reach // 2, reach - reach // 2)
+        # Weight norm and ReLU as in Bai et al.'s block; batch norm in its place would make a clip's style depend on the
+        # batch.
         self.first = weight_norm(nn.Conv1d(dim, dim, kernel_size, dilation=dilation))
         self.second = weight_norm(nn.Conv1d(dim, dim, kernel_size, dilation=dilation))
         self.dropout = nn.Dropout(dropout)

@@ -41,7 +41,7 @@ NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert"}
 class Wav2Vec2Encoder(AudioEncoder):
     """Pretrained wav2vec 2.0 or HuBERT, base or large; all but its convolutions is fine-tuned.
 
-    The published methods that facediff has (FaceFormer and others) hear speech through it; a model of facediff's own
+    The published methods that facediff has (FaceFormer and others) encode speech by it; a model of facediff's own
     may as well. ``hubert`` is the encoder that keeps more of the network frozen, whose frozen layers run once a clip.
 
     Args:
@@ -151,6 +151,8 @@ class Wav2Vec2Encoder(AudioEncoder):
     ) -> Float[Tensor, "batch most_steps width"]:
         """Encode as the published methods do; see :meth:`AudioEncoder.at_steps`."""
         features, lengths = cached or self.frozen_features(audio, audio_lengths)
+        # FaceFormer, CodeTalker and TalkingStyle resample between the convolutions and the Transformer, which then runs
+        # at the motion's rate; FaceDiffuser and DiffSpeaker resample its result. The weights fit one order only.
         early = rule.startswith("features")
 
         def resampled(x: Tensor, count: int) -> Tensor:
@@ -174,6 +176,9 @@ class Wav2Vec2Encoder(AudioEncoder):
                 hidden = network._mask_hidden_states(hidden)
             elif processes:
                 hidden = hidden + 0.0 * network.masked_spec_embed
+        # transformers' own forward pass written out, since it cannot be entered behind the convolutions, whose result
+        # is resampled or cached. The base networks normalise here, the large ones (``do_stable_layer_norm``) after the
+        # last layer.
         hidden = hidden + encoder.pos_conv_embed(hidden)
         hidden = encoder.dropout(hidden if large else encoder.layer_norm(hidden))
         for layer in encoder.layers:

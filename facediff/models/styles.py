@@ -67,6 +67,7 @@ def read_styles(
         )
     parts = split_styles(words, [*own, *(reference.clip for reference in model.assets.references.values())])
     if len(parts) == 1:
+        # A weight of one style would have to mean a distance from some other style, and there is none.
         if parts[0].weight not in (None, 1.0):
             raise OptionError.naming(
                 f"{{style}} {words}: one style alone cannot be weighted; mix it with another one (A:0.3,B:0.7)"
@@ -74,6 +75,7 @@ def read_styles(
         return read_style(parts[0].name, identity, model, template=template)
     shares = normalised(words, [part.weight for part in parts])
     styles = [read_style(part.name, identity, model, template=template) for part in parts]
+    # Vectors are mixed, not motions: two motions averaged frame by frame cancel each other where they differ in timing.
     vector = torch.stack([share * vector_of(s, model) for share, s in zip(shares, styles, strict=True)]).sum(0)
     names = [style.name if isinstance(style, Style) else style.clip for style in styles]
     return Style(" + ".join(f"{share:.3g} {name}" for share, name in zip(shares, names, strict=True)), vector)
@@ -271,7 +273,7 @@ def face_of_array(
 
     Args:
         opened: the array.
-        identity: the speaker, if the file's name names nobody who is known.
+        identity: the speaker, if the file's name contains no known one.
         model: its checkpoint's templates are known, and those of the corpus folder that the file lies in.
         given: a template that was given, or ``median``.
     """
@@ -311,6 +313,8 @@ def given_face(template: str | Path, opened: StyleFile, assets: Assets) -> Tenso
 
     path = Path(template)
     if str(template) == MEDIAN and not path.is_file():
+        # The median of each coordinate and not the mean: a face is at rest or nearly so in more frames than in any one
+        # expression, and wide openings would pull a mean.
         median = np.median(frames_of(opened, assets.n_vertices, 1), axis=0)
         print(
             f"note: --style {opened.path}: the median of its {len(opened.array)} frames stands for the neutral face; a "

@@ -223,6 +223,7 @@ class DualPathDiffusion(AnimationModel):
         """Besides principal components, how much noise hides of the training motion."""
         shapes = super().measure(data, PRINCIPAL if self.noise_scale == "auto" else at_least)
         if self.noise_scale == "auto" and shapes is not None:
+            # Shapes are as long as their standard deviations, so their squared lengths are the components' variances.
             variances = shapes[:PRINCIPAL].square().sum(1)
             self.rescale_noise(half_hidden(self.motion_space.noised_variances(variances), variances))
         self.motion_space.fit(self.process.signal)
@@ -361,6 +362,8 @@ class DualPathDiffusion(AnimationModel):
         conditions, motion, mask = self.conditions(batch), batch.motion, batch.mask
         if space.preconditioning is not None:
             motion = space.encode(motion * self.scale)
+        # Several noisy versions of a clip share its conditions: they lower the variance of the gradient at the price of
+        # the denoising network alone, without encoding speech and style again.
         draws = len(step) // len(batch)
         drawn = conditions
         if draws > 1:
@@ -382,6 +385,8 @@ class DualPathDiffusion(AnimationModel):
     ) -> dict[str, Tensor]:
         """The losses on the vertices."""
         network = self.network
+        # L_face is linear in the motion, the reconstruction quadratic while errors are below Huber's δ. Scaling motion
+        # by s divides the share of L_face by s, which is 100 to 200 on BIWI; ``corpus`` undoes that.
         face = self.loss_weights["face"] * (self.scale if self.face_weight_unit == "corpus" else 1.0)
         # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
         # takes longer than the arithmetic.
@@ -424,6 +429,8 @@ class DualPathDiffusion(AnimationModel):
         if self.style_identity is not None:
             terms["style_identity"] = style_identity_loss(self.style_identity(style), batch.identity)
         if weights["style_contrast"]:
+            # The reference and the target are clips of one speaker, which makes a positive pair of every clip, also
+            # in a batch of one speaker each.
             own = self.encode_style(batch.motion, batch.mask)
             terms["style_contrast"] = style_contrast(torch.cat([style, own]), batch.identity_names * 2)
         loss = losses["loss"]
@@ -446,6 +453,8 @@ class DualPathDiffusion(AnimationModel):
             identity, hidden = identity.masked_fill(hidden.identity, -1), hidden._replace(identity=None)
         views = self.views() if guided else {}
         if [*views] not in ([], [()]):
+            # All views are rows of one batch, so that guidance costs one call of the network per step and not one per
+            # view.
             hidden = Hidden(*(self._in_views(name, views, len(batch)) for name in CONDITIONS))
             conditions = network.conditions(batch, identity, self.style_of(batch), hidden)
             return replace(conditions, shares=tuple(views.values()))

@@ -135,6 +135,8 @@ class DualPathNetwork(nn.Module):
         self.mesh_encoder = mesh_encoder
         self.step_embedding = StepEmbedding(dim)
         self.fusion = fusion
+        # Eq. 13's norm. It takes the size of each frame's features away, which is one reason why the network cannot
+        # copy its input and a skip around it helps (Preconditioning).
         self.fused_norm = nn.LayerNorm(dim)
         self.decoder = decoder
         self.unembed = nn.Linear(dim, coordinates)
@@ -161,6 +163,8 @@ class DualPathNetwork(nn.Module):
         cached = batch.cached_features or ()
         audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
         mask, encoded = frame_mask(batch.frame_lengths, audio.shape[1]), dynamic_style
+        # Guidance asks for several views of every clip. The speech is encoded once and then repeated, since the audio
+        # encoder is the dearest part of the conditions.
         times = max((len(mask) for mask in hidden if mask is not None), default=len(batch)) // len(batch)
         if times > 1:
             audio, mask = audio.repeat(times, 1, 1), mask.repeat(times, 1)
@@ -244,6 +248,8 @@ class DualPathNetwork(nn.Module):
             preconditioning: the scales around the network in a space of its own; None on vertices.
         """
         first, last = self.embed, self.unembed
+        # Folding needs both ends linear in the motion. Preconditioning scales the motion differently in every step, and
+        # a space of components is narrow already.
         folded = folded and preconditioning is None and isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
         ends = [weight for weight in (first.weight, last.weight, last.bias) if weight is not None] if folded else []
 
@@ -282,6 +288,8 @@ class StyleTokens(nn.Module):
         if form == "single" and token_dims:
             token_dims = (sum(token_dims),)
         self.token_dims = token_dims
+        # A projection of their own puts parts of different widths into one space, and tells the decoder which level a
+        # token is: tokens carry no positions.
         self.projections = nn.ModuleList(nn.Linear(width, dim) for width in token_dims)
         self.null = None if token_dims else nn.Parameter(torch.zeros(1, 1, dim))
 

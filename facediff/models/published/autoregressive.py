@@ -91,7 +91,7 @@ class AutoregressiveModel(PublishedModel):
         """
         raise FaceDiffError(
             f"{type(self).__name__}: decodes frame by frame, which needs a graph with a memory, and cannot be "
-            f"exported; export a model that makes all frames at once, or animate with facediff animate"
+            f"exported; export a model that generates all frames in one pass, or animate with facediff animate"
         )
 
     def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
@@ -287,8 +287,7 @@ class PeriodicDecoder(nn.Module):
         frames = tokens.shape[1]
         x, bias = self.dropout(tokens + self.positions(frames)), self.bias(frames)
         for layer in self.layers:
-            # A prefix of the frames hears a prefix of the speech: the literal loop decodes 1, 2, 3 … frames of the same
-            # clip.
+            # A prefix of the frames goes with a prefix of the speech: the literal loop decodes 1, 2, 3 … frames.
             speech = layer.cross_attention.keys_values(memory[:, : frames * self.steps])  # type: ignore[union-attr, operator]
             x = layer(x, speech, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
         return x

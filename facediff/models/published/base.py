@@ -1,6 +1,6 @@
 """What the field's published methods have in common: each of them adds its network, its loss and its inference.
 
-They hear speech through a pretrained network at 50 steps a second, count their frames by it, know a speaker as one
+They encode speech by a pretrained network at 50 steps a second, count their frames by it, know a speaker as one
 column of a table, and train on motion as it is, without a scale, one clip at a time.
 """
 
@@ -54,8 +54,8 @@ NO_STYLE = Style("none", torch.zeros(0))
 class PublishedModel(AnimationModel):
     """Base of the published methods.
 
-    A method adds ``losses`` and :meth:`generate_frames`; it hears speech through ``audio_encoder``, and finds what
-    it knows of a clip's speaker in :meth:`identity_weights`.
+    A method adds ``losses`` and :meth:`generate_frames`; it encodes speech by ``audio_encoder``, and takes
+    the weights of a clip's speaker from :meth:`identity_weights`.
 
     Class attributes:
         published_encoder: the audio encoder as the method's authors use it.
@@ -67,8 +67,9 @@ class PublishedModel(AnimationModel):
         alignment: how speech at 50 steps a second meets motion: ``pairs`` of steps for each frame, or ``interpolated``;
             ``auto`` takes pairs at 25 frames a second, as the projects do.
         motion_scale: as in :class:`facediff.models.AnimationModel`; the published methods scale nothing.
-        weight_decay: likewise; the published methods train with Adam, which is AdamW with a decay of 0.
-        unseen_identity: likewise; the published methods condition an unseen speaker on each training identity in turn.
+        weight_decay: AdamW's; the published methods train with Adam, which is AdamW with a decay of 0.
+        unseen_identity: as in the same class; the published methods condition an unseen speaker on each training
+            identity in turn.
         options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
 
@@ -228,7 +229,7 @@ class PublishedModel(AnimationModel):
 
 
 class DirectModel(PublishedModel):
-    """Base of the published methods that make all frames at once, and nothing at random."""
+    """Base of the published methods that generate all frames in one pass, without random numbers."""
 
     @abstractmethod
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames *width"]:
@@ -270,7 +271,7 @@ class DirectModel(PublishedModel):
 
 
 def whole_model(model: PublishedModel, parts: list[Graph], sampling: SamplingLoop | None = None) -> Graphs:
-    """What is said of a published method besides its graphs."""
+    """A published method's graphs, with the facts that an exported model needs next to them."""
     style: StyleSource = "identity" if model.own_styles() else "none"
     longest = None if model.long_speech == "extend" else model.table_frames
     return Graphs(
@@ -302,7 +303,7 @@ class DirectMotion(nn.Module):
 
 
 def direct_graphs(model: DirectModel) -> Graphs:
-    """A method that makes all frames at once."""
+    """The graphs of a method that generates all frames in one pass."""
 
     def hear(heard: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
         return model.hear(heard, frames)
@@ -335,6 +336,8 @@ class SpeakerTable(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(count, dim))
         if like == "linear":
+            # PyTorch's start for a map of ``count`` inputs; normal rows would be some √(3·count) times as large and
+            # outweigh speech at first.
             nn.init.uniform_(self.weight, -1 / math.sqrt(count), 1 / math.sqrt(count))
         else:
             nn.init.normal_(self.weight)

@@ -51,7 +51,7 @@ class CodeTalker(AutoregressiveModel):
     """CodeTalker: an autoregressive Transformer over the codes of a discrete prior of motion.
 
     Train it twice: with ``stage=prior``, then with ``stage=predictor`` and ``prior`` the first run's checkpoint; the
-    second run's holds both. A prior alone hears nothing: a test of it scores how well it reconstructs motion.
+    second run's holds both. A prior alone takes no speech: a test of it scores how well it reconstructs motion.
 
     Args:
         stage: ``prior`` is the autoencoder alone; ``predictor`` trains what finds its codes, and leaves it as it is.
@@ -77,8 +77,8 @@ class CodeTalker(AutoregressiveModel):
             which gives one constant face whatever the speech is, since normalisation over equal frames leaves nothing
             of them; or a ``still`` face.
         history: which frames the predictor continues in training: the ``true`` ones as published, which lets it learn
-            to continue motion rather than to hear; or its ``own``, which it makes from a face that does not move, and
-            then anew from what it has made, once to three times.
+            to continue motion without regard to the speech; or its ``own``, generated from a face that does not move,
+            and then again from its own output, in one to three passes.
         output: which motion is given: all codes decoded ``together`` as published, or the frames that were ``fed_back``
             while it was generated, each decoded with those before it only.
         commitment: weight with which tokens are drawn to their codes.
@@ -164,7 +164,7 @@ class CodeTalker(AutoregressiveModel):
         self._lacks_prior = False
         if stage == "prior":
             self.windows = type(self.windows)(above=math.inf)
-            self.unseen_identity = "style_only"  # whoever it is, the same motion is reconstructed
+            self.unseen_identity = "style_only"  # the reconstruction does not depend on the speaker
             return
         # The second stage speaks a language that is fixed: were the prior trained along, the codes that are its targets
         # would move with the prediction.
@@ -339,8 +339,8 @@ class CodeTalker(AutoregressiveModel):
     def cached(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
         """Codes (B, T, width) and the frames that were fed back, with what does not change kept.
 
-        The predictor's keys, values and codes of earlier frames stay as they are. The prior sees all frames at once and
-        normalises over them, so what it makes of earlier ones changes with every frame: it decodes all codes again,
+        The predictor's keys, values and codes of earlier frames stay as they are. The prior attends to all frames and
+        normalises over them, so its output for earlier ones changes with every frame: it decodes all codes again,
         but in its last layer and map the newest frame alone.
         """
         state, token = self.network.decoder.start(memory), style[:, None]
@@ -394,7 +394,7 @@ class CodeTalker(AutoregressiveModel):
         """
         if not self.animates:
             raise FaceDiffError(
-                "this checkpoint is CodeTalker's prior alone, which reconstructs motion and hears no speech; train the "
+                "this checkpoint is CodeTalker's prior alone, which reconstructs motion and takes no speech; train the "
                 "predictor with model.stage=predictor and --model.prior, and animate with its checkpoint"
             )
         return super().clip_of(audio, identity, style, condition, frames)
@@ -415,7 +415,7 @@ class CodeTalker(AutoregressiveModel):
         return AnimationModel.generate_samples(self, clip, seeds, progress=progress)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """As every model; a prior alone is not tried with other speech, which it would not hear."""
+        """As every model; a prior alone is not tested with other speech, since it takes none."""
         if self.stage == "prior":
             batch = replace(batch, decoy_audio=None)
         super().test_step(batch, batch_idx, dataloader_idx)
@@ -430,7 +430,7 @@ def no_prior() -> FaceDiffError:
 
 
 class NoSpeech(AudioEncoder):
-    """In place of an audio encoder where no speech is heard.
+    """Stands in for the audio encoder of a model that takes no speech.
 
     Args:
         dim: has no meaning.
@@ -440,12 +440,12 @@ class NoSpeech(AudioEncoder):
         super().__init__()
 
     def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
-        """Refuse to hear.
+        """Refuse speech.
 
         Raises:
             FaceDiffError: always.
         """
-        raise FaceDiffError("CodeTalker's prior alone hears no speech; use the checkpoint of its predictor")
+        raise FaceDiffError("CodeTalker's prior alone takes no speech; use the checkpoint of its predictor")
 
 
 class Predictor(SpokenDecoder):

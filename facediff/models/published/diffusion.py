@@ -91,7 +91,7 @@ def features_graph(model: DiffusionModel, network: LinearEnds, steps: int) -> Gr
     """Speech to features in the network's width.
 
     Args:
-        model: hears speech by its audio encoder.
+        model: whose audio encoder is used.
         network: the model's.
         steps: of the audio encoder for each frame.
     """

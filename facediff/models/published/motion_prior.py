@@ -1,8 +1,8 @@
 """A discrete prior of facial motion: an autoencoder whose frames are a few entries each of a learnt table of codes.
 
 The first stage of CodeTalker. Motion goes through two halves that are built alike (:class:`Half`); between them, every
-frame's vector is cut into tokens, and each token becomes the nearest code. Both halves see all frames of a clip at once
-and normalise over them, so clips of different lengths never go through them together.
+frame's vector is cut into tokens, and each token becomes the nearest code. Both halves attend to all frames of a
+clip and normalise over them, so clips of different lengths never go through them together.
 """
 
 from __future__ import annotations

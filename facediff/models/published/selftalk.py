@@ -56,7 +56,7 @@ class SelfTalk(DirectModel):
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: in the decoder and the lip reader.
         lip_reader: what reads the generated lips in training: as published, a Transformer that learns from the ``text``
-            that a frozen recogniser hears; or ``none``, which needs no recogniser and leaves its two losses out.
+            that a frozen recogniser transcribes; or ``none``, which needs no recogniser and leaves its two losses out.
             Inference needs neither.
         lip_vertices: vertices that the lip reader sees, in its map's order, repeats kept; the corpus's lips if None.
         lip_layers: encoder layers of the lip reader, and as many decoder layers.
@@ -149,7 +149,7 @@ class SelfTalk(DirectModel):
         if self.text is not None and self.reader is None:
             lips: list[int] = assets.regions["lips"].tolist()
             self.reader = self._make_reader(self.text, lips).to(self.device)
-            # So that whoever rebuilds the model from its options, as loading and adaptation do, makes the same reader.
+            # Loading and adaptation rebuild the model from its options, and must make the same reader.
             self.hparams["lip_vertices"] = lips
 
     def _make_reader(self, text: TextNetwork, vertices: Sequence[int]) -> LipReader:
@@ -174,7 +174,7 @@ class SelfTalk(DirectModel):
     # Training.
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Squared errors of positions and velocities, and what the lip reader makes of the generated lips."""
+        """Squared errors of positions and velocities, and the two losses of the lip reader."""
         frames = self.trained_frames(batch)
         longest = int(frames.max())
         truth = (batch.motion * self.scale).flatten(2)[:, :longest]
@@ -265,7 +265,7 @@ class SelfTalkNetwork(nn.Module):
     def forward(
         self, speech: Float[Tensor, "batch frames width"], frames: Int[Tensor, " batch"] | None
     ) -> Float[Tensor, "batch frames coordinates"]:
-        """Speech is what is decoded, and what is attended to; every frame sees all of it, and no frame its number."""
+        """The speech features are both decoded and attended to, without positions or a mask."""
         tokens = self.audio_map(speech)
         padding = None if frames is None else padding_of(frames, tokens.shape[1])
         # The published decoder attends to its own input in both attentions, without positions and without a causal
@@ -350,7 +350,7 @@ class LipReader(nn.Module):
 
 
 class Transcription(NamedTuple):
-    """What a recogniser hears: hidden states (batch, steps, dim), likeliest letters (batch, steps), valid steps."""
+    """A recogniser's output: hidden states (batch, steps, dim), likeliest letters (batch, steps), valid steps."""
 
     features: Tensor
     letters: Tensor
@@ -387,7 +387,7 @@ class TextNetwork(nn.Module):
 
     @torch.no_grad()
     def forward(self, audio: Waves, audio_lengths: Lengths) -> Transcription:
-        """Hear speech, each clip by itself."""
+        """Transcribe speech, each clip by itself."""
         # ε = 1e-7, as transformers has had it since 4.26, which SelfTalk was trained with; FaceFormer's 1e-5 differs by
         # 0.5 % for quiet speech.
         features, steps = by_length(standardise(audio, audio_lengths), audio_lengths, self._hidden)

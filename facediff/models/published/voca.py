@@ -46,7 +46,7 @@ class Voca(DirectModel):
         dim: channels of the dense layer after the convolutions.
         components: linear shapes.
         channels: of the convolutions, each of which halves the window.
-        speech_window: rows of speech that a frame hears, half of them before it.
+        speech_window: rows of speech around each frame, half of them before it.
         rows_per_frame: rows of speech from one frame to the next; as many as bring the rows closest to the published
             60 a second if None: 1 at 60 frames a second, 2 at 30 and 25.
         velocity_weight: of the error of differences between frames, next to that of the frames.
@@ -318,7 +318,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> d
         )
     if facts.graph is None:
         raise OptionError.naming(
-            f"{weights.source}: holds VOCA without DeepSpeech, through whose logits it hears; give the graph "
+            f"{weights.source}: holds VOCA without DeepSpeech, whose logits are its input; give the graph "
             f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as {{option}} deepspeech=output_graph.pb"
         )
     if facts.audio_config is not None:

@@ -65,6 +65,7 @@ class MotionDistance:
             upper: vertices of the upper face; not looked at if None.
         """
         face = motion.new_zeros(())
+        # As a share of the truth's own size, since squared errors of small movements vanish next to those of the lips.
         if self.upper_face and upper is not None:
             face = relative_error(motion[:, :, upper], truth[:, :, upper], mask)
         gap = motion.new_zeros(())
@@ -84,6 +85,7 @@ class MotionDistance:
 def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch frames pairs"]:
     """Distances between the paired vertices; its gradient is finite where they touch."""
     upper, lower = (motion[:, :, pairs[:, side]] + rest[:, None, pairs[:, side]] for side in (0, 1))
+    # The root's slope is infinite at 0, which closed lips reach in every p, b and m.
     return ((upper - lower).square().sum(-1) + EPSILON).sqrt()
 
 
@@ -113,6 +115,7 @@ def relative_distance(
     A share, so that it is not made small by making all values small.
     """
     kept, other = values[mask], others[mask]
+    # A single frame has no variance to be a share of.
     if len(kept) < 2:
         return values.new_zeros(())
     # Two independent values of one distribution are twice its variance apart, hence the factor 2: unrelated contents
@@ -122,7 +125,7 @@ def relative_distance(
 
 
 def style_distance(styles: Float[Tensor, "clips dim"], identities: Sequence[str]) -> Float[Tensor, ""]:
-    """Mean squared difference of two styles of one identity, over all such pairs; 0 if nobody has two styles.
+    """Mean squared difference of two styles of one identity, over all such pairs; 0 if no identity has two styles.
 
     Args:
         styles: style vectors.
@@ -198,7 +201,7 @@ def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
 
     Args:
         batch: clips; one that is left over is its own partner.
-        alignments: aligns recordings of one sentence; None aligns nobody.
+        alignments: aligns recordings of one sentence; None aligns no pairs.
     """
     count, frames = batch.mask.shape
     partner = torch.arange(count)
@@ -211,7 +214,7 @@ def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
     places = torch.zeros(count, frames, dtype=torch.long)
     aligned = torch.zeros(count, frames, dtype=torch.bool)
     if alignments is not None and batch.partner_frames is not None:
-        # Windows of clips, which the data set has aligned already: it has heard the whole clips.
+        # Windows of clips, which the data set has aligned already, from the speech of the whole clips.
         places = batch.partner_frames.cpu().clamp_min(0)
         aligned = (batch.partner_frames >= 0).cpu() & (partner != torch.arange(count))[:, None]
         device = batch.motion.device

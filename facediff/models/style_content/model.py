@@ -294,9 +294,12 @@ class StyleContentDisentanglement(AnimationModel):
         # no true motion exists, and content and style that are encoded again must be those that went in.
         swapped = self.decode_scaled(content, style[partner], mask)
         again, style_again = network.content(swapped, mask), self.style_of_window(batch, swapped)
+        # Two people who say the same share the movements of lips and jaw in time, and not those of brows and lids.
         lower = self.lower_face() if self.swap_region == "lower_face" else None
         terms["swap"] = self.distance_to(batch, swapped, pairing.of_partner(motion), pairing.aligned, lower)
         free = pairing.unaligned
+        # Detached: the swapped motion is to give back the content that went in, and the content must not move towards
+        # what is easy to give back.
         terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), counted & free[:, None])
         target = style[partner].detach()
         terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], target[:, None], free[:, None])
@@ -370,7 +373,7 @@ class StyleContentDisentanglement(AnimationModel):
     def encode_content(
         self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames content_dim"]:
-        """Content of motion: what is said, without who says it; zero on padding."""
+        """Content of motion, independent of the speaker; zero on padding."""
         return self.network.content(motion * self.scale, mask)
 
     def decode(

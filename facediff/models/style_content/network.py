@@ -184,11 +184,13 @@ class StyleContentDecoder(nn.Module):
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Motion, flattened to 3V coordinates; what stands on padding frames has no meaning and no effect."""
         x = content
+        # Before every convolution and not only the first: a deep decoder would otherwise forget who speaks.
         repeated = style[:, None].expand(-1, content.shape[1], -1)
         valid = mask[..., None].to(content.dtype)
         for conv, kernel in zip(self.convolutions, self.kernels, strict=True):
             # Padding is zeroed again before each convolution: its own bias would otherwise fill it.
             columns = (torch.cat([x, repeated], dim=-1) * valid).transpose(1, 2)
+            # Zeros at the front alone keep the length and show no future frame, which a stream does not have yet.
             columns = nn.functional.pad(columns, (kernel - 1, 0))
             x = nn.functional.leaky_relu(conv(columns).transpose(1, 2), SLOPE)
         coefficients = self.connected(x)
@@ -281,6 +283,7 @@ class WindowedTransformer(nn.Module):
         x = self.embed(windows.flatten(0, 1)) + self.positions
         for layer in self.layers:
             x = layer(x, x)
+        # The middle feature alone asks, so that the decoder layer costs one query a frame and not a whole window.
         middle = x[:, self.before : self.before + 1]
         return self.out(self.query(middle, x)).view(*windows.shape[:2], -1)
 
