@@ -1,4 +1,4 @@
-"""Models: LightningModules that turn speech into facial motion, and the components that they are made of."""
+"""Models: LightningModules that turn speech into facial motion, and their components."""
 
 from typing import TYPE_CHECKING
 

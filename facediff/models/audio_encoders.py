@@ -111,7 +111,7 @@ class AudioEncoder(nn.Module, ABC):
         Args:
             audio: as :meth:`forward` takes it.
             audio_lengths: as :meth:`forward` takes it.
-            steps: how many are wanted of each clip.
+            steps: number of steps of each clip's features.
             rule: where they come from.
             cached: features of the frozen part with their lengths, if they are at hand.
 
@@ -124,14 +124,14 @@ class AudioEncoder(nn.Module, ABC):
     def at_rate(
         self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rate: float, *cached: Tensor
     ) -> Float[Tensor, "batch most_steps width"]:
-        """Encode as VOCA does: at so many steps a second, the first of them where speech begins.
+        """Encode as VOCA does: at ``rate`` steps a second, the first of them where speech begins.
 
         Here for encoders whose own steps have no such times: as many steps, spread over the clip evenly.
 
         Args:
             audio: as :meth:`forward` takes it.
             audio_lengths: as :meth:`forward` takes it.
-            steps: how many are wanted of each clip.
+            steps: number of steps of each clip's features.
             rate: steps a second.
             cached: features of the frozen part with their lengths, if they are at hand.
 

@@ -69,7 +69,7 @@ def open_content(
 
     Args:
         path: a checkpoint, which may be open; a model folder; or a name of the Hugging Face hub.
-        weights: whether the weights of a model folder are wanted too.
+        weights: whether to read the weights of a model folder too.
 
     Raises:
         FaceDiffError: if there is none, or it is damaged.

@@ -69,7 +69,7 @@ class DecoderConstants(NamedTuple):
     """What the decoding of a clip does not compute in every step.
 
     Attributes:
-        tokens: what each block attends to: the style tokens, or what its attention makes of them.
+        tokens: what each block attends to: the style tokens, or the products of them that its attention needs.
         mask: True on valid frames; None if nothing is padded.
         rotation: rotary positions of all blocks.
     """
@@ -179,7 +179,7 @@ class TokenProducts(NamedTuple):
 
 
 PreparedTokens = TokenProducts | AttentionContext
-"""What an attention to a few tokens makes of them."""
+"""What an attention to a few tokens computes from them, once for all queries."""
 
 
 class TokenAttention(Attention):
@@ -192,7 +192,7 @@ class TokenAttention(Attention):
         context_mask: Bool[Tensor, "batch keys"] | None = None,
         rotation: Rotation | None = None,
     ) -> Frames:
-        """Attend from ``x`` to all of ``context``, which may be what :meth:`prepare` made of it."""
+        """Attend from ``x`` to all of ``context``, or to the result of :meth:`prepare` for it."""
         if isinstance(context, Tensor):
             if context_mask is not None:
                 return super().forward(x, context, context_mask, rotation)

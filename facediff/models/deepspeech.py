@@ -245,7 +245,7 @@ def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
 
 
 def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
-    """The network's sizes, if it can be made of them.
+    """The network's sizes, checked.
 
     Raises:
         ArgumentError: if they are others than expected.

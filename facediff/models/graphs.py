@@ -37,7 +37,7 @@ StyleSource = Literal["reference", "identity", "none"]
 """What a style is: a vector of a reference motion, a training identity, or nothing that the model knows."""
 
 Blending = Literal["steps", "motion"]
-"""Where windows of long speech go over into one another: in every denoising step, or in the motion."""
+"""Where overlapping windows of long speech are blended: in every denoising step, or in the motion."""
 
 NoiseOf = Literal["clip", "seed"]
 """What noise depends on: the clip's name and the seed, or the seed alone."""
@@ -143,7 +143,7 @@ def update_table(sampler: Sampler) -> list[list[float]]:
     for i in range(sampler.steps):
         count = min(i + 1, sampler.memory)
         row = []
-        # A linear function is known by what it makes of each unit vector.
+        # A linear function is determined by its values at the unit vectors.
         for place in range(5):
             noisy, *predictions = (one if place == unit else zero for unit in range(4))
             drawn = one if place == 4 else zero

@@ -41,7 +41,7 @@ Rotation = tuple[Tensor, Tensor]
 
 
 class AttentionContext(NamedTuple):
-    """What an attention makes of its context, both (batch, heads, keys, head_dim)."""
+    """Keys and values of an attention's context, both (batch, heads, keys, head_dim)."""
 
     key: Tensor
     value: Tensor

@@ -83,7 +83,7 @@ class PrincipalComponents(nn.Module):
             return centred @ self.basis.T / self.deviations
 
     def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames vertices 3"]:
-        """The scaled offsets that have these components, and are the mean beside them."""
+        """The scaled offsets with these components; all other components are those of the mean."""
         with torch.autocast(components.device.type, enabled=False):
             back = components.to(self.basis.dtype) * self.deviations
             # The basis is orthonormal in weighted coordinates, so its transpose is its inverse there; then the weights

@@ -151,7 +151,7 @@ class OffsetModel(AutoregressiveModel):
 
 
 class ProjectedKeysValues(NamedTuple):
-    """What attention has made of some positions, both (batch, heads, positions, head_dim)."""
+    """Keys and values of some positions, both (batch, heads, positions, head_dim)."""
 
     key: Tensor
     value: Tensor

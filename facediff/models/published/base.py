@@ -115,7 +115,7 @@ class PublishedModel(AnimationModel):
         """Offsets from the template, in the corpus's unit.
 
         Args:
-            batch: clips; what is wanted of them is their speech and identity.
+            batch: clips, of which speech and identity are used.
             frames: how many each clip gets, at least 1, as :meth:`frames_of` counts them.
             seeds: of the noise, one for each clip; equal seeds of clips as long as each other give equal noise.
             progress: wraps the iteration over steps.
@@ -364,7 +364,7 @@ def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEn
 
 
 def held(motion: BatchMotion, frames: Int[Tensor, " batch"], lengths: Int[Tensor, " batch"]) -> BatchMotion:
-    """Motion of ``wanted`` frames of each clip: cut, or with its last frame held; zero on padding."""
+    """Motion of ``lengths`` frames of each clip: cut, or with its last frame held; zero on padding."""
     longest = int(lengths.max())
     # An index past the last frame becomes the last frame, which holds it.
     places = torch.arange(longest, device=motion.device)[None].minimum(frames[:, None] - 1)

@@ -510,7 +510,7 @@ class SpeakerStep(nn.Module):
         state: Float[Tensor, "batch frames state"],
         step: Int[Tensor, " batch"],
     ) -> tuple[Tensor, Tensor]:
-        """The prediction, and the features that it is made of."""
+        """The prediction, and the features that it is a map of."""
         model, network, space = self.model, self.model.network, self.model.space()
         conditions = network.conditions(features, model.weights_of(identity), None)
         hidden = network(space.embed(state[..., : space.width]), step, conditions)

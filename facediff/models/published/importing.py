@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Imported:
-    """A model made of an author's checkpoint.
+    """A model converted from an author's checkpoint.
 
     Attributes:
         model: ready for inference.

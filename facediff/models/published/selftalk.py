@@ -285,7 +285,7 @@ def padding_of(lengths: Int[Tensor, " batch"], longest: int) -> Tensor | None:
 
 
 class Read(NamedTuple):
-    """What the lip reader makes of lips: its features, and a number for each letter, both (batch, steps, …)."""
+    """The lip reader's output: its features, and a number for each letter, both (batch, steps, …)."""
 
     features: Tensor
     letters: Tensor

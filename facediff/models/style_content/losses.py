@@ -1,6 +1,6 @@
 """Distances of motions, contents and styles, and which recording goes with which, on padded batches with a mask.
 
-First the distances that the objectives of style-content disentanglement are made of, then the pairs of clips that they
+First the distances in the objectives of style-content disentanglement, then the pairs of clips that they
 compare.
 """
 

@@ -61,7 +61,7 @@ class StyleContentDisentanglement(AnimationModel):
         mesh_encoder: motion to one feature per frame, made once for content and once for style.
         style_encoder: these features to the style vector.
         window_seconds: length of the speech window around each frame.
-        speech_rate: speech features a second that the window is made of; as many as motion has frames if None.
+        speech_rate: speech features a second in the window; as many as motion has frames if None.
         speech_layers: encoder layers over the window.
         speech_heads: attention heads of these.
         decoder_channels: channels of the decoder's three convolutions.

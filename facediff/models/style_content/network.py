@@ -99,7 +99,7 @@ class DisentanglementNetwork(nn.Module):
     def content_of(
         self, heard: Spoken, lengths: Int[Tensor, " batch"], frames: int
     ) -> Float[Tensor, "batch frames content_dim"]:
-        """Content of speech, of so many frames each."""
+        """Content of speech, of ``lengths`` frames each."""
         cached = heard.cached_features or ()
         # The encoder gives features at any rate, as if motion had so many frames.
         # Rounded in the same way for every clip, and at least one step, so that a clip's features do not depend on its
