@@ -94,7 +94,7 @@ def test_a_mixture_is_the_weighted_mean_of_style_vectors(
         ("A_e01:0.3", "one style alone cannot be weighted"),
         ("A_e01:0.3,", "expected names or files with weights"),
         (":0.3,A_e01:1", "expected names or files with weights"),
-        ("A_e01:0.5,nobody.npy:0.5", "--style nobody.npy: no such file"),
+        ("A_e01:0.5,nobody.npy:0.5", "style nobody.npy: no such file"),
     ],
 )
 def test_words_that_make_no_style(words: str, sentence: str, model: DualPathDiffusion) -> None:
@@ -125,7 +125,7 @@ def test_an_unseen_speakers_style_needs_their_template(
     suffix: str, unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
 ) -> None:
     path, face, offsets = unseen
-    with pytest.raises(FaceDiffError, match="give that person's neutral face with --style-template"):
+    with pytest.raises(FaceDiffError, match="give that person's neutral face with style_template"):
         read_styles(str(path), "A", model)
     template = tmp_path / f"neutral.{suffix}"
     if suffix == "npy":
