@@ -16,7 +16,7 @@ from facediff.animation import Animation
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.folder import Arrays, Description
 from facediff.runtime.graphs import ExportedGraphs
-from facediff.runtime.sampling import NAME, RuntimeConditions, WindowSpeech, clip_motion, window_motion
+from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, WindowSpeech, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, encode_style, read_style
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, MotionWindow, SpeechWindows, WindowPlan
@@ -53,30 +53,15 @@ class RuntimeModel(ExportedGraphs):
         if quick := self.description.quick_steps:
             self.loop = list(zip(quick, self.description.quick_table, strict=True))
 
-    def animate(
-        self,
-        audio: Array,
-        *,
-        identity: str | None = None,
-        condition: str | None = None,
-        style: str | RuntimeStyle | None = None,
-        seed: int = 0,
-        expressivity: float = 1.0,
-        name: str = NAME,
-    ) -> Animation:
+    def animate(self, audio: Array, *, name: str = NAME, **choices: Any) -> Animation:  # noqa: ANN401
         """Animate a face with speech, as the model moves it: also in pauses.
 
         Args:
             audio: speech (S,) at 16 kHz.
-            identity: whose face and identity; the first one trained on if None.
-            condition: the training identity that the model is conditioned on, where it is not that of the face.
-            style: name of a style in the folder, a file or a mixture as ``--style`` takes them, or the result of
-                :meth:`encode_style`; that of the face's identity if None.
-            seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
-            expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
             name: of the animation.
+            choices: fields of :class:`~facediff.runtime.sampling.RuntimeChoices`: who moves, in which style.
         """
-        stream = self.stream(identity=identity, condition=condition, style=style, seed=seed, expressivity=expressivity)
+        stream = self.stream(**choices)
         audio = np.ascontiguousarray(audio, np.float32)
         if audio.ndim != 1 or not np.isfinite(audio).all():
             raise FaceDiffError(f"audio: is {audio.dtype} {audio.shape}; expected finite samples (S,) at 16 kHz")
@@ -95,30 +80,14 @@ class RuntimeModel(ExportedGraphs):
             vertices = np.concatenate(list(stream.parts(audio, frames=frames)))
         return self.animation(vertices, stream, audio, name)
 
-    def stream(
-        self,
-        *,
-        identity: str | None = None,
-        condition: str | None = None,
-        style: str | RuntimeStyle | None = None,
-        seed: int = 0,
-        expressivity: float = 1.0,
-        plan: WindowPlan | None = None,
-    ) -> RuntimeStream:
+    def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> RuntimeStream:  # noqa: ANN401
         """Animate speech of any length while it arrives.
 
         Args:
-            identity: as :meth:`animate` takes it.
-            condition: as :meth:`animate` takes it.
-            style: as :meth:`animate` takes it.
-            seed: as :meth:`animate` takes it.
-            expressivity: as :meth:`animate` takes it.
             plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
-
-        Raises:
-            FaceDiffError: as :meth:`animate`.
+            choices: as :meth:`animate` takes them.
         """
-        face, conditions = self._face(identity, condition, style, seed, expressivity)
+        face, conditions = self._face(RuntimeChoices(**choices))
         return RuntimeStream(self, face, conditions, plan or self.windows)
 
     def animation(self, vertices: Array, stream: RuntimeStream, audio: Array | None, name: str) -> Animation:
@@ -138,9 +107,9 @@ class RuntimeModel(ExportedGraphs):
             **({} if about.style_source == "none" else {"style": conditions.style_name}),
         }
         if about.generation == "sampled":
-            metadata |= {"seed": str(conditions.seed), "sampler": f"{about.sampler}, {len(self.loop)} steps"}
-        if conditions.expressivity != 1:
-            metadata["expressivity"] = f"{conditions.expressivity:g}"
+            metadata |= {"seed": str(conditions.choices.seed), "sampler": f"{about.sampler}, {len(self.loop)} steps"}
+        if conditions.choices.expressivity != 1:
+            metadata["expressivity"] = f"{conditions.choices.expressivity:g}"
         optional = {key: arrays[key] for key in ("faces", "colours", "inner_lip_pairs") if key in arrays}
         return Animation(
             name=name,
@@ -154,24 +123,18 @@ class RuntimeModel(ExportedGraphs):
             **cast(Any, optional),
         )
 
-    def _face(
-        self,
-        identity: str | None,
-        condition: str | None,
-        style: str | RuntimeStyle | None,
-        seed: int,
-        expressivity: float,
-    ) -> tuple[int, RuntimeConditions]:
+    def _face(self, choice: RuntimeChoices) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and the conditions of its motion."""
-        about = self.description
-        chosen = identity if identity is not None else (about.identities or about.faces)[0]
+        about, style = self.description, choice.style
+        chosen = choice.identity if choice.identity is not None else (about.identities or about.faces)[0]
         if chosen not in about.faces:
             raise OptionError("identity", f'there is no "{chosen}": {choices(chosen, about.faces)}')
-        if condition is not None and condition not in about.identities:
+        if choice.condition is not None and choice.condition not in about.identities:
             raise OptionError(
-                "condition", f'the model was not trained on "{condition}": {choices(condition, about.identities)}'
+                "condition",
+                f'the model was not trained on "{choice.condition}": {choices(choice.condition, about.identities)}',
             )
-        conditioned_on = chosen if condition is None else condition
+        conditioned_on = chosen if choice.condition is None else choice.condition
         vector = RuntimeStyle(conditioned_on, np.zeros(0, np.float32))
         if about.style_source == "reference":
             source = chosen if style is None else style
@@ -186,15 +149,15 @@ class RuntimeModel(ExportedGraphs):
                 raise OptionError("style", f'there is no "{style}": {choices(str(style), about.styles)}')
             conditioned_on = str(style)
             vector = RuntimeStyle(conditioned_on, vector.vector)
-        for option, value, kind in (("seed", seed, Seed), ("expressivity", expressivity, Expressivity)):
+        for option, value, kind in (("seed", choice.seed, Seed), ("expressivity", choice.expressivity, Expressivity)):
             if (expected := mismatch(kind, value)) is not None:
                 raise OptionError(option, f"out of range; expected {expected}", value)
-        if expressivity != 1 and about.last_step < 0:
+        if choice.expressivity != 1 and about.last_step < 0:
             raise OptionError("expressivity", f"{about.model} predicts no mean of its motion; omit the option")
         face = about.faces.index(chosen)
         index = about.identities.index(conditioned_on) if conditioned_on in about.identities else -1
         template = self.arrays["templates"][face].astype(np.float32)
-        return face, RuntimeConditions(index, vector.vector, vector.name, template, seed, expressivity)
+        return face, RuntimeConditions(index, vector.vector, vector.name, template, choice)
 
     def encode_style(self, motion: Array, *, name: str = "reference") -> RuntimeStyle:
         """The style of a reference motion.

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from facediff.errors import OptionError
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.noise import NumpyClipNoise, NumpyWindowNoise, SeedNoise
+from facediff.runtime.styles import RuntimeStyle
 from facediff.speech.windows import MotionWindow
 
 Array = npt.NDArray[np.float32]
@@ -24,6 +25,26 @@ Draw = Callable[[int, int], Array]
 
 
 @dataclass(frozen=True)
+class RuntimeChoices:
+    """Who moves and how: the keywords of :meth:`RuntimeModel.animate` and :meth:`RuntimeModel.stream`.
+
+    Attributes:
+        identity: whose face and identity; the first one trained on if None.
+        condition: the training identity that the model is conditioned on, where it is not that of the face.
+        style: name of a style in the folder, a file or a mixture as ``--style`` takes them, or the result of
+            :meth:`RuntimeModel.encode_style`; that of the face's identity if None.
+        seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
+        expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
+    """
+
+    identity: str | None = None
+    condition: str | None = None
+    style: str | RuntimeStyle | None = None
+    seed: int = 0
+    expressivity: float = 1.0
+
+
+@dataclass(frozen=True)
 class RuntimeConditions:
     """Conditions of the motion other than speech."""
 
@@ -31,8 +52,7 @@ class RuntimeConditions:
     style: Array
     style_name: str
     template: Array
-    seed: int
-    expressivity: float
+    choices: RuntimeChoices
 
 
 @dataclass(frozen=True)
@@ -59,10 +79,10 @@ def clip_motion(model: ExportedGraphs, speech: WindowSpeech, conditions: Runtime
     if about.generation == "direct":
         motion = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
     elif about.noise_of == "seed":
-        noise = SeedNoise(conditions.seed)  # such a model predicts no mean, so there is no other noise
+        noise = SeedNoise(conditions.choices.seed)  # such a model predicts no mean, so there is no other noise
         motion = SamplerRun(model, conditions, None, 0).run(features, noise, noise)
     else:
-        noises = NumpyClipNoise(NAME, [conditions.seed]), NumpyClipNoise(f"{NAME}/mean", [0])
+        noises = NumpyClipNoise(NAME, [conditions.choices.seed]), NumpyClipNoise(f"{NAME}/mean", [0])
         motion = SamplerRun(model, conditions, None, 0).run(features, *noises)
     if motion.shape[1] == speech.frames:
         return motion
@@ -99,7 +119,7 @@ def window_motion(
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
     features = np.ascontiguousarray(features_of(model, speech, speech.frames)[:, own_frames])
     sampling = SamplerRun(model, conditions, before, window.shared, window.fixed)
-    noise = NumpyWindowNoise(NAME, window, [conditions.seed])
+    noise = NumpyWindowNoise(NAME, window, [conditions.choices.seed])
     motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
     return motion, [kept[:, -window.kept :] for kept in sampling.kept]
 
@@ -178,7 +198,7 @@ class SamplerRun:
 
     def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
         """Offsets from the template (1, frames, vertices, 3), but for those frames that are given out already."""
-        about, share = self.model.description, self.conditions.expressivity
+        about, share = self.model.description, self.conditions.choices.expressivity
         frames, width = features.shape[1], about.drawn or about.state
         mean = None
         if share != 1:
