@@ -174,7 +174,13 @@ VARIANTS: dict[str, dict[str, object]] = {
 }
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+# Those that go another way through the loader, the loop or the optimiser; the others are combinations of the same.
+QUICK = ("accumulated gradients", "validation within an epoch", "windows", "clipped gradients")
+
+
+@pytest.mark.parametrize(
+    "variant", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in VARIANTS]
+)
 def test_every_way_of_training_continues_exactly(
     variant: str, tmp_path: Path, tiny_root: Path, make_model: Callable[..., DualPathDiffusion]
 ) -> None:

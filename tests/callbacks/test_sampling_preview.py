@@ -179,6 +179,7 @@ def test_preview_leaves_training_the_same_digit_for_digit(
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_preview_clips_and_noise_are_the_same_in_every_epoch(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:

@@ -119,6 +119,7 @@ def test_joint_training_uses_the_corpus_too(checkpoint: Path, tmp_path: Path) ->
     assert (printed["extra_identities"], printed["train_identities"]) == (["C"], None)
 
 
+@pytest.mark.slow
 def test_the_second_system_adapts_too(second: Path, tmp_path: Path) -> None:
     path = tmp_path / "C.ckpt"
     assert main(["adapt", "--checkpoint", str(second), "--person", "C", "-o", str(path), *FAST]) == 0
@@ -203,6 +204,7 @@ def person_folder(corpus: Path, root: Path, subject: str = "C", name: str = "Mar
     return root
 
 
+@pytest.mark.slow
 def test_a_persons_folder_is_learnt_by_name(checkpoint: Path, tiny_root: Path, tmp_path: Path) -> None:
     """And a second person after the first; the folders are named in the checkpoint, so that it is tested as ever."""
     folder = person_folder(tiny_root, tmp_path / "maria")

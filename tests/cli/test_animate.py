@@ -428,6 +428,7 @@ def test_streams_that_cannot_be(
     assert sentence in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_file_sent_as_samples_is_noticed(checkpoint: Path, speech: Path, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "facediff", "animate", "-", "--stream", "--checkpoint", str(checkpoint)]
     done = subprocess.run([*words, "-o", str(tmp_path / "x.npy")], input=speech.read_bytes(), capture_output=True)

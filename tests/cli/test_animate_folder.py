@@ -116,6 +116,7 @@ def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.Cap
     assert run(folder, retry_failed=True) == 0
 
 
+@pytest.mark.slow
 def test_each_process_loads_the_model_once_and_seeds_do_not_depend_on_it(folder: Path) -> None:
     assert run(folder, "--pause", "0.2", workers=2) == 0
     made = outputs(folder)

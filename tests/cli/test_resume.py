@@ -182,6 +182,7 @@ def test_a_fast_dev_run_leaves_nothing(fit: Fit, tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_checkpoints_can_be_switched_off(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert fit("--trainer.enable_checkpointing=false", "--trainer.callbacks=[]", "--trainer.logger.save_dir=runs") == 0
@@ -199,6 +200,7 @@ def test_a_users_own_callbacks_and_loggers_come_with_a_last_checkpoint(
     assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["epoch"] == 2
 
 
+@pytest.mark.slow
 def test_no_checkpoint_makes_training_remove_files_elsewhere(whole: Path, fit: Fit, tmp_path: Path) -> None:
     run = tmp_path / "puppet" / "version_0"
     shutil.copytree(whole, run)

@@ -60,6 +60,7 @@ def test_its_splits_are_multifaces(root: Path) -> None:
     assert data.dataset("test_b")[0].reference_name == "1_05"
 
 
+@pytest.mark.slow
 def test_it_trains_and_tests_from_the_command_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--config", "configs/experiment/puppet.yaml", "--data=multiface.Multiface", f"--data.root={root}"]
     words += ["--model.dim=16", "--model.sampler.steps=2", "--trainer.max_epochs=1", "--trainer.log_every_n_steps=1"]
