@@ -156,8 +156,8 @@ def perform(
         looks[f"eyeLookDown{side}"] *= 1.0 - tracks[f"eyeBlink{side}"]
     still = np.zeros_like(times)
     weights = np.stack([{**tracks, **looks}.get(name, still) for name in SHAPES], axis=1)
-    middles = (np.arange(frames) + 0.5) / frame_rate
-    return FaceMotion(*(_at(middles, times, track) for track in (np.asarray(np.clip(weights, 0.0, 1.2)), gaze, head)))
+    middles: Array = (np.arange(frames, dtype=np.float64) + 0.5) / frame_rate
+    return FaceMotion(*(_at(middles, times, track) for track in (np.clip(weights, 0.0, 1.2), gaze, head)))
 
 
 def _at(middles: Array, times: Array, tracks: Array) -> Array:

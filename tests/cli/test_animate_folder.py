@@ -86,6 +86,7 @@ def times(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder.parent / "out").glob("*.npy")}
 
 
+@pytest.mark.slow
 def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, words in (("b", "bad"), ("c", "deadly"), ("d", "bug")):
         (folder / f"{name}.wav").write_text(words)
@@ -247,6 +248,7 @@ def test_ctrl_c_finishes_running_recordings_and_a_second_run_the_rest(folder: Pa
     assert {name: after[name] for name in before} == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 def test_workers_end_when_their_parent_is_killed(folder: Path, tmp_path: Path) -> None:
     process = started(folder, tmp_path)

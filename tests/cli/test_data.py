@@ -53,8 +53,8 @@ FIT += ["--trainer.enable_model_summary=false", "--trainer.log_every_n_steps=1"]
     ("raw", "module", "splits"),
     [
         (raw_biwi, "MiniBiwi", ["test_a", "test_b"]),
-        (raw_vocaset, "MiniVocaset", ["test_b"]),
-        (raw_mead3d, "MiniMead", ["test_a"]),
+        pytest.param(raw_vocaset, "MiniVocaset", ["test_b"], marks=pytest.mark.slow),
+        pytest.param(raw_mead3d, "MiniMead", ["test_a"], marks=pytest.mark.slow),
     ],
     ids=["biwi", "vocaset", "mead3d"],
 )

@@ -41,6 +41,7 @@ def test_a_checkpoint_of_the_command_line_is_plain_data(checkpoint: Path) -> Non
     assert "current_model_state" in loaded
 
 
+@pytest.mark.slow
 def test_a_saved_config_runs_again(fitted: Path, fit: Fit, tmp_path: Path) -> None:
     status = fit(f"--trainer.logger.save_dir={tmp_path}", config=str(fitted / "config.yaml"))
     assert status == 0
@@ -68,6 +69,7 @@ def test_test_takes_everything_from_the_checkpoint(
     assert len(report["sequences"]) == 24
 
 
+@pytest.mark.slow
 def test_a_config_of_the_users_is_not_overwritten(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,6 +118,7 @@ def test_the_last_checkpoint_is_the_newest_runs(
         os.utime(tmp_path / "puppet" / f"version_{version}", (time.time() + 60,) * 2)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_a_config_names_is_there(
     fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -377,6 +380,7 @@ def test_three_processes_score_as_one_does(
                     assert other[column] == value
 
 
+@pytest.mark.slow
 def test_the_rows_of_the_sequences_add_up_to_the_scores(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
