@@ -27,7 +27,7 @@ def test_the_citation_is_of_this_version_and_licence() -> None:
     assert citation["version"] == facediff.__version__
     assert citation["license"] == PROJECT["project"]["license"]
     assert {reference["doi"] for reference in citation["references"]} <= set(
-        re.findall(r"doi (\S+?)\.?\s", (ROOT / "README.md").read_text())
+        re.findall(r"doi\s*=\s*\{(\S+?)\}", (ROOT / "README.md").read_text())
     )
 
 

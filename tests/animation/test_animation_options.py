@@ -23,7 +23,7 @@ from facediff.errors import OptionError
 from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_STEPS
 
 # The model is there already, where an animation is asked for.
-OF_THE_MODEL = {"checkpoint", "quiet", "device", "commercial_only"}
+OF_THE_MODEL = {"checkpoint", "quiet", "device", "commercial_only", "threads"}
 
 
 def plain(hint: object) -> object:

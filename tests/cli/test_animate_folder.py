@@ -174,7 +174,7 @@ def test_an_unusable_checkpoint_stops_the_batch(folder: Path) -> None:
         with pytest.raises(FaceDiffError, match="no such checkpoint"):
             run(folder, "no-model", workers=workers)
     assert outputs(folder) == {}
-    with pytest.raises(FaceDiffError, match="--workers 0"):
+    with pytest.raises(FaceDiffError, match="workers 0"):
         run(folder, workers=0)
 
 

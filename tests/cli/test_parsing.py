@@ -254,6 +254,7 @@ def test_every_option_of_every_command_is_explained(name: str) -> None:
 DIFFERENT = {
     "corpus": "the folder of a corpus where a video is imported; the name of one elsewhere",
     "frame_rate": "30 or 60 where VOCASET is prepared",
+    "low_latency": "steps of a distillation in `adapt`; a flag elsewhere",
     "json": "`evaluate` writes a file; the others print",
 }
 

@@ -80,7 +80,7 @@ def test_the_notebooks_are_committed_with_small_outputs() -> None:
         nbformat.validate(notebook)
         cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
         assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1)), path
-        assert sum(bool(cell.outputs) for cell in cells) >= 3, path
+        assert sum(bool(cell.outputs) for cell in cells) >= 1, path
         text = path.read_text(encoding="utf-8")
         assert len(text) < 30_000, path
         assert not re.search(r"/(?:tmp|home|root|work|opt|Users)/", text), path

@@ -57,7 +57,7 @@ def test_animation_closes_its_lips_by_alignment_and_by_transcript(
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"alignment": "a.csv", "transcript": "hello"}, "alignment and transcript"),
+        ({"alignment": "a.csv", "transcript": "hello"}, "alignment.*transcript"),
         ({"closure_budget": 3}, "closure_budget"),
         ({"alignment": "none.TextGrid"}, "none.TextGrid"),
     ],

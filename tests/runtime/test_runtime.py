@@ -430,14 +430,15 @@ def test_facediff_load_animates_a_folder_as_a_model(folder: Path, tmp_path: Path
 
     model, runtime, speech = facediff.load(folder), RuntimeModel.open(folder), sound(4.3)
     assert model.identities[0] in runtime.description.identities
-    for options in ({"seed": 2}, {"identity": "B", "expressivity": 0.5, "voice_gate": "off"}):
-        animation = model.animate(speech, 16_000, **options)  # type: ignore[call-overload]
-        assert isinstance(animation, facediff.Animation)
-        plain = dict(options)
-        gate = {"gate": None} if plain.pop("voice_gate", "") else {}
-        np.testing.assert_array_equal(animation.vertices, runtime.animate(speech, **plain, **gate).vertices)
-        streamed = np.concatenate([*model.stream(np.array_split(speech, 5), **options)])  # type: ignore[arg-type]
-        assert np.abs(streamed - animation.vertices).max() < 1e-6 * np.ptp(streamed)
+    for options in ({"seed": 2}, {"identity": "B", "expressivity": 0.5}):
+        for gate in ("energy", "off"):
+            chosen = {**options, "voice_gate": gate}
+            animation = model.animate(speech, 16_000, **chosen)  # type: ignore[call-overload]
+            assert isinstance(animation, facediff.Animation)
+            streamed = np.concatenate([*model.stream(np.array_split(speech, 5), **chosen)])  # type: ignore[arg-type]
+            assert np.abs(streamed - animation.vertices).max() < 1e-6 * np.ptp(streamed)
+        # Without the gate it is the model's own motion.
+        np.testing.assert_array_equal(animation.vertices, runtime.animate(speech, **options).vertices)
     assert model.animate([speech, speech[:9000]], 16_000, seed=None, low_latency=True)[1].metadata["seed"]
     assert len(model.animate(speech[:9000], 16_000, samples=2)) == 2
     np.testing.assert_array_equal(model.model.windows, runtime.windows)
@@ -464,8 +465,7 @@ def test_command_animates_a_folder(folder: Path, tmp_path: Path, capsys: pytest.
         str(folder),
         "-o",
         str(tmp_path / "a.npz"),
-        "--seed",
-        "3",
+        *("--seed", "3", "--voice-gate", "off"),
     ]
     assert facediff_main(words) == 0
     expected = RuntimeModel.open(folder).animate(sound(1.0), seed=3)

@@ -120,6 +120,7 @@ class AuthorsWeights:
     def authors_name(self, new: str) -> str:
         """What the authors call a tensor; a missing one is called by those next to it, else as the model does.
 
+        >>> import torch
         >>> weights = AuthorsWeights({"vertice_map.weight": torch.ones(1)}, "vocaset.pth")
         >>> weights.move("vertice_map.weight", "network.motion_in.weight")
         >>> weights.authors_name("network.motion_in.bias")

@@ -66,7 +66,7 @@ def test_weights_of_both_signs_can_be_sparse() -> None:
 
 def test_shapes_of_another_face_are_refused_by_what_they_leave() -> None:
     other = replace(OPPOSITE, deltas=RNG.normal(0, 0.005, OPPOSITE.deltas.shape))
-    with pytest.raises(FaceDiffError, match=r"leave \d+% of the motion.*residual-limit"):
+    with pytest.raises(FaceDiffError, match=r"leave \d+% of the motion.*residual_limit"):
         solve(motion(weights_of(40)), other)
     assert len(solve(motion(weights_of(40)), other, SolveOptions(residual_limit=1.0)).values) == 40
     # What nobody sees is no reason to refuse.

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import facediff
 from facediff.animation import Animation, read_archive
 from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, curve, read_direction
 from facediff.export.format import linear_colours
@@ -183,7 +182,7 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
 
 def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
     """The page starts from the take that was made with old keys; the other way is from the bare motion."""
-    bare = facediff.Animation.of(directed(Direction([Key(0, "head.roll", 0.0)])))
+    bare = directed(Direction([Key(0, "head.roll", 0.0)]))
     bare = replace(bare, metadata={})
     old = [Key(0, "expressiveness", 2.0), Key(0, "head.yaw", -10.0, "linear"), Key(2, "head.yaw", 20.0)]
     new = [Key(0, "expressiveness", 0.5), Key(0, "expressiveness.lips", 3.0), Key(0, "head.pitch", 25.0)]
