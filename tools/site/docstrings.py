@@ -122,7 +122,10 @@ def is_elsewhere(obj: griffe.Object, name: str) -> bool:
     first = name.split(".")[0]
     if first in sys.stdlib_module_names or ("." in name and importlib.util.find_spec(first) is not None):
         return True
-    module = importlib.import_module(obj.module.path)
+    try:
+        module = importlib.import_module(obj.module.path)
+    except ImportError:  # of an extra that is not installed: what cannot be imported cannot be checked
+        return True
     return any(hasattr(member, name) for member in vars(module).values() if inspect.isclass(member))
 
 
@@ -137,6 +140,9 @@ def named(obj: griffe.Object, name: str) -> str | None:
         except griffe.AliasResolutionError:  # a module of another package that is imported there
             found = None
         if found is not None:
-            return found.canonical_path
+            try:
+                return found.canonical_path
+            except griffe.AliasResolutionError:  # in a module that griffe has not read yet
+                return found.target_path if isinstance(found, griffe.Alias) else None
         owner = owner.parent
     return None
