@@ -15,8 +15,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from facediff.synthetic.geometry import Array, rise
+from facediff.synthetic.geometry import Array
 from facediff.synthetic.head.rig import LEFT_AND_RIGHT
+from facediff.synthetic.motion import UNHURRIED, rounded, shut_lips
 from facediff.synthetic.speech import SpokenPhoneme
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.
@@ -172,7 +173,6 @@ SPEECH_SHAPES = (
 """Shapes that speech drives; those with two sides are named without one."""
 SIDED = frozenset(LEFT_AND_RIGHT)
 
-_ROUND_TOP = 0.018
 _BLOCK, _OUT_OF_REACH = 1024, 1.5
 """Times that are blended together, and seconds beyond which a sound's dominance is nothing (e^-15 and less)."""
 # Seconds in which dominance falls to 1/e, before and after a sound. Rounding is prepared early.
@@ -181,10 +181,6 @@ _FALL_AFTER = {"mouthPucker": 0.070, "mouthFunnel": 0.065, "mouthStretch": 0.060
 _QUICK = {"mouthPress": 0.035, "tongueUp": 0.032, "tongueForward": 0.035}
 _USUAL_FALL = 0.052
 _FIRM_STRENGTH = 3.0
-_SURELY_SHUT = 0.028
-_UNHURRIED = 0.11
-# Shortest and longest time in seconds that the lips take to meet and to part.
-_CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
 
 
 @dataclass(frozen=True)
@@ -205,7 +201,7 @@ def speech_sounds(phonemes: Sequence[SpokenPhoneme]) -> list[SpeechSound]:
         length = phoneme.end - phoneme.start
         stress = 1.08 if "ˈ" in phoneme.ipa else 0.95
         # A short sound does not reach its target (Lindblom's undershoot, 1963): jaws have no time for it.
-        stress *= float(np.clip(0.5 + 0.5 * length / _UNHURRIED, 0.5, 1.0))
+        stress *= float(np.clip(0.5 + 0.5 * length / UNHURRIED, 0.5, 1.0))
         later = [0.4 / (len(parts) - 1)] * (len(parts) - 1) if len(parts) > 1 else []
         shares = np.cumsum([0.0, 0.6 if later else 1.0, *later])
         sounds += [
@@ -234,8 +230,8 @@ def _blend_block(sounds: Sequence[SpeechSound], times: Array, spread: float) -> 
     start, end = (np.array([getattr(sound, name) for sound in sounds]) for name in ("start", "end"))
     # A target holds in the sound's middle part and fades from there towards both borders.
     core = 0.25 * (end - start)
-    before = _rounded(np.maximum(start + core - times[:, None], 0.0))
-    after = _rounded(np.maximum(times[:, None] - end + core, 0.0))
+    before = rounded(np.maximum(start + core - times[:, None], 0.0))
+    after = rounded(np.maximum(times[:, None] - end + core, 0.0))
     reach = spread * np.array([sound.articulation.reach for sound in sounds])
     weights = np.zeros((len(times), len(SPEECH_SHAPES)))
     for column, shape in enumerate(SPEECH_SHAPES):
@@ -252,23 +248,4 @@ def _blend_block(sounds: Sequence[SpeechSound], times: Array, spread: float) -> 
 
 def lip_closure(sounds: Sequence[SpeechSound], times: Array) -> Array:
     """How firmly the lips are shut (n,), 0 to 1: 1 from before the start to past the middle of every p, b and m."""
-    apart = np.ones_like(times)
-    lengths = [sound.end - sound.start for sound in sounds]
-    for number, (sound, length) in enumerate(zip(sounds, lengths, strict=True)):
-        if not sound.articulation.closes:
-            continue
-        # The lips must be shut in the frame nearest to the middle, which is up to half a frame away.
-        middle = sound.start + 0.5 * length
-        first = min(sound.start + min(0.15 * length, 0.012), middle - _SURELY_SHUT)
-        last = max(sound.start + 0.72 * length, middle + _SURELY_SHUT)
-        # A short vowel between two closures needs time to open.
-        closing = np.clip(0.55 * lengths[number - 1], *_CLOSING) if number > 0 else _CLOSING[1]
-        opening = np.clip(0.55 * lengths[number + 1], *_OPENING) if number + 1 < len(lengths) else _OPENING[1]
-        shut = rise(times, first - float(closing), first) * rise(times, last + float(opening), last)
-        apart *= 1.0 - shut
-    return np.asarray(1.0 - apart)
-
-
-def _rounded(distance: Array) -> Array:
-    """Distance with a rounded start, so that its slope is continuous where a sound's core begins."""
-    return np.asarray(np.sqrt(distance**2 + _ROUND_TOP**2) - _ROUND_TOP)
+    return shut_lips([(sound.start, sound.end, sound.articulation.closes) for sound in sounds], times)

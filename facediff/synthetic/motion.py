@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,7 @@ SPEECH_CONTROLS = (
     "nose_wrinkle",
 )
 FRAME_RATE = 25
-_FINE_RATE = 200
+FINE_RATE = 200
 _CLOSURE_SMOOTHNESS = 0.010
 
 
@@ -99,13 +100,13 @@ def generate_weights(
     """
     effect = MOOD_EFFECTS[mood]
     margin = 0.2  # seconds beyond both ends, so that smoothing has no border effect within the clip
-    times = np.arange(-margin, frames / FRAME_RATE + margin, 1.0 / _FINE_RATE)
+    times = np.arange(-margin, frames / FRAME_RATE + margin, 1.0 / FINE_RATE)
     tracks = {name: np.zeros_like(times) for name in CONTROLS}
     _speech(tracks, segments, times, style, effect, random)
     _upper_face(tracks, prosody, times, style, effect, random)
     # Even a speaker with slack articulation shuts the lips in time.
     blur = {"lip_closure": min(style.smoothness, _CLOSURE_SMOOTHNESS)}
-    fine = np.stack([_smooth(track, blur.get(name, style.smoothness)) for name, track in tracks.items()])
+    fine = np.stack([smooth(track, blur.get(name, style.smoothness)) for name, track in tracks.items()])
     middles = (np.arange(frames) + 0.5) / FRAME_RATE
     return np.stack([np.interp(middles, times, track) for track in fine], axis=1)
 
@@ -121,7 +122,7 @@ def _speech(
     """Add the motion of jaw and lips, which follows the phonemes."""
     # The mouth runs ahead of the sound by `lead`: sampling the gestures later in time plays them earlier.
     weights = articulate(segments, times + style.lead, spread=style.slack)
-    wander = 1.0 + 0.03 * _drift(times, random)
+    wander = 1.0 + 0.03 * drift(times, random)
     for column, control in enumerate(SPEECH_CONTROLS):
         gain = getattr(style, _GAINS[control]) if control in _GAINS else 1.0
         # Lips that press, or that touch the teeth, do so in every mood; only large shapes are emphasised.
@@ -133,7 +134,7 @@ def _speech(
         # Lips that meet cannot show the teeth at the same time.
         tracks[control] *= 1.0 - 0.85 * tracks["lip_closure"]
     smile = style.smile + effect.smile
-    tracks["corner_up"] += max(smile, 0.0) + 0.03 * _drift(times, random)
+    tracks["corner_up"] += max(smile, 0.0) + 0.03 * drift(times, random)
     tracks["corner_down"] += max(-smile, 0.0)
     tracks["cheek_raise"] += style.cheeks * (tracks["stretch"] + 0.8 * tracks["corner_up"])
 
@@ -150,14 +151,14 @@ def _upper_face(
     accent = np.interp(times, prosody.times, 0.55 * prosody.pitch + 0.45 * prosody.loudness)
     accent = effect.brows * np.maximum(accent, -0.3)
     habit = 1.0 + 0.25 * float(random.standard_normal())
-    tracks["inner_brow_up"] += effect.raised + style.inner_brow * habit * accent + 0.06 * _drift(times, random)
-    tracks["outer_brow_up"] += effect.raised + style.outer_brow * habit * accent + 0.06 * _drift(times, random)
-    tracks["brow_frown"] += style.frown + effect.frown - 0.25 * np.minimum(accent, 0.0) + 0.04 * _drift(times, random)
-    tracks["squint"] += style.squint + 0.5 * tracks["cheek_raise"] + 0.04 * _drift(times, random)
+    tracks["inner_brow_up"] += effect.raised + style.inner_brow * habit * accent + 0.06 * drift(times, random)
+    tracks["outer_brow_up"] += effect.raised + style.outer_brow * habit * accent + 0.06 * drift(times, random)
+    tracks["brow_frown"] += style.frown + effect.frown - 0.25 * np.minimum(accent, 0.0) + 0.04 * drift(times, random)
+    tracks["squint"] += style.squint + 0.5 * tracks["cheek_raise"] + 0.04 * drift(times, random)
     tracks["nose_wrinkle"] += 0.3 * tracks["upper_lip_raise"]
     tracks["lids_wide"] += np.maximum(0.35 * tracks["inner_brow_up"], 0.0)
     blink = _blinks(times, style, random)
-    droop = effect.droop + 0.04 * _drift(times, random)
+    droop = effect.droop + 0.04 * drift(times, random)
     tracks["lids_close"] += np.clip(droop + (1.0 - droop) * blink, 0.0, 1.0)
     tracks["lids_wide"] *= 1.0 - blink
     tracks["squint"] *= 1.0 - blink
@@ -176,7 +177,7 @@ def _blinks(times: Array, style: SpeakingStyle, random: np.random.Generator) -> 
     return shut
 
 
-def _drift(times: Array, random: np.random.Generator) -> Array:
+def drift(times: Array, random: np.random.Generator) -> Array:
     """Slow random drift of about unit size: a few sines below 0.8 Hz."""
     rates = random.uniform(0.12, 0.8, 4)
     phases = random.uniform(0.0, 2.0 * np.pi, 4)
@@ -184,10 +185,10 @@ def _drift(times: Array, random: np.random.Generator) -> Array:
     return np.asarray(0.7 * waves.sum(axis=0))
 
 
-def _smooth(track: Array, deviation: float) -> Array:
+def smooth(track: Array, deviation: float) -> Array:
     """Blur in time with a Gaussian of so many seconds."""
-    reach = max(int(np.ceil(3.0 * deviation * _FINE_RATE)), 1)
-    return _blurred(track, np.arange(-reach, reach + 1) / (deviation * _FINE_RATE))
+    reach = max(int(np.ceil(3.0 * deviation * FINE_RATE)), 1)
+    return _blurred(track, np.arange(-reach, reach + 1) / (deviation * FINE_RATE))
 
 
 def _blurred(values: Array, places: NDArray[np.floating]) -> Array:
@@ -303,7 +304,7 @@ _FALL_AFTER = {"pucker": 0.070, "funnel": 0.065, "stretch": 0.060, "lower_lip_tu
 _DEFAULT_FALL = 0.052
 _FIRM_STRENGTH = 3.0
 _SURELY_SHUT = 0.028
-_UNHURRIED = 0.11
+UNHURRIED = 0.11
 # Shortest and longest time in seconds that the lips take to meet and to part.
 _CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
 
@@ -327,7 +328,7 @@ def segments_of(phonemes: tuple[SpokenPhoneme, ...]) -> list[Segment]:
         shares = np.cumsum([0.0, *([0.6] + [0.4 / (len(names) - 1)] * (len(names) - 1) if len(names) > 1 else [1.0])])
         length = phoneme.end - phoneme.start
         # A short sound does not reach its target (Lindblom's undershoot, 1963): jaws have no time for it.
-        stress *= float(np.clip(0.5 + 0.5 * length / _UNHURRIED, 0.5, 1.0))
+        stress *= float(np.clip(0.5 + 0.5 * length / UNHURRIED, 0.5, 1.0))
         segments += [
             Segment(phoneme.start + float(a) * length, phoneme.start + float(b) * length, VISEMES[name], stress)
             for name, a, b in zip(names, shares[:-1], shares[1:], strict=True)
@@ -352,7 +353,7 @@ def articulate(segments: list[Segment], times: Array, *, spread: float = 1.0) ->
         fall_before = reach * _FALL_BEFORE.get(control, _DEFAULT_FALL)
         fall_after = reach * _FALL_AFTER.get(control, _DEFAULT_FALL)
         strength = np.array([_FIRM_STRENGTH if control in s.viseme.firm else s.viseme.strength for s in segments])
-        distance = _rounded(before) / fall_before + _rounded(after) / fall_after
+        distance = rounded(before) / fall_before + rounded(after) / fall_after
         dominance = strength * np.exp(-distance)
         target = np.array([s.stress * s.viseme.targets.get(control, 0.0) for s in segments])
         result[:, column] = (dominance * target).sum(axis=1) / (dominance.sum(axis=1) + 1e-9)
@@ -361,14 +362,19 @@ def articulate(segments: list[Segment], times: Array, *, spread: float = 1.0) ->
 
 def close_lips(segments: list[Segment], times: Array) -> Array:
     """How firmly the lips are shut (n,), 0 to 1: 1 from before the start to past the middle of every p, b and m."""
+    return shut_lips([(segment.start, segment.end, segment.viseme.closes) for segment in segments], times)
+
+
+def shut_lips(stretches: Sequence[tuple[float, float, bool]], times: Array) -> Array:
+    """How firmly the lips are shut (n,), by start and end of each sound in seconds and whether it closes the lips."""
     apart = np.ones_like(times)
-    lengths = [segment.end - segment.start for segment in segments]
-    for index, (segment, length) in enumerate(zip(segments, lengths, strict=True)):
-        if segment.viseme.closes:
+    lengths = [end - start for start, end, _ in stretches]
+    for index, ((start, _, closes), length) in enumerate(zip(stretches, lengths, strict=True)):
+        if closes:
             # The lips must be shut in the frame nearest to the middle, which is up to half a frame away.
-            middle = segment.start + 0.5 * length
-            first = min(segment.start + min(0.15 * length, 0.012), middle - _SURELY_SHUT)
-            last = max(segment.start + 0.72 * length, middle + _SURELY_SHUT)
+            middle = start + 0.5 * length
+            first = min(start + min(0.15 * length, 0.012), middle - _SURELY_SHUT)
+            last = max(start + 0.72 * length, middle + _SURELY_SHUT)
             # A short vowel between two closures needs time to open.
             closing = np.clip(0.55 * lengths[index - 1], *_CLOSING) if index > 0 else _CLOSING[1]
             opening = np.clip(0.55 * lengths[index + 1], *_OPENING) if index + 1 < len(lengths) else _OPENING[1]
@@ -377,7 +383,7 @@ def close_lips(segments: list[Segment], times: Array) -> Array:
     return np.asarray(1.0 - apart)
 
 
-def _rounded(distance: Array) -> Array:
+def rounded(distance: Array) -> Array:
     """Distance with a rounded start, so that its slope is continuous where a segment's core begins."""
     return np.asarray(np.sqrt(distance**2 + _ROUND_TOP**2) - _ROUND_TOP)
 

@@ -15,9 +15,8 @@ import numpy as np
 from facediff.synthetic.articulation import SIDED, SPEECH_SHAPES, SpeechSound, blend, lip_closure
 from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.head.rig import LOOK_DOWN, LOOK_SIDEWAYS, LOOK_UP, SHAPES
-from facediff.synthetic.motion import ProsodyContours
+from facediff.synthetic.motion import FINE_RATE, ProsodyContours, drift, smooth
 
-_RATE = 200  # Samples a second at which motion is computed
 _MARGIN = 0.4  # Seconds before and after the clip in which motion goes on
 _SACCADE_VELOCITY = (0.021, 0.0022)
 """Seconds that a saccade takes, and those that each degree adds (Carpenter, "Movements of the eyes", 1988)."""
@@ -143,7 +142,7 @@ def perform(
 ) -> FaceMotion:
     """The motion of a spoken sentence at the middle of each frame; ``mood`` is a name in :data:`MOODS`."""
     effect = MOODS[mood]
-    times = np.arange(-_MARGIN, frames / frame_rate + _MARGIN, 1.0 / _RATE)
+    times = np.arange(-_MARGIN, frames / frame_rate + _MARGIN, 1.0 / FINE_RATE)
     accents = np.interp(times, prosody.times, 0.55 * prosody.pitch + 0.45 * prosody.loudness)
     mouth = _mouth(sounds, times, habits, effect, random)
     gaze, glances = _gaze(times, habits, random)
@@ -170,14 +169,14 @@ def _mouth(
 ) -> dict[str, Array]:
     """What follows the phonemes; shapes with two sides are still one."""
     weights = blend(sounds, times + habits.lead, spread=habits.slack)
-    wander = 1.0 + 0.03 * _drift(times, random)
+    wander = 1.0 + 0.03 * drift(times, random)
     tracks: dict[str, Array] = {}
     for column, name in enumerate(SPEECH_SHAPES):
         # Lips that press, or that touch the teeth, do so in every mood; only large shapes are emphasised.
         gain = effect.articulation * getattr(habits, _GAIN_OF[name]) if name in _GAIN_OF else 1.0
-        tracks[name] = _smooth(gain * wander * weights[:, column], habits.smoothness)
+        tracks[name] = smooth(gain * wander * weights[:, column], habits.smoothness)
     # A speaker with slack articulation shuts the lips in time all the same.
-    shut = _smooth(
+    shut = smooth(
         lip_closure(sounds, times + float(np.clip(habits.lead, -0.008, 0.008))), min(habits.smoothness, 0.010)
     )
     # Lips that meet show no teeth and are not rounded outwards; the jaw stays where it is and the lips bridge it.
@@ -185,7 +184,7 @@ def _mouth(
         tracks[name] = tracks[name] * (1.0 - shut)
     tracks["mouthClose"] = tracks["jawOpen"] * shut
     rest = habits.smile + effect.smile
-    tracks["mouthSmile"] = tracks["mouthSmile"] + max(rest, 0.0) + 0.02 * _drift(times, random)
+    tracks["mouthSmile"] = tracks["mouthSmile"] + max(rest, 0.0) + 0.02 * drift(times, random)
     tracks["mouthFrown"] = np.full_like(times, max(-rest, 0.0))
     tracks["cheekSquint"] = 0.6 * tracks["mouthSmile"] + 0.3 * tracks["mouthStretch"]
     tracks["noseSneer"] = 0.25 * tracks["mouthUpperUp"]
@@ -247,16 +246,16 @@ def _upper_face(
     """Brows on accents (Cavé and others, ICSLP 1996), blinks, lids that follow the gaze, and slow drift."""
     accents = np.maximum(accents, -0.3)
     habit = 1.0 + 0.25 * float(random.standard_normal())
-    inner = effect.raised + habits.inner_brow * habit * accents * 0.8 + 0.03 * _drift(times, random)
-    outer = effect.raised + habits.outer_brow * habit * accents * 0.8 + 0.03 * _drift(times, random)
-    frown = habits.frown + effect.frown - 0.2 * np.minimum(accents, 0.0) + 0.02 * _drift(times, random)
+    inner = effect.raised + habits.inner_brow * habit * accents * 0.8 + 0.03 * drift(times, random)
+    outer = effect.raised + habits.outer_brow * habit * accents * 0.8 + 0.03 * drift(times, random)
+    frown = habits.frown + effect.frown - 0.2 * np.minimum(accents, 0.0) + 0.02 * drift(times, random)
     blink = _blinks(times, glances, habits, random)
-    droop = np.clip(effect.droop + 0.02 * _drift(times, random), 0.0, 0.4)
-    squint = habits.squint + 0.4 * mouth["cheekSquint"] + 0.02 * _drift(times, random)
+    droop = np.clip(effect.droop + 0.02 * drift(times, random), 0.0, 0.4)
+    squint = habits.squint + 0.4 * mouth["cheekSquint"] + 0.02 * drift(times, random)
     return {
-        "browInnerUp": _smooth(inner, 0.03),
-        "browOuterUp": _smooth(outer, 0.03),
-        "browDown": _smooth(frown, 0.03),
+        "browInnerUp": smooth(inner, 0.03),
+        "browOuterUp": smooth(outer, 0.03),
+        "browDown": smooth(frown, 0.03),
         "eyeBlink": np.clip(droop + (1.0 - droop) * blink, 0.0, 1.0),
         "eyeSquint": np.maximum(squint, 0.0) * (1.0 - blink),
         "eyeWide": np.maximum(0.3 * inner, 0.0) * (1.0 - blink),
@@ -295,11 +294,11 @@ def _head(accents: Array, gaze: Array, times: Array, habits: SpeakingHabits, ran
     Nods follow the melody, which explains about two thirds of the head's motion in speech (Munhall and others, Psychol.
     Sci. 15, 2004); sway is slower than 1 Hz (Hadar and others, 1983); a glance takes a part of the head along.
     """
-    nod = -_smooth(np.maximum(accents, 0.0), 0.06) + 0.5 * _smooth(np.maximum(-accents, 0.0), 0.15)
-    along = 0.3 * _smooth(gaze[:, 0], 0.12)
-    pitch = -habits.nods * nod + 0.6 * habits.sway * _drift(times, random)
-    yaw = along + habits.sway * _drift(times, random)
-    roll = habits.tilt + 0.5 * habits.sway * _drift(times, random) + 0.15 * along
+    nod = -smooth(np.maximum(accents, 0.0), 0.06) + 0.5 * smooth(np.maximum(-accents, 0.0), 0.15)
+    along = 0.3 * smooth(gaze[:, 0], 0.12)
+    pitch = -habits.nods * nod + 0.6 * habits.sway * drift(times, random)
+    yaw = along + habits.sway * drift(times, random)
+    roll = habits.tilt + 0.5 * habits.sway * drift(times, random) + 0.15 * along
     return np.stack([pitch, yaw, roll], axis=1)
 
 
@@ -318,7 +317,7 @@ def _sided(
     tracks: dict[str, Array], times: Array, habits: SpeakingHabits, random: np.random.Generator
 ) -> dict[str, Array]:
     """The tracks by the rig's names: both sides of a shape move nearly alike, more or less on the left."""
-    lean = np.clip(habits.asymmetry + 0.04 * _drift(times, random), -0.35, 0.35)
+    lean = np.clip(habits.asymmetry + 0.04 * drift(times, random), -0.35, 0.35)
     result: dict[str, Array] = {}
     for name, track in tracks.items():
         if name not in SIDED:
@@ -328,17 +327,3 @@ def _sided(
         share = np.zeros_like(times) if name.startswith("eye") else lean
         result[f"{name}Left"], result[f"{name}Right"] = track * (1.0 + share), track * (1.0 - share)
     return result
-
-
-def _drift(times: Array, random: np.random.Generator) -> Array:
-    """Slow random drift of about unit size: a few sines below 0.8 Hz."""
-    rates = random.uniform(0.12, 0.8, 4)
-    phases = random.uniform(0.0, 2.0 * np.pi, 4)
-    return np.asarray(0.7 * np.sin(2.0 * np.pi * rates[:, None] * times + phases[:, None]).sum(axis=0))
-
-
-def _smooth(track: Array, deviation: float) -> Array:
-    """Blur in time with a Gaussian of so many seconds; the ends are held."""
-    reach = max(int(np.ceil(3.0 * deviation * _RATE)), 1)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (deviation * _RATE)) ** 2)
-    return np.convolve(np.pad(track, reach, mode="edge"), kernel / kernel.sum(), mode="valid")

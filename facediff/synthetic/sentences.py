@@ -1,4 +1,4 @@
-"""What the speakers of the second edition say, written for this corpus.
+"""What the speakers of the second edition say: the first edition's sentences and others written for this corpus.
 
 Most sentences are rich in p, b and m, in rounded and in open vowels, since these are what the mouth shows. No sentence
 is in two of the lists.
@@ -8,39 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from facediff.synthetic.speech import SENTENCES
+
 TRAIN: tuple[str, ...] = (
-    "Mama bought a map of Bombay for papa.",
-    "Bob put both pumps above the purple boat.",
-    "My mother may move home before May.",
-    "Who would choose blue shoes in the fog?",
-    "Father parked far from the large palm.",
-    "Pam baked apple pie for five happy boys.",
-    "Two wolves went west over warm wet woods.",
-    "Please bring me some more ripe plums.",
-    "Five brave fishermen found a big cave.",
-    "Sheep always jump when they hear my whip.",
-    "The moon rose above a smooth, warm pool.",
-    "Barbara mopped the bottom of the bathtub.",
-    "We saw a small paw print by the wall.",
-    "Emma and Ben hum the same bold hymn.",
-    "Open your mouth and show me that tooth.",
-    "A bumpy bus brought Mabel back to Rome.",
-    "Every evening my uncle waters his maple.",
-    "Put the soup spoon into the blue bowl.",
-    "Tom and Pip climb up the mossy bank.",
-    "Maybe Wanda will marry a famous baker.",
-    "Oh no, the robot dropped my umbrella.",
-    "Farm boys always feed five plump piglets.",
-    "You may borrow my best woollen cap for now.",
-    "Calm palms make a lovely soft lamp.",
-    "Bees hum and buzz above the poppy meadow.",
-    "Why would a wombat want a white van?",
-    "Mum popped a balloon, and papa jumped.",
-    "Our boat moves up the broad brown river.",
-    "Phoebe wrote four poems about a mole.",
-    "The bad lamb hopped over my plum jam.",
-    "Wow, what an awful amount of pepper!",
-    "Beth above all hoped for a warm room.",
+    *SENTENCES,
     "She sells cheap fish by the station shop.",
     "I think the third thing is worth a thousand.",
     "The judge enjoyed a large orange jelly.",
