@@ -21,7 +21,7 @@ from facediff.render import contact_sheet, save_image  # noqa: E402
 from facediff.render.rasteriser import FIELD_OF_VIEW, Camera, Renderer, opencv  # noqa: E402
 from facediff.synthetic.cast import CAST  # noqa: E402
 from facediff.synthetic.head.parts import build_head  # noqa: E402
-from facediff.synthetic.head.people import coloured, dressed  # noqa: E402
+from facediff.synthetic.head.people import Complexion, coloured, dressed  # noqa: E402
 from facediff.synthetic.head.rig import LEFT_AND_RIGHT, head_shapes  # noqa: E402
 
 SIZE = 300
@@ -83,21 +83,22 @@ def main() -> None:
     parser.add_argument("output", type=Path, help="a .png file")
     output = parser.parse_args().output
     mesh = build_head()
+    average = coloured(mesh, Complexion())
 
     def draw(vertices: NDArray[np.float64], view: Camera, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return Renderer(mesh.faces, template=mesh.vertices, size=SIZE, camera=view, colours=colours).render(vertices)
 
-    pictures = [draw(mesh.vertices, camera((0, -15, 0), turn, 340), mesh.colours) for turn in (0, 40, 90)]
+    pictures = [draw(mesh.vertices, camera((0, -15, 0), turn, 340), average) for turn in (0, 40, 90)]
     pictures.append(wireframe(camera((0, -10, 40), 25, 230)))
     labels = ["front", "three quarters", "side", "quads"]
     for (name, weights), turn in zip(EXPRESSIONS.items(), (0, 0, 0, 0, 20, 40, 20, 20), strict=True):
-        pictures.append(draw(posed(weights), camera((0, -12, 50), turn, 205), mesh.colours))
+        pictures.append(draw(posed(weights), camera((0, -12, 50), turn, 205), average))
         labels.append(name)
     for name, weights in BLINKS.items():
-        pictures.append(draw(posed(weights), camera((31, 27, 60), 10, 62), mesh.colours))
+        pictures.append(draw(posed(weights), camera((31, 27, 60), 10, 62), average))
         labels.append(name)
     for name, member in CAST.items():
-        vertices = dressed(member.face(mesh.vertices), mesh, member.complexion)
+        vertices = dressed(member.face, mesh, member.complexion)
         pictures.append(draw(vertices, camera((0, -20, 0), 25, 345), coloured(mesh, member.complexion)))
         labels.append(name)
     save_image(output, contact_sheet(pictures, 4, labels=labels))

@@ -56,7 +56,7 @@ class Puppet(SpeechMotionDataModule):
 
     Synthetic: scores on it say nothing about real people. 25 frames per second, metres. In the first edition six seen
     speakers (test A) and two unseen ones (test B) have a face of 1 008 vertices; sentences 1–24 train, 25–27 validate,
-    28–32 test. In the second one, six and four have a head of 5 743 vertices that ARKit's 52 shapes move; 32 sentences
+    28–32 test. In the second one, six and four have a head of 5 875 vertices that ARKit's 52 shapes move; 32 sentences
     of each train, 10 test, and the voices of test C are kept out of training.
 
     Args:

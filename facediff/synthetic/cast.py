@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from facediff.synthetic.head.people import EYE_COLOURS, HAIR_COLOURS, SKIN_TONES, Complexion, Face
+from facediff.synthetic.head.people import EYE_COLOURS, HAIR_COLOURS, SHIRTS, SKIN_TONES, Complexion, Face
 from facediff.synthetic.performance import SpeakingHabits
 
 
@@ -49,61 +49,61 @@ _CAST = (
     CastMember(
         *("F1", "espeak:en-us+f2", 1.02, 1.2, 1.1),
         Face(sex=-0.9, age=-0.3, lips=0.4, eye_size=0.4, cheekbones=0.4, nose_up=0.4),
-        Complexion("fair", "auburn", "green", "bob"),
+        Complexion("fair", "auburn", "green", "bob", "teal"),
         SpeakingHabits(rounding=1.05, smile=0.06, outer_brow=0.5, blinks=26, nods=3.0),
     ),
     CastMember(
         *("F2", "espeak:en-gb-x-rp+f3", 0.97, 1.8, 1.35),
         Face(sex=-0.8, weight=0.6, width=0.4, length=-0.5, lips=0.6, cheeks=0.5, nose_length=-0.4),
-        Complexion("brown", "black", "brown", "bun"),
+        Complexion("brown", "black", "brown", "bun", "rust"),
         SpeakingHabits(jaw=1.2, lips=1.25, inner_brow=0.75, outer_brow=0.6, blinks=18, sway=2.2, asymmetry=0.08),
     ),
     CastMember(
         *("F3", "espeak:en+f4", 1.1, 0.4, 0.8),
         Face(sex=-0.6, age=0.9, length=0.3, nose_length=0.4, cheekbones=0.3),
-        Complexion("pale", "grey", "blue", "short"),
+        Complexion("pale", "grey", "blue", "short", "wine"),
         SpeakingHabits(jaw=0.8, rounding=0.85, slack=1.25, lead=0.0, frown=0.08, blinks=34, nods=1.5, gaze_away=0.5),
     ),
     CastMember(
         *("M1", "espeak:en-us+m3", 1.0, -1.5, 0.9),
         Face(sex=0.9, jaw=0.3, brow_ridge=0.3, nose_bridge=0.3),
-        Complexion("tan", "brown", "brown", "short"),
+        Complexion("tan", "brown", "brown", "short", "sand", stubble=0.35),
         SpeakingHabits(jaw=1.05, spreading=0.85, lead=0.03, inner_brow=0.35, squint=0.08, blinks=20, tilt=1.5),
     ),
     CastMember(
         *("M2", "espeak:en-gb-scotland+m2", 1.08, -0.6, 1.2),
         Face(sex=0.7, age=-0.5, width=-0.4, length=0.5, nose_tip=0.4, eye_gap=-0.3),
-        Complexion("pale", "blond", "blue", "cropped"),
+        Complexion("pale", "blond", "blue", "cropped", "navy"),
         SpeakingHabits(spreading=1.25, slack=0.8, smoothness=0.011, smile=0.1, outer_brow=0.65, blinks=30, nods=4.0),
     ),
     CastMember(
         *("M3", "espeak:en+m7", 0.93, -2.2, 0.7),
         Face(sex=0.8, age=0.7, weight=0.7, nose_width=0.6, lips=0.5, width=0.3),
-        Complexion("dark", "black", "brown", "bald"),
+        Complexion("dark", "black", "brown", "bald", "moss", stubble=0.25),
         SpeakingHabits(jaw=0.9, rounding=1.2, lips=0.85, asymmetry=-0.1, frown=0.05, blinks=14, gaze_away=0.25),
     ),
     CastMember(
         *("F4", "espeak:en-us+f5", 1.05, 0.8, 1.0),
         Face(sex=-0.7, eye_gap=0.4, nose_bridge=-0.6, cheekbones=0.6, eye_tilt=0.5),
-        Complexion("olive", "black", "brown", "long"),
+        Complexion("olive", "black", "brown", "long", "slate"),
         SpeakingHabits(jaw=1.1, spreading=1.1, smile=0.04, inner_brow=0.6, blinks=22),
     ),
     CastMember(
         *("F5", "espeak:en-gb-x-rp+f1", 0.95, 2.2, 1.15),
         Face(sex=-1.0, age=-0.7, weight=-0.4, jaw=-0.4, lips=0.2, forehead=0.4),
-        Complexion("fair", "blond", "grey", "long"),
+        Complexion("fair", "blond", "grey", "long", "wine"),
         SpeakingHabits(rounding=1.15, lips=1.1, slack=1.1, asymmetry=0.1, blinks=28, nods=2.0, sway=1.0),
     ),
     CastMember(
         *("M4", "espeak:en-us+m1", 1.04, -1.0, 1.1),
         Face(sex=1.0, weight=-0.4, length=0.3, chin=0.4, nose_length=0.4),
-        Complexion("fair", "brown", "green", "short"),
+        Complexion("fair", "brown", "green", "short", "moss", stubble=0.3),
         SpeakingHabits(jaw=1.0, spreading=1.05, lead=0.01, outer_brow=0.5, squint=0.05, blinks=24, tilt=-1.0),
     ),
     CastMember(
         *("M5", "espeak:en-gb-scotland+m6", 0.98, -1.8, 0.85),
         Face(sex=0.6, age=0.4, width=0.4, cheeks=0.4, nose_width=0.3, ears=0.5),
-        Complexion("olive", "grey", "brown", "cropped"),
+        Complexion("olive", "grey", "brown", "cropped", "navy", stubble=0.2),
         SpeakingHabits(jaw=0.85, lips=1.15, slack=0.9, inner_brow=0.55, smile=0.08, blinks=18, gaze_away=0.45),
     ),
 )
@@ -147,6 +147,8 @@ def _drawn(number: int, people: tuple[str, ...]) -> CastMember:
         str(random.choice([*HAIR_COLOURS])),
         str(random.choice([*EYE_COLOURS])),
         random.choice(["short", "bob", "long", "bun"] if sex < 0 else ["short", "cropped", "bald"]),
+        shirt=[*SHIRTS][number % len(SHIRTS)],
+        stubble=0.1 * (number % 5) if sex > 0 else 0.0,
     )
     habits = {}
     for item in fields(SpeakingHabits):

@@ -191,7 +191,7 @@ def rig_of(identity: str) -> NDArray[np.float32]:
     member, mesh, shapes = member_of(identity), build_head(), head_shapes()
     rest = member.face(mesh.vertices)
     rig = np.zeros((1 + len(SHAPES), *rest.shape), np.float32)
-    rig[0] = dressed(rest, mesh, member.complexion) / 1000.0
+    rig[0] = dressed(member.face, mesh, member.complexion) / 1000.0
     for number, name in enumerate(SHAPES, start=1):
         moved = np.flatnonzero(np.abs(shapes[name]).max(axis=1) > 1e-9)
         posed = member.face(mesh.vertices[moved] + shapes[name][moved])

@@ -19,11 +19,11 @@ from facediff.synthetic.head.surface import TOP, level_of, plane_of
 
 Index = NDArray[np.int64]
 
-COLUMNS, ROWS = 26, 48
+COLUMNS, ROWS = 26, 52
 """Cells of the grid, round the head and upwards."""
 
 # Holes by their first and last column, first and last row.
-_HOLES = {"mouth": (0, 8, 13, 17), "eye": (4, 12, 28, 32), "nostril": (1, 3, 20, 22), "ear": (17, 20, 24, 31)}
+_HOLES = {"mouth": (0, 8, 17, 21), "eye": (4, 12, 32, 36), "nostril": (1, 3, 24, 26), "ear": (17, 20, 27, 34)}
 
 MOUTH_HALF_WIDTH = 25.0
 MOUTH_Y = -46.0
@@ -33,22 +33,24 @@ MOUTH_POINTS, EYE_POINTS = 21, 24
 MOUTH_MARGIN, EYE_MARGIN = 9.0, 8.0
 """Distance in mm of the holes' borders from lips and lids."""
 
-# Heights in mm of the grid's rows on the front midline; rows 14 to 16 end at the mouth.
-_BELOW = (-178, -160, -143, -128, -116, -108, -103, -98.5, -94, -88, -81, -74, -68)
+SHIRT_ROWS = 4  # Rows of vertices that the shirt covers
+# Heights in mm of the grid's rows on the front midline; rows 18 to 20 end at the mouth. The shirt reaches up
+# to row 3.
+_BELOW = (-215, -196, -180, -168.5, -166, -152, -139, -126, -112, -103.5, -98, -93.5, -89, -84, -79, -73.5, -68)
 _NOSE = (-30.5, -27, -24.5, -21.5, -17.5, -12.5, -6.5, 0.5, 7.5, 14.5, 21.0)
 # Columns of the rows over the nose, as distances from the midline: they hold its back and wings in place.
 _NOSE_COLUMNS: dict[int, tuple[float, ...]] = {
-    19: (4.2, 8.5, 13.5, 19, 25),
-    20: (3.6, 7.4, 11.6, 17.2, 23.5),
-    21: (3.4, 8.0, 13.0, 18.0, 23.6),
-    22: (3.8, 8.0, 13.2, 18.4, 23.8),
-    23: (3.8, 7.8, 12.4, 17.4, 23.4),
-    24: (3.8, 7.6, 11.8, 16.4, 22.6),
-    25: (3.6, 7.2, 11, 15.6, 21.6),
-    26: (3.3, 6.6, 10.2, 14.6),
-    27: (3.0, 6.0, 9.0, 13.0),
+    23: (4.2, 8.5, 13.5, 19, 25),
+    24: (3.6, 7.4, 11.6, 17.2, 23.5),
+    25: (3.4, 8.0, 13.0, 18.0, 23.6),
+    26: (3.8, 8.0, 13.2, 18.4, 23.8),
+    27: (3.8, 7.8, 12.4, 17.4, 23.4),
+    28: (3.8, 7.6, 11.8, 16.4, 22.6),
+    29: (3.6, 7.2, 11, 15.6, 21.6),
+    30: (3.3, 6.6, 10.2, 14.6),
+    31: (3.0, 6.0, 9.0, 13.0),
 }
-_EAR_CENTRE, _EAR_HEIGHT, _EAR_SIZE = 1.70, 2.0, (0.15, 27.0)
+_EAR_CENTRE, _EAR_HEIGHT, _EAR_SIZE = 1.70, -8.0, (0.15, 27.0)
 _PLANE_RADIUS = 70.0  # mm by which an angle is multiplied, so that both coordinates of the plane are lengths
 
 
@@ -62,25 +64,27 @@ class Layout:
         holes: the vertices round each hole. ``mouth`` runs from the upper midline over the corner to the lower one;
             the others are closed and begin in the middle of the side that faces the midline, upwards first.
         top: the vertices of the last row, from the front midline to the back.
+        shirt: the vertices of the first rows, which a shirt covers.
     """
 
     plane: Array
     quads: Index
     holes: dict[str, Index]
     top: Index
+    shirt: Index
 
 
 def contact_line(x: Array) -> Array:
     """Height in mm at which the lips meet."""
-    return MOUTH_Y + through([0, 6, 14, 25], [-0.5, 0.2, 0.2, 0.0], x)
+    return MOUTH_Y + through([-6, 0, 6, 14, 25], [0.2, -0.5, 0.2, 0.2, 0.0], x)
 
 
 def mouth_ring(distance: float) -> Array:
     """Outline of the lips, or a curve at a distance outside it, as (x, y) in mm, shape (21, 2)."""
     share = np.linspace(0.0, 1.0, MOUTH_POINTS // 2 + 1)
     x = MOUTH_HALF_WIDTH * np.sin(0.5 * np.pi * share) ** 0.92
-    upper = through([0, 5.5, 12, 19, 23.5, 25], [6.6, 8.2, 6.6, 3.8, 2.0, 0.5], x)
-    lower = through([0, 8, 16, 22, 24, 25], [9.6, 9.2, 6.6, 3.2, 1.8, 0.5], x)
+    upper = through([-5.5, 0, 5.5, 12, 19, 23.5, 25], [8.0, 6.8, 8.0, 6.6, 3.8, 2.0, 0.5], x)
+    lower = through([-8, 0, 8, 16, 22, 24, 25], [9.4, 9.9, 9.4, 6.6, 3.2, 1.8, 0.5], x)
     turn = 0.5 * np.pi * share**1.15
     across, middle = x + distance * np.sin(turn), contact_line(x)
     top = np.stack([across, middle + upper + distance * np.cos(turn)], axis=1)
@@ -121,7 +125,8 @@ def lay_out() -> Layout:
     number[used] = np.arange(len(used))
     holes = {name: number[_border(name)] for name in _HOLES}
     top = number[[_at(column, ROWS) for column in range(COLUMNS + 1)]]
-    return Layout(plane[used], number[quads], holes, top)
+    shirt = number[: SHIRT_ROWS * (COLUMNS + 1)]
+    return Layout(plane[used], number[quads], holes, top, shirt)
 
 
 def _at(column: int, row: int) -> int:
@@ -145,22 +150,25 @@ def _held() -> dict[int, tuple[float, float]]:
     """Vertices whose place in the plane is given: the grid's edges, the borders of holes, and the nose."""
     heights = dict(enumerate(_BELOW))
     border = mouth_ring(MOUTH_MARGIN)
-    heights[13], heights[17] = border[-1, 1], border[0, 1]
-    heights |= dict(zip(range(18, 29), _NOSE, strict=True))
-    heights |= dict(zip(range(29, 37), np.linspace(27, 60, 8), strict=True))
-    heights |= dict(zip(range(37, ROWS + 1), np.linspace(67.5, 139.5, ROWS - 36), strict=True))
+    heights[17], heights[21] = border[-1, 1], border[0, 1]
+    heights |= dict(zip(range(22, 33), _NOSE, strict=True))
+    heights |= dict(zip(range(33, 41), np.linspace(27, 60, 8), strict=True))
+    heights |= dict(zip(range(41, ROWS + 1), np.linspace(67.0, 132.0, ROWS - 40), strict=True))
     end = TOP - 1.0  # the crown itself is one vertex, which no grid reaches
     held = {_at(0, row): (0.0, float(level_of(height))) for row, height in heights.items()}
-    held |= {_at(COLUMNS, row): (np.pi, level) for row, level in enumerate(np.linspace(0.0, end, ROWS + 1))}
+    first = float(level_of(heights[SHIRT_ROWS + 1]))
+    back = np.linspace(first, end, ROWS - SHIRT_ROWS)
+    held |= {_at(COLUMNS, row): (np.pi, level) for row, level in enumerate(back.tolist(), start=SHIRT_ROWS + 1)}
     # Cells are narrow in the face and wide at the back.
     angles = np.pi * np.interp(np.arange(COLUMNS + 1), [0, 12, 17, 20, 26], [0, 0.30, 0.46, 0.58, 1.0])
     for column, angle in enumerate(angles):
-        held[_at(column, 0)], held[_at(column, ROWS)] = (angle, 0.0), (angle, end)
+        held[_at(column, ROWS)] = angle, end
+        held |= {_at(column, row): (angle, float(level_of(heights[row]))) for row in range(SHIRT_ROWS + 2)}
     for name, outline in (("mouth", border), ("eye", eye_ring(EYE_MARGIN))):
         held |= dict(zip(_border(name), map(tuple, plane_of(outline).tolist()), strict=True))
     for row, columns in _NOSE_COLUMNS.items():
         # The lowest rows rise towards the cheek, as the base of the nose does.
-        lift = np.interp(np.arange(1, len(columns) + 1), [3, 4, 5], [0.0, 0.6, 1.5]) * (row <= 21)
+        lift = np.interp(np.arange(1, len(columns) + 1), [3, 4, 5], [0.0, 0.6, 1.5]) * (row <= 25)
         places = plane_of(np.stack([np.array(columns), heights[row] + lift], axis=1))
         for column, place in enumerate(places.tolist(), start=1):
             held.setdefault(_at(column, row), (place[0], place[1]))

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from facediff.synthetic.geometry import Array, bump, rise, through
+from facediff.synthetic.head.hair import HAIR_COLUMNS, HAIR_ROWS, hair_points, strands
 from facediff.synthetic.head.layout import (
     EYE_POINTS,
     INNER_CANTHUS,
@@ -23,16 +24,17 @@ from facediff.synthetic.head.layout import (
     mouth_ring,
 )
 from facediff.synthetic.head.mesh import HalfQuadMesh, QuadMesh
-from facediff.synthetic.head.surface import level_of, skin, skin_at
+from facediff.synthetic.head.surface import skin, skin_at
 
 EYE_CENTRE = np.array([31.0, 25.0, 62.5])
 EYE_RADIUS = 12.2
 """Radius of the eyeball in mm, as of adults' eyes."""
 
-SKIN, LIP, GUM, TOOTH = (222, 174, 150), (186, 98, 96), (196, 110, 108), (238, 232, 218)
+SKIN, LIP, GUM, TOOTH = (222, 174, 150), (188, 106, 102), (196, 110, 108), (238, 232, 218)
 _MOUTH, _THROAT, _TONGUE = (132, 58, 58), (38, 12, 14), (192, 104, 104)
-_LID_EDGE, _BEHIND_LIDS, _LASH = (200, 130, 118), (196, 120, 110), (46, 32, 28)
-HAIR, _CROWN = (78, 54, 42), (0.0, 140.3, 0.0)
+_LID_EDGE, _BEHIND_LIDS, _LASH, _LASH_LINE = (206, 140, 126), (196, 120, 110), (46, 32, 28), (112, 74, 64)
+SHIRT = (92, 108, 128)
+HAIR, _CROWN = (78, 54, 42), (0.0, 132.8, 0.0)
 
 LIP_LOOPS = ("lip_outer", "lip_crest", "lip_front", "lip_inner", "lip_roll", "mouth_front", "mouth_bag", "mouth_back")
 """Loops of the mouth inwards from the border of the lips; upper and lower lip touch at ``lip_inner``."""
@@ -40,7 +42,7 @@ AROUND_MOUTH = {"mouth_far": 5.6, "mouth_near": 2.6, "lip_border": 0.0}
 """Loops of skin round the mouth, and their distance from the lips in mm."""
 AROUND_EYE = {"eye_far": 5.4, "eye_crease": 3.3, "eye_near": 1.6, "eye_edge": 0.0}
 """Loops of skin round the eye, and their distance from the edge of the lids in mm."""
-LASHES, BROW_STROKES = 13, 17
+LASHES, BROW_COLUMNS = 15, 15
 
 
 @lru_cache(maxsize=1)
@@ -54,7 +56,7 @@ def build_head() -> QuadMesh:
     _add_ear(half, layout)
     _add_teeth(half)
     _add_tongue(half)
-    _add_hair(half, layout)
+    _add_hair(half)
     _add_brow(half)
     return half.mirrored()
 
@@ -68,14 +70,19 @@ def _add_skin(half: HalfQuadMesh, layout: Layout) -> None:
     x, y, z = points.T
     front = rise(z, 20, 60)
     for centre, width, colour, share in (
-        ((40, -6), (14, 12), (214, 120, 106), 0.35),  # cheeks
+        ((42, -8), (15, 14), (216, 128, 112), 0.26),  # cheeks
         ((0, -14), (9, 7), (212, 126, 110), 0.28),  # tip of the nose
         ((0, -84), (14, 9), (214, 140, 122), 0.2),  # chin
         ((31, 25), (17, 10), (196, 140, 124), 0.35),  # lids
         ((0, -66), (12, 4), (198, 140, 122), 0.25),  # below the lower lip
     ):
         colours += (share * front * bump(x, y, centre, width))[:, None] * (np.array(colour) - colours)
+    covered = layout.shirt
+    colours[covered] = SHIRT
+    outwards = points[covered] * [1.0, 0.0, 1.0]
+    points[covered] += 2.2 * outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
     index = half.add("skin", points, colours)
+    half.groups["skin_shirt"] = index[covered]
     half.quads.append(index[layout.quads])
     half.fan(layout.top, int(half.add("crown", [_CROWN], SKIN)[0]), closed=False)
 
@@ -99,9 +106,9 @@ def _add_mouth(half: HalfQuadMesh, layout: Layout) -> None:
         ("lip_front", 0.16, 0.0, 3.0, 3.6, 0.974, LIP),
         ("lip_inner", 0.0, 0.0, -0.2, -0.2, 0.962, tuple(0.8 * np.array(LIP))),
         ("lip_roll", 0.0, 0.9, -3.6, -3.8, 0.95, _MOUTH),
-        ("mouth_front", 0.0, 4.5, -6.5, -7.0, 0.94, _MOUTH),
-        ("mouth_bag", 0.0, 11.0, -16.0, -17.0, 0.9, tuple(0.7 * np.array(_MOUTH))),
-        ("mouth_back", 0.0, 13.0, -40.0, -40.0, 0.7, _THROAT),
+        ("mouth_front", 0.0, 4.5, -6.5, -7.0, 0.97, _MOUTH),
+        ("mouth_bag", 0.0, 11.0, -16.0, -17.0, 1.15, tuple(0.7 * np.array(_MOUTH))),
+        ("mouth_back", 0.0, 13.0, -42.0, -42.0, 1.0, _THROAT),
     ):
         forward = np.where(side > 0, upper, lower)
         forward = np.where(forward > 0, forward * full, forward)
@@ -138,14 +145,18 @@ def _add_eye(half: HalfQuadMesh, layout: Layout) -> None:
     inner = edge.copy()
     inner[:, :2] += 0.035 * (middle - edge[:, :2])
     inner = _towards_ball(inner, 1.7)
-    loops.append(half.add("lid_edge", inner, _LID_EDGE))
+    line = np.where(np.isin(np.arange(EYE_POINTS), np.arange(2, EYE_POINTS // 2))[:, None], _LASH_LINE, _LID_EDGE)
+    loops.append(half.add("lid_edge", inner, line))
     # Lids go on behind their edge, close to the ball, so that no gap opens when they move.
-    for name, wider, back in (("lid_behind", 1.12, 0.3), ("lid_end", 1.3, 1.35)):
-        points = inner.copy()
-        points[:, :2] = middle + wider * (inner[:, :2] - middle)
-        beside = ((points - EYE_CENTRE)[:, :2] ** 2).sum(axis=1)
-        points[:, 2] = EYE_CENTRE[2] + np.sqrt(np.clip((EYE_RADIUS + 0.3) ** 2 - beside, 1.0, None)) - back
-        loops.append(half.add(name, points, _BEHIND_LIDS))
+    points = inner.copy()
+    points[:, :2] = middle + 1.12 * (inner[:, :2] - middle)
+    beside = ((points - EYE_CENTRE)[:, :2] ** 2).sum(axis=1)
+    points[:, 2] = EYE_CENTRE[2] + np.sqrt(np.clip((EYE_RADIUS + 0.3) ** 2 - beside, 1.0, None)) - 0.3
+    loops.append(half.add("lid_behind", points, _BEHIND_LIDS))
+    # They end on the ball, so that nobody looks past it into the head; at the inner corner that makes the caruncle.
+    away = points - EYE_CENTRE + np.array([0.0, 0.0, -2.5])
+    away *= (EYE_RADIUS - 0.3) / np.linalg.norm(away, axis=1, keepdims=True)
+    loops.append(half.add("lid_end", EYE_CENTRE + away, _BEHIND_LIDS))
     half.strips(loops, closed=True)
     _add_lashes(half, edge)
     _add_eyeball(half)
@@ -166,8 +177,8 @@ def _towards_ball(points: Array, thickness: float) -> Array:
 
 
 def lash_places() -> Array:
-    """Where the roots of the upper lashes lie along the lid, from 0 at the inner corner to 1, shape (13,)."""
-    return np.linspace(0.12, 0.97, LASHES)
+    """Where the roots of the upper lashes lie along the lid, from 0 at the inner corner to 1, shape (15,)."""
+    return np.linspace(0.10, 0.96, LASHES)
 
 
 def _add_lashes(half: HalfQuadMesh, edge: Array) -> None:
@@ -176,10 +187,10 @@ def _add_lashes(half: HalfQuadMesh, edge: Array) -> None:
     for number, place in enumerate(lash_places()):
         roots = [
             np.array([np.interp(min(at, 1.0), along, upper[:, axis]) for axis in range(3)])
-            for at in (place, place + 0.035)
+            for at in (place, place + 0.022)
         ]
         out = (roots[0] - EYE_CENTRE) / np.linalg.norm(roots[0] - EYE_CENTRE)
-        tip = roots[0] + (3.2 + 2.6 * place) * (0.75 * out + np.array([0.35 * (place - 0.35), 0.62, 0.25]))
+        tip = roots[0] + (2.4 + 2.0 * place) * (0.85 * out + np.array([0.75 * (place - 0.4), 0.35, 0.35]))
         index = half.add(f"lash_{number:02d}", [*(root + np.array([0.0, 0.0, 0.05]) for root in roots), tip], _LASH)
         half.quads.append(index[[0, 1, 2, 2]][None])
 
@@ -187,12 +198,13 @@ def _add_lashes(half: HalfQuadMesh, edge: Array) -> None:
 def _add_eyeball(half: HalfQuadMesh) -> None:
     """Sclera, iris and pupil as rings from behind to the front; the cornea stands out a little over the iris' rim."""
     turn = 2.0 * np.pi * np.arange(20) / 20
+    fibres = 1.0 + 0.09 * np.cos(np.pi * np.arange(20)) + 0.05 * np.sin(5.0 * turn)
     rings = []
     for name, degrees, out, colour in (
-        ("ball_0", 105.0, 0.0, (240, 236, 230)),
-        ("ball_1", 75.0, 0.0, (242, 238, 233)),
-        ("ball_2", 48.0, 0.0, (243, 240, 236)),
-        ("ball_3", 31.0, 0.05, (238, 234, 230)),
+        ("ball_0", 105.0, 0.0, (206, 172, 164)),
+        ("ball_1", 75.0, 0.0, (222, 204, 197)),
+        ("ball_2", 48.0, 0.0, (232, 224, 218)),
+        ("ball_3", 31.0, 0.05, (224, 220, 216)),
         ("iris_rim", 28.0, 0.25, (70, 92, 98)),
         ("iris_middle", 20.0, -0.2, (96, 128, 132)),
         ("iris_inner", 11.5, -0.3, (60, 80, 84)),
@@ -201,10 +213,17 @@ def _add_eyeball(half: HalfQuadMesh) -> None:
         angle, radius = np.deg2rad(degrees), EYE_RADIUS + out
         across, up = -radius * np.sin(angle) * np.cos(turn), radius * np.sin(angle) * np.sin(turn)
         ring = np.stack([across, up, np.full_like(turn, radius * np.cos(angle))], axis=1)
-        rings.append(half.add(name, EYE_CENTRE + ring, colour))
+        shade = fibres[:, None] if name == "iris_middle" else np.ones((20, 1))
+        rings.append(half.add(name, EYE_CENTRE + ring, shade * np.array(colour)))
     half.strips(rings, closed=True)
     tip = half.add("pupil", [EYE_CENTRE + np.array([0.0, 0.0, EYE_RADIUS - 0.25])], (14, 12, 12))
     half.fan(rings[-1], int(tip[0]))
+    # The light that the cornea reflects, above the pupil in both eyes.
+    around = np.pi * np.arange(6) / 3.0
+    glint = np.stack([np.cos(around), 2.9 + 0.9 * np.sin(around), np.full(6, EYE_RADIUS)], axis=1)
+    glint *= (EYE_RADIUS + 0.34) / np.linalg.norm(glint, axis=1, keepdims=True)
+    index = half.add("glint", EYE_CENTRE + glint, (255, 255, 255))
+    half.quads.append(index[[[0, 1, 2, 3], [0, 3, 4, 5]]])
 
 
 def _add_nostril(half: HalfQuadMesh, layout: Layout) -> None:
@@ -217,9 +236,9 @@ def _add_nostril(half: HalfQuadMesh, layout: Layout) -> None:
     for number, (size, inside, colour) in enumerate(
         (
             (1.0, (0.0, 0.2, -0.1), SKIN),
-            (0.82, (0.0, 1.2, -0.4), (150, 92, 80)),
-            (0.62, (0.3, 5.0, -2.5), (84, 40, 38)),
-            (0.3, (0.5, 9.0, -5.0), (40, 18, 18)),
+            (0.82, (0.0, 1.2, -0.4), (142, 86, 74)),
+            (0.62, (0.3, 5.0, -2.5), (58, 27, 25)),
+            (0.3, (0.5, 9.0, -5.0), (24, 10, 10)),
         )
     ):
         loops.append(half.add(f"nostril_{number}", centre + size * oval + np.array(inside), colour))
@@ -233,9 +252,9 @@ def _add_ear(half: HalfQuadMesh, layout: Layout) -> None:
     turn = 2.0 * np.pi * np.arange(len(loops[0])) / len(loops[0])
     front = half.at("skin")[loops[0]].mean(axis=0) + np.array([0.5, 0.0, 15.0])
     up = 29.0 * np.sin(turn) * (1.0 + 0.08 * np.sin(turn))
-    back = (17.0 - 17.0 * np.cos(turn)) * (1.0 - 0.22 * rise(-np.sin(turn), 0.2, 1.0))  # the lobe is narrow
+    back = (17.0 - 17.0 * np.cos(turn)) * (1.0 - 0.36 * rise(-np.sin(turn), 0.0, 1.0))  # the lobe is narrow
     attached = rise(np.cos(turn), 0.35, 0.95)
-    flare, tilt = np.deg2rad(28.0), np.deg2rad(10.0)
+    flare, tilt = np.deg2rad(28.0), np.deg2rad(14.0)
     for name, size, out, closer, shift, shade in (
         ("ear_stalk", 0.80, -4.5, 0.5, (0.0, 0.0), 1.0),
         ("ear_behind", 0.97, -2.0, 0.8, (0.0, 0.0), 1.0),
@@ -265,7 +284,7 @@ def _add_teeth(half: HalfQuadMesh) -> None:
     turn = np.linspace(0.0, np.deg2rad(68.0), columns)
     normal = np.stack([np.sin(turn), np.zeros(columns), np.cos(turn)], axis=1)
     front = float(seam_depth(half.at("lip_border"))[0]) - 6.0
-    arch = np.stack([27.0 * np.sin(turn), np.zeros(columns), front - 37.5 * (1.0 - np.cos(turn))], axis=1)
+    arch = np.stack([25.0 * np.sin(turn), np.zeros(columns), front - 37.5 * (1.0 - np.cos(turn))], axis=1)
     between = (np.arange(columns) % 2 == 0).astype(np.float64)
     white, inside = np.array(TOOTH, dtype=np.float64), 0.8 * np.array(TOOTH)
     # Height, distance from the arch, depth of the grooves between teeth, colour; front to back over the biting edge.
@@ -294,7 +313,9 @@ def _add_teeth(half: HalfQuadMesh) -> None:
         for name, height, out, groove, colour in rows:
             points = arch + normal * (out - groove * between)[:, None]
             points[:, 1] = height + (0.7 * sign * between if name == "edge" else 0.0)
-            loops.append(half.add(f"teeth_{jaw}_{name}", points, colour))
+            # Little light reaches the back of the mouth.
+            dark = 1.0 - 0.6 * rise(turn, np.deg2rad(15.0), np.deg2rad(60.0))
+            loops.append(half.add(f"teeth_{jaw}_{name}", points, dark[:, None] * np.array(colour)))
         # A strip's first row runs clockwise round the next one: outwards the two arches lie the opposite way round.
         half.strips(loops[::-1])
 
@@ -317,51 +338,26 @@ def _add_tongue(half: HalfQuadMesh) -> None:
     half.strips(loops)
 
 
-def hairline(theta: Array) -> Array:
-    """Height in mm at which the hair begins, by the angle round the head."""
-    knots = [0, 0.35, 0.62, 0.85, 1.0, 1.15, 1.35, 1.6, 2.0, 3.2]
-    return through(knots, [86, 84, 74, 60, 34, 30, 20, 6, -42, -66], theta)
-
-
-def _add_hair(half: HalfQuadMesh, layout: Layout) -> None:
-    """Short hair: a shell over the skin whose edge lies below it, so that the hairline is where both surfaces cross."""
-    theta, level = layout.plane.T
-    points = half.at("skin")
-    inside = level - level_of(hairline(theta))
-    normal = points / np.array([75.0, 140.0, 95.0]) ** 2
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    from_ear = np.hypot(75.0 * (theta - 1.70), level - level_of(4.0))
-    thickness = (
-        13.6 * rise(inside, -9.0, 30.0) * rise(from_ear, 26.0, 62.0) * (1.0 - 0.35 * bump(theta, 0, (1.5, 0), (0.5, 1)))
-        - 1.6
-    )
-    strands = 0.7 * np.sin(22.0 * theta + 0.04 * level), 0.5 * np.sin(37.0 * theta - 0.03 * level + 1.0)
-    thickness += rise(inside, 0.0, 20.0) * (strands[0] + strands[1])
-    points = points + thickness[:, None] * normal
-    points[(theta == 0.0) | (theta > np.pi - 1e-6), 0] = 0.0
-    quads = layout.quads[(inside > -16.0)[layout.quads].all(axis=1)]
-    kept = np.unique(quads)
-    number = np.full(len(points), -1)
-    number[kept] = np.arange(len(kept))
-    shade = 0.92 + 0.14 * strands[0] + 0.16 * strands[1]
-    hair = half.add("hair", points[kept], (shade[:, None] * np.array(HAIR))[kept])
-    half.quads.append(hair[number[quads]])
-    crown = half.add("hair_crown", [np.array(_CROWN) + np.array([0.0, 12.0, 0.0])], HAIR)
-    half.fan(hair[number[layout.top]], int(crown[0]), closed=False)
-    # The skin below is darkened before the edge, as hair that is cut short does.
-    colours = half.colours[0]
-    colours += (0.85 * rise(inside, -7.0, 3.0))[:, None] * (1.2 * np.array(HAIR) - colours)
+def _add_hair(half: HalfQuadMesh) -> None:
+    """The shell of hair, in the first style of :data:`facediff.synthetic.head.hair.HairStyle`."""
+    points, top = hair_points("short")
+    shade = 0.92 + 0.22 * strands()
+    grid = half.add("hair", points, shade[:, None] * np.array(HAIR)).reshape(HAIR_ROWS, HAIR_COLUMNS)
+    half.strips(list(grid[::-1]))
+    crown = half.add("hair_crown", [top], 0.92 * np.array(HAIR))
+    half.fan(grid[-1], int(crown[0]), closed=False)
 
 
 def _add_brow(half: HalfQuadMesh) -> None:
-    """Short strokes that lie on the skin and overlap, leaning outwards."""
-    x = np.linspace(12.5, 48.0, BROW_STROKES)
-    y = through([12, 20, 30, 40, 49], [40.0, 42.6, 44.4, 43.6, 38.5], x)
-    thickness = through([12, 18, 34, 49], [2.6, 4.2, 3.2, 0.8], x)
-    lean = np.interp(x, [12, 24, 49], [0.2, 1.6, 3.4])
-    for number, (across, height, thick, to_side) in enumerate(zip(x, y, thickness, lean, strict=True)):
-        corners = np.array([[-1.5, -0.55], [1.7, -0.5], [1.9 + to_side, 0.55], [-0.4 + 0.8 * to_side, 0.6]])
-        points = skin_at(np.array([across, height]) + corners * np.array([1.0, thick]))
-        points[:, 2] += np.array([0.5, 0.5, 0.9, 0.9])  # the upper ends stand off a little, as hair does
-        index = half.add(f"brow_{number:02d}", points, 0.95 * np.array(HAIR))
-        half.quads.append(index[None])
+    """A thin ribbon on the skin; its rims and its ends are half as dense as its middle."""
+    share = np.linspace(0.0, 1.0, BROW_COLUMNS)
+    x = 11.5 + 36.5 * share
+    y = through([10, 20, 30, 39, 49], [39.6, 42.2, 44.4, 44.2, 39.0], x)
+    thickness = through([0.0, 0.08, 0.3, 0.65, 1.0], [1.7, 2.6, 2.7, 1.9, 0.4], share)
+    rows = []
+    for row, (off, lift) in enumerate(((-1.0, 0.1), (-0.55, 0.55), (0.45, 0.75), (1.0, 0.1))):
+        lean = 0.9 * off * (1.0 - share)  # the upper rim lies further out, as the hairs do
+        points = skin_at(np.stack([x + lean, y + off * thickness], axis=1))
+        points[:, 2] += lift
+        rows.append(half.add(f"brow_{row}", points, HAIR))
+    half.strips(rows[::-1])

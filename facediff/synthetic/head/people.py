@@ -7,18 +7,15 @@ through it as well as the head at rest, and the rig moves in the person's own pr
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from facediff.synthetic.geometry import Array, bump, rise
-from facediff.synthetic.head.layout import MOUTH_Y, lay_out
+from facediff.synthetic.head.hair import HairStyle, hair_points
+from facediff.synthetic.head.layout import MOUTH_Y
 from facediff.synthetic.head.mesh import QuadMesh
-from facediff.synthetic.head.parts import EYE_CENTRE, HAIR, SKIN, hairline
-from facediff.synthetic.head.surface import level_of
-
-HairStyle = Literal["short", "cropped", "bald", "bob", "long", "bun"]
+from facediff.synthetic.head.parts import BROW_COLUMNS, EYE_CENTRE, HAIR, SHIRT, SKIN
 
 SKIN_TONES = {
     "pale": (238, 200, 180),
@@ -36,17 +33,28 @@ HAIR_COLOURS = {
     "grey": (150, 148, 146),
     "white": (222, 220, 216),
 }
+SHIRTS = {
+    "slate": SHIRT,
+    "navy": (48, 58, 88),
+    "teal": (52, 110, 112),
+    "rust": (162, 88, 62),
+    "sand": (190, 172, 142),
+    "wine": (110, 46, 58),
+    "moss": (96, 110, 74),
+}
 EYE_COLOURS = {"blue": (96, 128, 150), "grey": (120, 130, 132), "green": (98, 122, 84), "brown": (98, 66, 42)}
 
 
 @dataclass(frozen=True)
 class Complexion:
-    """The colours of a person and how the hair is worn."""
+    """The colours of a person, how the hair is worn, and the shirt."""
 
     skin: str = "fair"  # A name in SKIN_TONES
     hair: str = "brown"  # A name in HAIR_COLOURS
     eyes: str = "grey"  # A name in EYE_COLOURS
     style: HairStyle = "short"
+    shirt: str = "slate"  # A name in SHIRTS
+    stubble: float = 0.0  # How dense the shadow of a beard is, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -173,68 +181,44 @@ def _moves(x: Array, y: Array, z: Array) -> dict[str, Array]:
     }
 
 
-# How hair is worn: how thick the shell is, as a share of short hair, and how far its lower edge hangs down, in mm.
-_STYLES: dict[HairStyle, tuple[float, float]] = {
-    "short": (1.0, 0.0),
-    "cropped": (0.35, 0.0),
-    "bald": (-0.35, 0.0),
-    "bob": (1.5, 62.0),
-    "long": (1.3, 118.0),
-    "bun": (0.75, 0.0),
-}
-
-
-def dressed(vertices: Array, mesh: QuadMesh, complexion: Complexion) -> Array:
-    """The head (V, 3) with its hair worn as a person wears it; ``vertices`` has the short hair of the average head."""
-    thickness, hanging = _STYLES[complexion.style]
-    points = vertices.copy()
-    layout = lay_out()
-    theta, level = layout.plane.T
-    inside = level - level_of(hairline(theta))
-    kept = np.unique(layout.quads[(inside > -16.0)[layout.quads].all(axis=1)])
-    below, shell = mesh.groups["skin"][kept], mesh.groups["hair"]
-    theta, inside = theta[kept], inside[kept]
-    for side in (slice(None), mesh.mirror):
-        skin, hair = (np.arange(len(vertices))[side][index] for index in (below, shell))
-        off = vertices[hair] - vertices[skin]
-        share = np.where(inside > -9.0, thickness, 1.0)[:, None]
-        points[hair] = vertices[skin] + (
-            off * share if thickness > 0 else np.minimum(np.abs(off), 3.0) * np.sign(off) * thickness
-        )
-        # Long hair falls from behind the ears; it stands off the neck, whose outline it does not follow.
-        fall = rise(theta, 1.15, 1.55) * rise(inside, 46.0, -6.0)
-        away = np.stack([np.sign(points[hair, 0]) * np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=1)
-        points[hair] += fall[:, None] * (away * min(hanging, 40.0) * 0.35 - np.array([0.0, hanging, 0.0]))
-        if complexion.style == "bun":
-            knot = bump(inside, theta, (120.0, np.pi), (26.0, 0.42))
-            points[hair] += knot[:, None] * away * 34.0
-    crown, hair_crown = mesh.groups["crown"], mesh.groups["hair_crown"]
-    points[hair_crown] = vertices[crown] + (12.0 * thickness if thickness > 0 else -3.0) * np.array([0.0, 1.0, 0.0])
-    return points
+def dressed(face: Face, mesh: QuadMesh, complexion: Complexion) -> Array:
+    """A person's head at rest (V, 3) with the hair as it is worn."""
+    points = mesh.vertices.copy()
+    shell, crown = hair_points(complexion.style)
+    for name, places in (("hair", shell), ("hair_crown", crown[None])):
+        index = mesh.groups[name]
+        points[index] = places
+        points[mesh.mirror[index]] = places * [-1.0, 1.0, 1.0]
+    middle = mesh.mirror == np.arange(len(points))
+    points[middle, 0] = 0.0
+    return face(points)
 
 
 def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
     """The head's colours (V, 3) in a person's complexion."""
     colours = mesh.colours.astype(np.float64)
-    tint = np.array(SKIN_TONES[complexion.skin]) / np.array(SKIN)
-    skin = mesh.both("skin", "crown", "mouth_far", "mouth_near", "lip_border", "eye_", "ear_", "nostril", "lid_")
-    hair_tint = np.array(HAIR_COLOURS[complexion.hair]) / np.array(HAIR)
-    layout = lay_out()
-    theta, level = layout.plane.T
-    scalp = 0.85 * rise(level - level_of(hairline(theta)), -7.0, 3.0)
-    under = mesh.groups["skin"]
-    for index in (under, mesh.mirror[under]):
-        # The darkened scalp takes the colour of the hair, and that of the skin where there is no hair.
-        scalp_colour = np.array(SKIN) if complexion.style == "bald" else 1.2 * np.array(HAIR) * hair_tint / tint
-        colours[index] += scalp[:, None] / 0.85 * (scalp_colour - colours[index])
-    colours[skin] *= tint
-    lips = mesh.both("lip_outer", "lip_crest", "lip_front", "lip_inner")
-    colours[lips] *= 0.45 + 0.55 * tint
-    for name in ("hair", "brow_"):
-        colours[mesh.both(name)] *= hair_tint
-    if complexion.style == "bald":  # the shell lies below the skin, whose colour it takes where they cross
-        colours[mesh.both("hair")] = np.array(SKIN) * tint
+    tone = np.array(SKIN_TONES[complexion.skin], dtype=np.float64)
+    tint, hair_tint = tone / SKIN, np.array(HAIR_COLOURS[complexion.hair]) / np.array(HAIR)
+    around = ("skin", "crown", "mouth_far", "mouth_near", "lip_border")
+    colours[mesh.both(*around, "eye_", "ear_", "nostril", "lid_")] *= tint
+    x, y, z = mesh.vertices.T
+    if complexion.stubble:
+        skin = mesh.both("skin", "mouth_far", "mouth_near")
+        beard = rise(y, -4.0 - 0.2 * np.abs(x), -34.0) * rise(y, -128.0, -104.0) * rise(z, 8.0, 30.0)
+        beard *= 1.0 - 0.85 * bump(np.abs(x), y, (30.0, -18.0), (12.0, 14.0))
+        shadow = complexion.stubble * beard[skin, None]
+        colours[skin] += shadow * (0.55 * tone + [8.0, 10.0, 12.0] - colours[skin])
+    colours[mesh.both("lip_outer", "lip_crest", "lip_front", "lip_inner")] *= 0.45 + 0.55 * tint
+    colours[mesh.both("hair")] *= hair_tint
+    brow = np.array(HAIR) * (0.25 + 0.6 * np.minimum(hair_tint, 2.2))
+    for name, share in (("brow_0", 0.35), ("brow_1", 0.95), ("brow_2", 0.9), ("brow_3", 0.3)):
+        density = share * np.interp(np.arange(BROW_COLUMNS), [0, 2, BROW_COLUMNS - 1], [0.35, 1.0, 0.8])[:, None]
+        index = mesh.groups[name]
+        colours[index] = colours[mesh.mirror[index]] = density * brow + (1.0 - density) * 0.93 * tone
+    shirt = mesh.both("skin_shirt")
+    colours[shirt] = SHIRTS[complexion.shirt]
     iris = np.array(EYE_COLOURS[complexion.eyes])
-    for name, shade in (("iris_rim", 0.7), ("iris_middle", 1.0), ("iris_inner", 0.62)):
-        colours[mesh.both(name)] = shade * iris
+    for name in ("iris_rim", "iris_middle", "iris_inner"):
+        average = mesh.colours[mesh.groups["iris_middle"]].mean(axis=0)
+        colours[mesh.both(name)] *= iris / average
     return np.asarray(np.clip(np.rint(colours), 0, 255), dtype=np.uint8)

@@ -83,7 +83,7 @@ class _Fields:
         self.sign = np.sign(mesh.vertices[:, 0])
         # Skin of the front of the face, which stretches; eyeballs, teeth and tongue do not, ears and hair stand still.
         self.soft = rise(self.z, -5.0, 35.0)
-        self.soft[mesh.both("ball_", "iris_", "pupil", "teeth_", "tongue_", "hair", "ear_")] = 0.0
+        self.soft[mesh.both("ball_", "iris_", "pupil", "glint", "teeth_", "tongue_", "hair", "ear_")] = 0.0
         for name, share in (("mouth_front", 0.8), ("mouth_bag", 0.35), ("mouth_back", 0.1)):
             self.soft[mesh.both(name)] *= share
         self.off_line = self.y - contact_line(np.minimum(self.x, MOUTH_HALF_WIDTH))
@@ -136,7 +136,7 @@ class _Fields:
         share = self.lower * rise(self.z, -14.0, 26.0) * rise(self.y, -150.0, -104.0) * rise(self.y, 6.0, -20.0)
         share[mesh.both("mouth_bag")] *= 0.85
         share[mesh.both("mouth_back")] *= 0.5
-        share[mesh.both("ball_", "iris_", "pupil", "teeth_upper", "hair", "ear_", "lash_", "brow_")] = 0.0
+        share[mesh.both("ball_", "iris_", "pupil", "glint", "teeth_upper", "hair", "ear_", "lash_", "brow_")] = 0.0
         share[mesh.both("teeth_lower")] = 1.0
         for number, root in enumerate(np.interp(np.arange(9), [0, 5, 8], [0.88, 0.75, 0.45])):
             share[mesh.both(f"tongue_{number}")] = root
@@ -182,6 +182,7 @@ class _Fields:
 
     def _mouth_sides(self) -> dict[str, Array]:
         corner = self._hill((26, MOUTH_Y), (10, 11))
+        wide = self._hill((29, MOUTH_Y), (13, 13)) * rise(self.x, 0.0, 16.0)
         press = self._hill((12, MOUTH_Y), (14, 8))
         mouth = self._hill((0, MOUTH_Y), (22, 15))
         upper = self._hill((9, -39), (10, 10)) * (1.0 - self.lower)
@@ -189,9 +190,9 @@ class _Fields:
         cheek = self._hill((38, -12), (14, 12))
         return {
             "mouthSmile": self._move(
-                6.0 * corner,
-                7.0 * corner + 2.0 * self._hill((36, -26), (13, 14)) + 1.5 * cheek,
-                2.5 * cheek - 4.5 * corner,
+                5.5 * wide,
+                6.0 * wide + 2.0 * self._hill((36, -26), (13, 14)) + 2.0 * cheek,
+                3.0 * cheek - 4.0 * corner - 1.5 * mouth,
             ),
             "mouthFrown": self._move(0.8 * corner, -6.0 * corner, -0.5 * corner),
             "mouthDimple": self._move(2.5 * corner, corner, -4.0 * corner),
@@ -288,9 +289,10 @@ class _Fields:
         upwards = np.array([[1, 0, 0], [0, np.cos(lift), -np.sin(lift)], [0, np.sin(lift), np.cos(lift)]])
         moves = np.zeros((len(self.x), 3))
         for name in self.mesh.groups:
-            if name.startswith(("ball_", "iris_", "pupil")):
+            if name.startswith(("ball_", "iris_", "pupil", "glint")):
                 points = self.mesh.vertices[self.mesh.groups[name]] - EYE_CENTRE
-                self._loop(moves, name, points @ (sideways @ upwards).T - points)
+                share = 0.5 if name == "glint" else 1.0  # a reflection goes half as far as the mirror turns
+                self._loop(moves, name, share * (points @ (sideways @ upwards).T - points))
         return moves
 
     def _closing(self, opened: Array) -> Array:

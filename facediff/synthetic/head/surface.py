@@ -20,27 +20,31 @@ from facediff.synthetic.geometry import Array, bump, rise, spline, through
 # the surface runs backwards and not down, so that many rows have nearly one height at the front.
 _ROWS = np.array(
     [
-        (-178, -178, 52, 92, 92, 2.1),
-        (-158, -160, 41, 64, 80, 2.0),
-        (-134, -128, 37, 54, 74, 2.0),
-        (-116, -98, 41, 53, 72, 2.0),
-        (-106, -80, 53, 54, 73, 1.98),
-        (-100.5, -69, 69, 56.5, 76, 1.90),
-        (-95, -61, 80.5, 59, 79, 1.84),
-        (-86, -52, 87.5, 61, 82, 1.84),
-        (-75, -42, 88, 62.8, 85, 1.88),
-        (-64, -32, 86.5, 64.3, 88, 1.92),
-        (-46, -17, 89, 66.3, 92, 2.0),
-        (-27, -3, 88.5, 68.5, 95, 2.1),
-        (-5, 11, 87, 70.5, 97.5, 2.22),
-        (22, 28, 86.5, 72.3, 99, 2.32),
-        (42, 46, 91.5, 74.0, 99.5, 2.34),
-        (66, 68, 91.0, 75.4, 98.5, 2.22),
-        (90, 91, 83, 72.0, 92, 2.1),
-        (112, 112, 66, 60.0, 78, 2.05),
-        (128, 128, 44, 41.5, 54, 2.0),
-        (137, 137, 23, 24, 28, 2.0),
-        (140, 140, 6, 6.5, 7, 2.0),
+        (-215, -200, 78, 150, 105, 2.6),
+        (-198, -178, 70, 139, 104, 2.5),
+        (-184, -160, 57, 114, 100, 2.3),
+        (-171, -145, 41, 83, 93, 2.1),
+        (-158, -132, 33, 65, 85, 2.0),
+        (-143, -119, 31, 56, 78, 2.0),
+        (-127, -105, 34, 51, 73.5, 2.0),
+        (-112, -91, 41, 49, 71, 2.0),
+        (-101, -77, 53, 48.5, 71.5, 1.96),
+        (-96, -69, 68, 50.5, 73, 1.9),
+        (-91, -61.5, 79.5, 54.5, 76, 1.84),
+        (-83.5, -53, 86.5, 57.5, 79.5, 1.84),
+        (-74, -43, 88, 60, 84, 1.88),
+        (-64, -33, 86.5, 62.5, 87.5, 1.92),
+        (-46, -18, 89, 65.2, 92, 2.0),
+        (-27, -3, 88.5, 67.7, 95, 2.1),
+        (-5, 11, 87, 70, 97.5, 2.22),
+        (22, 28, 86.5, 72, 99, 2.32),
+        (42, 46, 91.5, 73.8, 99.5, 2.34),
+        (66, 67, 90.5, 75, 98, 2.22),
+        (88, 88, 81.5, 71, 91, 2.1),
+        (107, 107, 66, 60, 78, 2.05),
+        (121, 121, 45, 42, 54, 2.0),
+        (130, 130, 23.5, 24, 28, 2.0),
+        (132.5, 132.5, 6, 6.5, 7, 2.0),
     ]
 )
 _BACK_EXPONENT = 2.15
@@ -55,6 +59,13 @@ TOP = float(_LEVELS[-1])
 def level_of(height: Array | float) -> Array:
     """The level at which the front midline has a height, in mm."""
     return np.asarray(np.interp(height, _ROWS[:, 0], _LEVELS))
+
+
+def level_at(theta: Array, height: Array) -> Array:
+    """The level (n,) at which the surface has a height in mm, at angles (n,)."""
+    turn = rise(theta, 0.0, 1.45)
+    columns = (_ROWS[:, 0] + share * (_ROWS[:, 1] - _ROWS[:, 0]) for share in turn)
+    return np.array([np.interp(up, column, _LEVELS) for up, column in zip(height, columns, strict=True)])
 
 
 def skin(theta: Array, level: Array) -> Array:
@@ -93,7 +104,7 @@ def skin_at(front: Array) -> Array:
 
 # The nose by height: how far it stands out, and its half width.
 _NOSE_LEVELS = (-29.5, -26.5, -23, -18, -13, -7, 4, 14, 24, 33, 42)
-_NOSE_DEPTHS = (0, 1.5, 9, 17.5, 20.0, 18.6, 13.6, 8.8, 4.4, 1.4, 0)
+_NOSE_DEPTHS = (0, 3.5, 12.5, 18.6, 20.6, 18.8, 13.4, 8.4, 4.2, 1.4, 0)
 _NOSE_WIDTH_LEVELS = (-30, -24, -17, -10, -2, 10, 24, 36)
 _NOSE_WIDTHS = (7, 8, 9.2, 9, 8.0, 6.4, 5.6, 7.0)
 
@@ -116,7 +127,7 @@ def _with_features(points: Array) -> Array:
     sideways = -3.0 * bump(y, z, (48, 38), (20, 16)) * rise(x, 35, 60)  # temple
     sideways += 2.5 * bump(y, z, (4, 42), (14, 20)) * rise(x, 30, 60)  # cheekbone
     sideways -= 2.5 * bump(y, z, (-34, 38), (16, 18)) * rise(x, 30, 60)  # hollow of the cheek
-    sideways += 3.0 * bump(y, z, (-44, 14), (16, 18)) * rise(x, 30, 60)  # angle of the jaw
+    sideways += 1.5 * bump(y, z, (-46, 14), (14, 18)) * rise(x, 30, 60)  # angle of the jaw
     return points + np.stack([sideways, np.zeros_like(y), front * forward], axis=-1)
 
 
@@ -126,5 +137,5 @@ def _nose(x: Array, y: Array) -> Array:
     width = through(_NOSE_WIDTH_LEVELS, _NOSE_WIDTHS, y)
     # A steep ridge on a wide foot, so that the side of the nose runs out into the cheek without an edge.
     ridge = 0.64 * np.exp(-0.9 * (x / width) ** 2.6) + 0.36 * np.exp(-((x / (1.9 * width)) ** 2))
-    wing = 8.0 * bump(x, y, (12.6, -19.0), (4.0, 5.2)) - 2.2 * bump(x, y, (18.5, -14.5), (1.8, 6))
-    return np.asarray(out * ridge + wing + 1.0 * bump(x, y, (0, -12), (6, 6)))
+    wing = 9.5 * bump(x, y, (13.0, -19.5), (3.8, 5.2)) - 2.6 * bump(x, y, (18.8, -15.0), (1.9, 6.5))
+    return np.asarray(out * ridge + wing + 1.6 * bump(x, y, (0, -13), (6.5, 6)))
