@@ -56,7 +56,7 @@ _BELOW = 16.0  # Height below which falling hair no longer follows the skull
 
 def hairline(theta: Array) -> Array:
     """Height at which the hair begins, by the angle round the head: forehead, temple, sideburn, over the ear, nape."""
-    front = [(0, 80), (0.3, 83), (0.55, 80.5), (0.75, 71), (0.9, 58), (1.02, 46), (1.15, 37), (1.27, 26), (1.37, 4)]
+    front = [(0, 81.5), (0.3, 83), (0.55, 80.5), (0.75, 71), (0.9, 58), (1.02, 46), (1.15, 37), (1.27, 26), (1.37, 4)]
     ear = [(1.46, 0), (1.54, 22), (1.62, 37), (1.72, 40), (1.84, 37), (1.94, 18), (2.02, -6)]
     angles, heights = zip(*front, *ear, (2.15, -32), (2.45, -50), (3.2, -60), strict=True)
     return through(angles, heights, theta)
@@ -69,6 +69,14 @@ def strands() -> Array:
     height[[0, -1]] *= 0.3
     # They run together at the crown and lie flat at the hairline.
     return np.outer(rise(_SHARE, 0.0, 0.1) * rise(_SHARE, 1.0, 0.6), height).ravel()
+
+
+def density(style: HairStyle) -> Array:
+    """How much of the skin the hair hides at each vertex of the grid (n,): less at the hairline, all of it above."""
+    cut = _CUTS[style]
+    fall = np.zeros(HAIR_COLUMNS) if cut.falls is None else rise(_THETA, *cut.falls)
+    edge = np.interp(np.arange(HAIR_ROWS), [0, 1, 2, 3], [0.3, 0.6, 0.85, 1.0])
+    return np.asarray(np.maximum(edge[:, None], fall)).ravel()
 
 
 def hair_points(style: HairStyle) -> tuple[Array, Array]:
@@ -90,7 +98,7 @@ def hair_points(style: HairStyle) -> tuple[Array, Array]:
     thickness += cut.quiff * bump(theta, inside, (0.0, 34.0), (0.8, 20.0))
     thickness += cut.over_ears * bump(theta, points[..., 1], (1.66, 10.0), (0.42, 34.0))
     if cut.top > 0.0:  # the edge lies below the skin, so that the hairline is where both surfaces cross
-        slope = 7.0 + 11.0 * rise(theta, 0.9, 0.4)
+        slope = 7.0 + 11.0 * rise(theta, 0.9, 0.4) + 20.0 * rise(theta, 1.9, 2.4) * (1.0 - fall)
         thickness = -1.0 + (thickness + 1.0) * (1.0 - np.exp(-inside / slope))
         thickness += 0.11 * thickness.clip(0.0, 9.0) * strands().reshape(thickness.shape)
         # Ends of hair that falls stand off the skin, too.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.synthetic.geometry import Array, bump, rise
-from facediff.synthetic.head.hair import HairStyle, hair_points
+from facediff.synthetic.head.hair import HairStyle, density, hair_points
 from facediff.synthetic.head.layout import MOUTH_Y
 from facediff.synthetic.head.mesh import QuadMesh
 from facediff.synthetic.head.parts import BROW_COLUMNS, EYE_CENTRE, HAIR, SHIRT, SKIN
@@ -209,12 +209,15 @@ def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
         shadow = complexion.stubble * beard[skin, None]
         colours[skin] += shadow * (0.55 * tone + [8.0, 10.0, 12.0] - colours[skin])
     colours[mesh.both("lip_outer", "lip_crest", "lip_front", "lip_inner")] *= 0.45 + 0.55 * tint
-    colours[mesh.both("hair")] *= hair_tint
+    grid, share = mesh.groups["hair"], density(complexion.style)[:, None]
+    strand = share * hair_tint * colours[grid] + (1.0 - share) * 0.9 * tone
+    colours[grid] = colours[mesh.mirror[grid]] = strand
+    colours[mesh.both("hair_crown")] *= hair_tint
     brow = np.array(HAIR) * (0.25 + 0.6 * np.minimum(hair_tint, 2.2))
-    for name, share in (("brow_0", 0.35), ("brow_1", 0.95), ("brow_2", 0.9), ("brow_3", 0.3)):
-        density = share * np.interp(np.arange(BROW_COLUMNS), [0, 2, BROW_COLUMNS - 1], [0.35, 1.0, 0.8])[:, None]
+    for name, most in (("brow_0", 0.35), ("brow_1", 0.95), ("brow_2", 0.9), ("brow_3", 0.3)):
+        dense = most * np.interp(np.arange(BROW_COLUMNS), [0, 2, BROW_COLUMNS - 1], [0.35, 1.0, 0.8])[:, None]
         index = mesh.groups[name]
-        colours[index] = colours[mesh.mirror[index]] = density * brow + (1.0 - density) * 0.93 * tone
+        colours[index] = colours[mesh.mirror[index]] = dense * brow + (1.0 - dense) * 0.93 * tone
     shirt = mesh.both("skin_shirt")
     colours[shirt] = SHIRTS[complexion.shirt]
     iris = np.array(EYE_COLOURS[complexion.eyes])
