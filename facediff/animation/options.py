@@ -95,7 +95,8 @@ class GenerationOptions(CheckedOptions):
             stored reference
         style_template: neutral face (mesh or .npy) of the speaker whose motion the style holds, where the checkpoint
             does not know them; or the word median
-        sampler: sampler by name; see `facediff components sampler`
+        sampler: sampler by name, with the checkpoint's spacing and last noise where its steps allow them; see `facediff
+            components sampler`
         steps: denoising steps of the sampler
         expressivity: 0 for the mean of what the model finds possible, 1 for a sample, up to 2 for more than that; or by
             region, lips=0.5,upper_face=1.2 (default: the checkpoint's, usually 1)
@@ -103,7 +104,7 @@ class GenerationOptions(CheckedOptions):
             trained for that (default: the checkpoint's, usually 1)
         seed: seed of the noise; equal seeds give equal motion
         voice_gate: what finds the pauses, in which the mouth comes to rest: energy or webrtc, with options
-            (energy:release=0.3); off for the model's own motion there
+            (energy:release=0.3); off for the model's own motion there (default: energy, but off for imported models)
     """
 
     identity: Annotated[str | None, Option(metavar="NAME")] = None
@@ -115,7 +116,7 @@ class GenerationOptions(CheckedOptions):
     expressivity: Annotated[Scales | None, Option(metavar="E")] = None
     guidance: Annotated[Scales | None, Option(metavar="SCALES")] = None
     seed: Annotated[ranges.Seed | None, Option(metavar="N")] = 0
-    voice_gate: Annotated[str, Option(metavar="GATE")] = "energy"
+    voice_gate: Annotated[str | None, Option(metavar="GATE")] = None
 
 
 @dataclass(frozen=True)
@@ -425,7 +426,7 @@ class StreamKeywords(ActingKeywords, total=False):
     expressivity: Scales | None
     guidance: Scales | None
     seed: int | None
-    voice_gate: str
+    voice_gate: str | None
     window: float | None
     overlap: float | None
     low_latency: bool

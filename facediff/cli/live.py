@@ -84,7 +84,7 @@ def live_model(options: AnimationOptions) -> LiveModel:
     from facediff.speech.voice_activity import USUAL_GATE, read_gate
 
     pipeline = open_pipeline(options)
-    if pipeline.rest is not None and options.voice_gate == USUAL_GATE and not options.low_latency:
+    if pipeline.rest is not None and pipeline.gate == USUAL_GATE:
         pipeline.rest.gate = read_gate(usual_gate(pipeline.windows.look_ahead)) or pipeline.rest.gate
     pipeline.stream()  # what cannot be streamed is refused before anything is opened
     face = pipeline.facts

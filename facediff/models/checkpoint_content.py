@@ -18,12 +18,16 @@ from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.inference import Inference, Style
 from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, plain
+from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_options import is_name, is_plain_text
 
 PROVENANCE_KEY = "facediff_provenance"
 """Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
+
+IMPORTED = "imported"
+"""In the provenance: the method whose authors' checkpoint the weights were imported from."""
 
 STYLES_KEY = "facediff_styles"
 """Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
@@ -84,6 +88,11 @@ class CheckpointContent(LightningModule, Inference):
         if self.assets.motion_scale is None:
             raise OptionError.naming("the model has never been trained: give a checkpoint (--ckpt_path, {checkpoint})")
         return self.assets.motion_scale
+
+    @property
+    def usual_gate(self) -> str:
+        """The voice gate of animations that choose none: an imported model gives its authors' motion, in pauses too."""
+        return OFF if IMPORTED in self.provenance else USUAL_GATE
 
     def adopt(self, assets: Assets) -> None:
         """Take over a corpus's assets after checking that they fit the model's sizes.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError
-from facediff.models.checkpoint_content import CheckpointContent
+from facediff.models.checkpoint_content import IMPORTED, CheckpointContent
 from facediff.registry import COMPONENTS, corpus
 from facediff.utils.hub import ASSETS, CONFIG, WEIGHTS
 from facediff.utils.licences import KNOWN, Licence, commercial_use
@@ -260,10 +260,12 @@ def data_section(model: CheckpointContent, facts: Facts) -> str:
 def training_section(model: CheckpointContent) -> str:
     """How it was trained."""
     provenance = model.provenance
+    imported = IMPORTED in provenance
+    origin = "the authors' checkpoint, imported" if imported else "nothing; trained from its first step"
     options = dict(model.hparams)
     data = model.data_options
     rows = [
-        ("adapted from", text(provenance.get("parent") or "nothing; trained from its first step")),
+        ("adapted from", text(provenance.get("parent") or origin)),
         ("epochs", provenance.get("epochs", "not known")),
         ("optimiser steps", provenance.get("steps", "not known")),
         ("seed", provenance.get("seed", "not known")),

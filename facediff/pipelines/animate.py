@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from facediff.editing.direction import Direction
     from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.stream import AnimationStream, VertexGenerator
-    from facediff.speech.voice_activity import MouthAtRest, VoiceGate
+    from facediff.speech.voice_activity import MouthAtRest
     from facediff.speech.windows import WindowPlan
 
     Array = npt.NDArray[np.float32]
@@ -45,9 +45,11 @@ Progress = Callable[[int, int], object]
 
 def check_options(options: AnimationOptions) -> None:
     """Refuse options that contradict each other and files that are not there, before a model is loaded."""
+    from facediff.speech.voice_activity import OFF, read_gate
+
     expressivity_of(options)
     read_scales(options.guidance)
-    gate_of(options)
+    read_gate(options.voice_gate or OFF)
     check_controls(options)
     if options.acting is not None:
         from facediff.editing.acting import read_acting
@@ -72,21 +74,6 @@ def expressivity_of(options: AnimationOptions) -> dict[str, float]:
     return read_factors(options.expressivity, "expressivity", ranges.EXPRESSIVITY.most)
 
 
-def gate_text(options: AnimationOptions) -> str:
-    """The voice gate's name with its options."""
-    from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE
-
-    # The usual gate looks further ahead than windows of low latency do.
-    return QUICK_GATE if options.low_latency and options.voice_gate == USUAL_GATE else options.voice_gate
-
-
-def gate_of(options: AnimationOptions) -> VoiceGate | None:
-    """What finds the pauses in which the mouth comes to rest; None if nothing does."""
-    from facediff.speech.voice_activity import read_gate
-
-    return read_gate(gate_text(options))
-
-
 class AnimationPipeline(ABC):
     """Animates recordings with one model, one face and one style.
 
@@ -98,10 +85,12 @@ class AnimationPipeline(ABC):
         windows: how long speech is cut.
         model: name of the model, for errors.
         samples: whether the model's motion depends on a seed.
+        usual_gate: the model's voice gate, where the options choose none.
         rest_weights: how far each vertex (V,) goes to rest in pauses.
 
     Attributes:
         seed: of the first sample.
+        gate: the voice gate's name with its options.
         progress: called while motion is generated; None for a bar on the terminal, if the options ask for one.
 
     Raises:
@@ -121,8 +110,11 @@ class AnimationPipeline(ABC):
         windows: WindowPlan,
         model: str,
         samples: bool,
+        usual_gate: str,
         rest_weights: Callable[[], Array],
     ) -> None:
+        from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, MouthAtRest, read_gate
+
         self.options, self.facts, self.windows = options, face, windows
         self.frame_rate: float = face["frame_rate"]
         self.windows.in_frames(self.frame_rate)
@@ -135,9 +127,10 @@ class AnimationPipeline(ABC):
         self.seed = options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or drawn else 0
         self.progress: Progress | None = None
         self.rest: MouthAtRest | None = None
-        if (gate := gate_of(options)) is not None:
-            from facediff.speech.voice_activity import MouthAtRest
-
+        self.gate = options.voice_gate or usual_gate
+        if options.low_latency and self.gate == USUAL_GATE:
+            self.gate = QUICK_GATE  # The usual gate looks further ahead than windows of low latency do.
+        if (gate := read_gate(self.gate)) is not None:
             self.rest = MouthAtRest(gate, face["template"], rest_weights(), self.frame_rate)
         self.acting: Acting | None = None
         if options.acting is not None:
@@ -342,7 +335,7 @@ class AnimationPipeline(ABC):
         options = self.options
         metadata = {"generator": f"facediff {__version__}", **self.metadata(seed)}
         if self.rest is not None:
-            metadata["voice gate"] = gate_text(options)
+            metadata["voice gate"] = self.gate
         if options.denoise:
             metadata["denoised"] = "yes"
         if self.direction is not None:

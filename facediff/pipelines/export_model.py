@@ -351,6 +351,7 @@ def describe(
         stillness=stillness.size if stillness else 0.0,
         quick_steps=loop.quick_steps if loop else [],
         quick_table=loop.quick_table if loop else [],
+        voice_gate=model.usual_gate,
     )
 
 

@@ -66,6 +66,7 @@ class ExportedPipeline(AnimationPipeline):
             windows=self.model.windows,
             model=about.model,
             samples=about.generation == "sampled",
+            usual_gate=about.voice_gate,
             rest_weights=lambda: self.model.arrays["rest_weights"][stream.face],
         )
 

@@ -72,6 +72,7 @@ class TrainedPipeline(AnimationPipeline):
             windows=model.windows,
             model=type(model).__name__,
             samples=model.samples,
+            usual_gate=model.usual_gate,
             rest_weights=rest_weights,
         )
         steps = getattr(getattr(model, "sampler", None), "steps", 1)

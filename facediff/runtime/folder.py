@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.speech.frame_clock import FrameClock, Rule
+from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.speech.windows import WindowPlan
 from facediff.utils.arrays import read_arrays
 from facediff.utils.plain_files import load_json
@@ -78,6 +79,7 @@ class Description:
             vertices (the array ``still``) deviate by more than a fraction of this.
         quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
         quick_table: for each of them, as in ``table``.
+        voice_gate: the voice gate where nobody chooses one: ``energy``, or ``off`` for imported models.
         check: the comparison with PyTorch when the folder was written.
     """
 
@@ -116,6 +118,7 @@ class Description:
     stillness: float = 0.0
     quick_steps: list[int] = field(default_factory=list)
     quick_table: list[list[float]] = field(default_factory=list)
+    voice_gate: str = USUAL_GATE
     check: dict[str, Any] = field(default_factory=dict)
 
     def content(self) -> dict[str, Any]:
@@ -201,6 +204,7 @@ def _check(path: Path, description: Description) -> None:
         ("blending", ("steps", "motion")),
         ("style_source", ("reference", "identity", "none")),
         ("noise_of", ("clip", "seed")),
+        ("voice_gate", (USUAL_GATE, OFF)),
     ):
         if getattr(description, name) not in kinds:
             refuse(name, " or ".join(kinds))

@@ -23,7 +23,7 @@ from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.export.viewer.page import assemble, script_of
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
 from facediff.runtime.onnxruntime_web import LICENCE
-from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
+from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
 from facediff.speech.windows import LOW_LATENCY
 from facediff.utils.files import atomic_folder
 from facediff.utils.server import HEADERS as SERVED
@@ -125,6 +125,7 @@ def page(title: str, description: Description, arrays: Arrays) -> str:
         "millimetres": millimetres(face),
         "inward": not np.array_equal(outward(face), face.triangles),
         "delays": DELAYS,
+        "rests": description.voice_gate != OFF,
         "gates": {"usual": gate_facts(USUAL_GATE), "quick": gate_facts(QUICK_GATE)},
     }
     values = {"title": html.escape(title)}

@@ -171,6 +171,18 @@ def test_other_steps_keep_the_samplers_other_options(make_model: Make) -> None:
     assert (type(model.sampler).__name__, model.sampler.steps) == ("dpm_solver", 5)
 
 
+def test_another_sampler_keeps_spacing_and_last_noise_where_its_steps_allow(make_model: Make) -> None:
+    spaced = {"spacing": "log_snr", "last_noise": 0.5}
+    model = make_model(sampler=partial(registry.sampler.ddim, steps=4, **spaced))
+    own = model.sampler.timesteps
+    model.choose_sampler("dpm_solver", 4)
+    assert model.sampler.timesteps == own
+    model.choose_sampler("ddpm")
+    assert model.sampler.timesteps == [*range(model.process.steps)][::-1]
+    with pytest.raises(FaceDiffError, match="steps"):
+        model.choose_sampler("ddpm", model.process.steps + 1)
+
+
 def test_sizes_that_do_not_fit_are_named(make_model: Make, tiny: Tiny) -> None:
     with pytest.raises(FaceDiffError, match=r"vertices are \{30\} in the model and \{24\} in the corpus"):
         make_model(n_vertices=30).adopt(tiny.assets())

@@ -158,9 +158,6 @@ def test_impossible_pasts_are_refused(change: dict[str, float], field: str) -> N
 
 def test_low_latency_excludes_lengths_of_windows() -> None:
     from facediff.animation.options import AnimationOptions
-    from facediff.pipelines.animate import gate_of, gate_text
 
     with pytest.raises(FaceDiffError, match="low_latency"):
         AnimationOptions(checkpoint="a.ckpt", window=1.0, low_latency=True)
-    assert gate_text(AnimationOptions(checkpoint="a.ckpt", low_latency=True)) == QUICK_GATE
-    assert gate_of(AnimationOptions(checkpoint="a.ckpt", low_latency=True, voice_gate="off")) is None

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ import torch
 import facediff
 from facediff import registry
 from facediff.animation import write_archive
+from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion
@@ -28,9 +30,11 @@ from facediff.models.inference import ClipNoise as ModelNoise
 from facediff.models.inference import WindowNoise as ModelWindowNoise
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
 from facediff.pipelines.export_model import Precision, export_model, store_weights
+from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel
 from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
 from facediff.runtime.styles import read_style
+from facediff.speech.voice_activity import QUICK_GATE
 from facediff.speech.windows import MotionWindow, WindowPlan
 from tests.fakes.tiny import Tiny
 
@@ -141,6 +145,23 @@ def sound(seconds: float) -> np.ndarray:
 def largest(found: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference as a share of the motion's range."""
     return float(np.abs(found - wanted).max() / np.ptp(wanted - wanted.mean(0)))
+
+
+def test_an_exported_folder_keeps_the_models_own_voice_gate(folder: Path) -> None:
+    """An imported model has none, so that pauses are its authors' too; options that choose one come first."""
+    exported = RuntimeModel.open(folder)
+    assert exported.description.voice_gate == "energy"
+    ungated = copy(exported)
+    ungated.description = replace(exported.description, voice_gate="off")
+    for model, gate, expected in (
+        *((exported, None, "energy"), (exported, "off", "off")),
+        *((ungated, None, "off"), (ungated, "energy", "energy")),
+    ):
+        options = AnimationOptions(checkpoint=folder, voice_gate=gate)
+        pipeline = ExportedPipeline(options, model=model)
+        assert (pipeline.gate, pipeline.rest is None) == (expected, expected == "off")
+    quick = ExportedPipeline(replace(options, low_latency=True, voice_gate=None), model=exported)
+    assert quick.gate == QUICK_GATE
 
 
 @pytest.mark.parametrize("seconds", [0.5, 1.99, 4.3])  # in one pass, and by windows of which the last is short

@@ -267,13 +267,26 @@ class DualPathDiffusion(AnimationModel):
         return [part for part in parts if part is not None]
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
-        """Sample in another way from now on; checkpoints keep the sampler that the model was made with."""
+        """Sample in another way from now on; checkpoints keep the sampler that the model was made with.
+
+        A sampler chosen by name keeps the spacing and the last noise that the model was made with, where as many steps
+        have that much noise; its other options are its own.
+        """
         chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
-        options = dict(self.hparams["sampler"]["init_args"]) if name is None else {}
-        if steps is not None:
-            options["steps"] = steps
-        self._sampler_options = options
-        self.sampler = chosen(process=self.process, **options)
+        options = dict(self.hparams["sampler"]["init_args"])
+        more: dict[str, Any] = {} if steps is None else {"steps": steps}
+        if name is not None:
+            shared = {"spacing", "last_noise"} & options.keys() & registry.defaults(chosen).keys()
+            options = {key: options[key] for key in sorted(shared)}
+        try:
+            self.sampler = chosen(process=self.process, **options | more)
+        except ArgumentError:
+            if name is None:
+                raise
+            # A thousand steps of ddpm go to the clean end: fewer of the process have the last noise of ten.
+            options = {}
+            self.sampler = chosen(process=self.process, **more)
+        self._sampler_options = options | more
 
     def choose_low_latency(self) -> None:
         """Frame by frame, and in :attr:`low_latency_steps` denoising steps of the present sampler."""

@@ -26,6 +26,7 @@ from facediff.data.batch import ASSETS_KEY
 from facediff.data.corpus import read_templates
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.metrics import Region
+from facediff.models.checkpoint_content import IMPORTED
 from facediff.models.checkpoint_reading import check_weights
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.recognition import (
@@ -451,6 +452,7 @@ def label(model: AnimationModel, method: Recogniser, dataset: str) -> None:
     if corpus is not None:
         model.data_source = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}"}
     weights = Licence(f"weights of {method.method}", method.licence, method.commercial, method.licence_source)
+    model.provenance = {IMPORTED: method.method}
     model.licences = merged([weights], [data], network_licences(dict(model.hparams)))
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+import facediff
+from facediff import Animator
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import import_checkpoint
@@ -137,6 +139,28 @@ def test_an_imported_model_knows_its_corpus_but_not_its_folder(tmp_path: Path) -
     assert main(words(tmp_path)) == 0
     path = tmp_path / "model.ckpt"
     assert corpus_of(path, read_checkpoint(path)) == (Vocaset, {})
+
+
+def test_an_imported_model_gives_its_authors_motion_in_pauses_too(tmp_path: Path) -> None:
+    """As soon as lips are known a voice gate would change it; the checkpoint that is written says so as well."""
+    (tmp_path / "regions").mkdir()
+    for name, indices in (("lve", range(6)), ("fdd", range(6, VERTICES))):
+        (tmp_path / "regions" / f"{name}.txt").write_text(", ".join(map(str, indices)), encoding="utf-8")
+    write_author_files(tmp_path)
+    assert main(words(tmp_path, regions=str(tmp_path / "regions"))) == 0
+    voice = 0.1 * np.random.default_rng(0).standard_normal(16_000).astype(np.float32)
+    speech = np.concatenate([voice, np.zeros(16_000, np.float32), voice])
+    model = facediff.load(tmp_path / "model.ckpt")
+    assert isinstance(model, Animator)
+    usual, gated, free = (
+        model.animate(speech, 16_000, identity="A", voice_gate=gate) for gate in (None, "energy", "off")
+    )
+    expected = model.module.animate(torch.from_numpy(speech), identity="A").vertices.numpy()
+    np.testing.assert_array_equal(usual.vertices, expected)
+    np.testing.assert_array_equal(free.vertices, expected)
+    assert np.abs(gated.vertices - expected)[36:54].max() > 1e-3
+    assert "voice gate" not in usual.metadata
+    assert gated.metadata["voice gate"] == "energy"
 
 
 class Hostile:

@@ -21,6 +21,7 @@ class Animated {
 class TalkingPage {
   constructor(facts) {
     this.facts = facts;
+    if (!facts.rests) find("gate").checked = false;
     this.jobs = 0; // numbers of what the worker was asked
     this.job = null; // what it computes now
     this.animated = null;
