@@ -19,7 +19,11 @@ REFERENCE_LABELS = {
     "mean_face": "speaker's mean face",
     "shuffled": "{row}, shuffled speech",
 }
-SPLIT_LABELS = {"test_a": "test A, seen speakers", "test_b": "test B, unseen speakers"}
+SPLIT_LABELS = {
+    "test_a": "test A, seen speakers",
+    "test_b": "test B, unseen speakers",
+    "test_c": "test C, unseen voices",
+}
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
     from facediff.models.generation_metrics import GenerationScores
 
-SPLITS = ("val", "test_a", "test_b")
+SPLITS = ("val", "test_a", "test_b", "test_c")
 
 
 def generation_metrics(
@@ -63,7 +63,7 @@ def generation_metrics(
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
         expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
-        splits: val, test_a, test_b (default: all test splits)
+        splits: val, test_a, test_b, test_c (default: all test splits)
         max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
         against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
         data_root: where the corpus is, if not where it was in training

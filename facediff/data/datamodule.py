@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import IO, TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
 Count = Annotated[int, Range(1, 10**9)]
 """Clips or frames."""
 
-Split = Literal["train", "val", "test_a", "test_b"]
+Split = Literal["train", "val", "test_a", "test_b", "test_c"]
 
 
 class SpeechMotionDataModule(LightningDataModule, ABC):
-    """Speech with motion for training, validation and two tests: seen speakers (test A) and unseen ones (test B).
+    """Speech with motion for training, validation and tests: seen speakers (A), unseen ones (B), unseen voices (C).
 
     A corpus subclasses this, states the facts below and decides which clips belong to a split. Options of its own go
     into a constructor that passes the others on::
@@ -82,6 +82,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         licence_source: where the terms stand, without ``https://``.
         obtain: how to obtain the corpus.
         languages: codes of the languages that are spoken in it.
+        former_options: values of options that came later, for checkpoints that were trained before these.
 
     Attributes:
         pair_sentences: whether neighbours in training batches speak the same sentence; a model that learns from such
@@ -141,6 +142,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     licence_source: ClassVar[str] = ""
     obtain: ClassVar[str] = ""
     languages: ClassVar[tuple[str, ...]] = ()
+    former_options: ClassVar[dict[str, Any]] = {}
 
     @keeps_arguments
     def __init__(
@@ -253,7 +255,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     @abstractmethod
     def split_of(self, clip: Clip) -> str | None:
-        """The split a clip belongs to (``train``, ``val``, ``test_a``, ``test_b``), or None for none of them.
+        """The split a clip belongs to (a name of :data:`Split`), or None for none of them.
 
         Clips of no split may serve as style references of their speaker; clips of an evaluated split only where their
         speaker has no others. The clips of imported speakers are not passed to this method.
@@ -326,7 +328,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     @property
     def test_splits(self) -> list[str]:
         """The test splits that have clips, in the order of the test loaders."""
-        return [split for split in ("test_a", "test_b") if self.clips(split)]
+        return [split for split in get_args(Split)[2:] if self.clips(split)]
 
     def clips(self, split: str) -> list[Clip]:
         """The clips of a split, sorted by name."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -16,9 +17,11 @@ from facediff import registry
 from facediff import synthetic as puppet
 from facediff.data.corpus import Clip
 from facediff.data.datamodule import Count, SpeechMotionDataModule
+from facediff.data.manifest import read_manifest
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
 from facediff.synthetic import second_edition
+from facediff.synthetic.cast import SEEN, UNSEEN
 from facediff.synthetic.face import build_face
 from facediff.synthetic.further_speech import further_speech
 from facediff.synthetic.rig import eyelid_pairs
@@ -29,19 +32,106 @@ from facediff.utils.ranges import Range
 from facediff.utils.workers import processors
 
 
-def cache_root(seed: int, drawn_speakers: int = 0, edition: int = 1, people: Sequence[str] = ()) -> Path:
-    """Where the corpus of a seed is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
-    more += f"-people{len(people)}" if people else ""
-    generator = puppet.GENERATOR if edition == 1 else second_edition.GENERATOR
-    return cache_dir() / f"puppet-{generator}-seed{seed}{more}"
+@dataclass(frozen=True)
+class FirstEdition:
+    """The first edition: a face of 1 008 vertices that a rig of 21 controls moves, and one synthesiser.
+
+    Attributes:
+        seed: of what is left to chance.
+        drawn: how many drawn speakers there are.
+        people: voices of people; this edition has none.
+    """
+
+    seed: int = 0
+    drawn: int = 0
+    people: tuple[str, ...] = ()
+    generator: ClassVar[str] = puppet.GENERATOR
+    unseen: ClassVar[tuple[str, ...]] = puppet.UNSEEN_IDENTITIES
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of the face."""
+        return puppet.N_VERTICES
+
+    def make(self, root: Path) -> None:
+        """Write the corpus, unless the folder holds it already."""
+        if not puppet.is_complete(root, seed=self.seed, drawn=self.drawn):
+            workers = min(4, processors()) if self.drawn else 1
+            puppet.generate(root, seed=self.seed, drawn=self.drawn, workers=workers)
+
+    def split_of(self, clip: Clip) -> str | None:
+        """By speaker and sentence number, like BIWI."""
+        seen = clip.identity in puppet.SEEN_IDENTITIES
+        if clip.number in puppet.TEST_SENTENCES:
+            return "test_a" if seen else "test_b"
+        if not seen:
+            return None
+        return "train" if clip.number in puppet.TRAIN_SENTENCES else "val"
+
+    def further_speech(self, identities: tuple[str, ...]) -> Callable[[int], npt.NDArray[np.float32]]:
+        """Random words by these speakers."""
+        return partial(further_speech, identities=identities)
+
+    def eyelid_pairs(self) -> Tensor | None:
+        """Of the mesh, for folders that come from a version without such a file."""
+        return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1))
+
+
+@dataclass(frozen=True)
+class SecondEdition:
+    """The second edition: a head that ARKit's 52 shapes move, and several synthesisers; attributes as in the first."""
+
+    seed: int = 0
+    drawn: int = 0
+    people: tuple[str, ...] = ()
+    generator: ClassVar[str] = second_edition.GENERATOR
+    unseen: ClassVar[tuple[str, ...]] = UNSEEN
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of the head."""
+        return second_edition.vertex_count()
+
+    def make(self, root: Path) -> None:
+        """Write the corpus, unless the folder holds it already."""
+        workers = min(4, processors()) if self.drawn else 1
+        second_edition.generate_second(root, seed=self.seed, drawn=self.drawn, people=self.people, workers=workers)
+
+    def split_of(self, clip: Clip) -> str | None:
+        """By the table of clips."""
+        split = clip.attributes.get("split")
+        return None if split == "references" else split
+
+    def further_speech(self, identities: tuple[str, ...]) -> Callable[[int], npt.NDArray[np.float32]]:
+        """Random words by these speakers."""
+        return partial(second_edition.spoken_words, identities=identities, people=self.people)
+
+    def eyelid_pairs(self) -> Tensor | None:
+        """None: every folder has the file."""
+        return None
+
+
+EDITIONS = {1: FirstEdition, 2: SecondEdition}
+
+
+def cache_root(edition: FirstEdition | SecondEdition) -> Path:
+    """Where an edition is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
+    more = f"-drawn{edition.drawn}" if edition.drawn else ""
+    more += f"-people{len(edition.people)}" if edition.people else ""
+    return cache_dir() / f"puppet-{edition.generator}-seed{edition.seed}{more}"
 
 
 def made_root(seed: int) -> Path | None:
-    """An existing folder of :func:`cache_root`, with or without drawn speakers; None if there is none."""
-    usual = cache_root(seed)
-    folders = [usual, *sorted(usual.parent.glob(f"{usual.name}-drawn*"))]
+    """An existing folder of :func:`cache_root`, of the second edition if there is one; None if there is none."""
+    usual = [cache_root(edition(seed)) for edition in (SecondEdition, FirstEdition)]
+    folders = [path for root in usual for path in (root, *sorted(root.parent.glob(f"{root.name}-*")))]
     return next((folder for folder in folders if folder.is_dir()), None)
+
+
+def edition_of(root: Path) -> int | None:
+    """The edition in a folder; None if it holds none."""
+    generator = str(read_manifest(root).get("generator", ""))
+    return int(generator[0]) if generator[:1] in ("1", "2") else None
 
 
 def built_in_mesh() -> Mesh:
@@ -52,21 +142,20 @@ def built_in_mesh() -> Mesh:
 
 @registry.corpus.register("Puppet")
 class Puppet(SpeechMotionDataModule):
-    """The built-in corpus: a face made by code that speaks with a real speech synthesiser; made on first use.
+    """The built-in corpus: a head made by code that speaks with real speech synthesisers; made on first use.
 
-    Synthetic: scores on it say nothing about real people. 25 frames per second, metres. In the first edition six seen
-    speakers (test A) and two unseen ones (test B) have a face of 1 008 vertices; sentences 1–24 train, 25–27 validate,
-    28–32 test. In the second one, six and four have a head of 5 875 vertices that ARKit's 52 shapes move; 32 sentences
-    of each train, 10 test, and the voices of test C are kept out of training.
+    Synthetic: scores on it say nothing about real people. 25 frames per second, metres. Six seen speakers say 32
+    sentences in training and 10 on test A, four unseen ones 10 on test B, and test C has voices that nobody is trained
+    with. The first edition has a face of 1 008 vertices, six and two speakers, and 24 and 5 sentences of each.
 
     Args:
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
-        drawn_speakers: how many speakers with random voice, face and speaking style also say the training sentences.
+        drawn_speakers: how many speakers with random voice, face and speaking style also say training sentences.
             The test splits do not change.
-        edition: 1 or 2.
-        people_voices: let every second drawn speaker of the second edition speak with a voice made from recordings of
-            people, as far as flite and Festival are installed.
+        edition: 1 or 2; the one in the folder if None, and the second where there is none yet.
+        people_voices: let every second drawn speaker speak with a voice made from recordings of people, as far as flite
+            and Festival are installed.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
     """
@@ -76,10 +165,10 @@ class Puppet(SpeechMotionDataModule):
     unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(puppet.FRAME_RATE)
     n_vertices = puppet.N_VERTICES
-    identities = list(puppet.SEEN_IDENTITIES)
+    identities = list(SEEN)
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
-    compared_speakers: ClassVar[tuple[str, ...] | None] = (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
+    former_options: ClassVar[dict[str, Any]] = {"edition": 1}
     # Face and motion come from this package's code. The program espeak-ng, which speaks, is under the GPL 3, whose
     # terms cover the program and not its output (gnu.org/licenses/gpl-faq.html#GPLOutput).
     licence: ClassVar[str] = "Apache-2.0"
@@ -93,66 +182,47 @@ class Puppet(SpeechMotionDataModule):
         root: str | None = None,
         seed: Annotated[int, Range(0, 2**32 - 1)] = 0,
         drawn_speakers: Annotated[int, Range(0, MOST_DRAWN)] = 0,
-        edition: Literal[1, 2] = 1,
+        edition: Literal[1, 2] | None = None,
         people_voices: bool = False,
         batch_size: Count = 8,
         extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        if people_voices and edition == 1:
-            raise FaceDiffError("data.people_voices: belongs to the second edition; set data.edition=2 as well")
-        self.edition = edition
-        self.voices = second_edition.people_voices() if people_voices else ()
+        people = second_edition.people_voices() if people_voices else ()
+        facts = EDITIONS[edition or 2](seed, drawn_speakers, people)
+        drawn = drawn_names(drawn_speakers)
         super().__init__(
-            root=str(cache_root(seed, drawn_speakers, edition, self.voices)) if root is None else root,
+            root=str(cache_root(facts)) if root is None else root,
             batch_size=batch_size,
-            extra_identities=[*(extra_identities or []), *drawn_names(drawn_speakers)],
+            extra_identities=[*(extra_identities or []), *drawn],
             **options,
         )
-        self.seed = seed
-        self.drawn_speakers = drawn_speakers
-        # The first identity is animated unless another is named, so it is one of the eight, not a drawn one.
-        drawn = drawn_names(drawn_speakers)
-        if edition == 2:  # its six seen speakers have the names of the first edition's
-            self.n_vertices = second_edition.vertex_count()
+        stored = None if edition or root is None else edition_of(self.root)
+        self.edition = facts if stored is None else EDITIONS[stored](seed, drawn_speakers, people)
+        if people and isinstance(self.edition, FirstEdition):
+            raise FaceDiffError("data.people_voices: belongs to the second edition; set data.edition=2 as well")
+        self.n_vertices = self.edition.n_vertices
+        self.compared_speakers = (*SEEN, *self.edition.unseen)
+        # The first identity is animated unless another is named, so it is one of the cast, not a drawn one.
         self.identities = [*(name for name in self.identities if name not in drawn), *drawn]
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
-        if self.packed is not None:
-            return
-        if self.edition == 2:
-            second_edition.generate_second(
-                self.root, seed=self.seed, drawn=self.drawn_speakers, people=self.voices, workers=min(4, processors())
-            )
-        elif not puppet.is_complete(self.root, seed=self.seed, drawn=self.drawn_speakers):
-            workers = min(4, processors()) if self.drawn_speakers else 1
-            puppet.generate(self.root, seed=self.seed, drawn=self.drawn_speakers, workers=workers)
+        if self.packed is None:
+            self.edition.make(self.root)
 
     def eyelid_pairs(self) -> Tensor | None:
         """The corpus folder's pairs, or the mesh's own where the folder comes from a version without such a file."""
         pairs = super().eyelid_pairs()
-        if self.edition == 2:
-            return pairs
-        return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1)) if pairs is None else pairs
+        return self.edition.eyelid_pairs() if pairs is None else pairs
 
     def split_of(self, clip: Clip) -> str | None:
         """By speaker and sentence number, like BIWI; the second edition's table of clips says it."""
-        if self.edition == 2:
-            split = clip.attributes.get("split")
-            return split if split in ("train", "val", "test_a", "test_b") else None
-        seen = clip.identity in puppet.SEEN_IDENTITIES
-        if clip.number in puppet.TEST_SENTENCES:
-            return "test_a" if seen else "test_b"
-        if not seen:
-            return None
-        return "train" if clip.number in puppet.TRAIN_SENTENCES else "val"
+        return self.edition.split_of(clip)
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
         """Random words by the training speakers."""
-        if self.edition == 2:
-            return partial(second_edition.spoken_words, identities=tuple(self.identities), people=self.voices)
-        return partial(further_speech, identities=tuple(self.identities))
+        return self.edition.further_speech(tuple(self.identities))
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -65,7 +65,6 @@ class ClipFolder:
     def __init__(self, root: Path, n_vertices: int) -> None:
         self.root = root
         self.n_vertices = n_vertices
-        self._rigs: dict[str, npt.NDArray[np.floating]] = {}
 
     def names(self) -> list[str]:
         """The clips that have both files, sorted."""
@@ -75,27 +74,13 @@ class ClipFolder:
                 raise FaceDiffError(
                     f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"
                 )
-            if self._path(name).is_file():
+            if motion_path(self.root, name).is_file():
                 names.append(name)
         return names
 
-    def _path(self, name: str) -> Path:
-        """The file that holds a clip's motion."""
-        vertices, weights = motion_path(self.root, name), self.root / WEIGHTS_FOLDER / f"{name}.npy"
-        return weights if weights.is_file() and not vertices.is_file() else vertices
-
     def open(self, name: str) -> ClipMotion:
         """Map a clip's file into memory."""
-        path = self._path(name)
-        if path.parent.name != WEIGHTS_FOLDER:
-            return VertexFile(path, self.n_vertices)
-        return WeightFile(path, self._rig(name.rpartition("_")[0]))
-
-    def _rig(self, identity: str) -> npt.NDArray[np.floating]:
-        """A speaker's shapes, which all of their clips share."""
-        if identity not in self._rigs:
-            self._rigs[identity] = open_vertices(self.root / RIGS_FOLDER / f"{identity}.npy", self.n_vertices)
-        return self._rigs[identity]
+        return open_motion(motion_path(self.root, name), self.n_vertices)
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
@@ -103,7 +88,7 @@ class ClipFolder:
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""
-        facts = self._path(name).stat()
+        facts = motion_path(self.root, name).stat()
         return facts.st_size, facts.st_mtime_ns
 
 
@@ -124,13 +109,19 @@ class VertexFile:
         """Frames in the file."""
         return len(self.vertices)
 
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored numbers."""
+        return self.vertices.dtype
+
+    def read(self, picks: Sequence[int]) -> npt.NDArray[np.floating]:
+        """Absolute vertices (len(picks), V, 3) of some frames, as they are stored."""
+        return self.vertices[slice(picks.start, picks.stop, picks.step) if isinstance(picks, range) else picks]
+
     def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Offsets from the template of some frames; only these are read."""
         picks = within(picks, self.frames)
-        if isinstance(picks, range):
-            stored = self.vertices[picks.start : picks.stop : picks.step]
-        else:
-            stored = self.vertices[np.array(picks, np.intp)]
+        stored = self.read(picks)
         motion = np.empty(stored.shape, np.float32)
         # Conversion, check and subtraction go over each chunk while it is in the processor's cache: done one after the
         # other over the whole clip, each would wait for main memory.
@@ -167,13 +158,23 @@ class WeightFile:
         """Frames in the file."""
         return len(self.weights)
 
-    def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Offsets from the template of some frames."""
-        picks = within(picks, self.frames)
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the decoded numbers."""
+        return np.dtype(np.float32)
+
+    def read(self, picks: Sequence[int]) -> npt.NDArray[np.float32]:
+        """Absolute vertices (len(picks), V, 3) of some frames."""
         weights = np.asarray(self.weights[np.array(picks, np.intp)], np.float32)
         shapes = np.asarray(self.rig[1:], np.float32).reshape(len(self.rig) - 1, -1)
         motion = (weights @ shapes).reshape(len(weights), -1, 3)
         motion += np.asarray(self.rig[0], np.float32)
+        return motion
+
+    def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Offsets from the template of some frames."""
+        picks = within(picks, self.frames)
+        motion = self.read(picks)
         refuse_out_of_range(motion, picks, self.path)
         motion -= template
         return motion
@@ -202,7 +203,20 @@ def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int
         )
 
 
+def open_motion(path: Path, n_vertices: int) -> VertexFile | WeightFile:
+    """The motion in a file of vertices, or in one of weights with the speaker's shapes next to it."""
+    rig = rig_path(path)
+    return VertexFile(path, n_vertices) if rig is None else WeightFile(path, open_vertices(rig, n_vertices))
+
+
+def rig_path(path: Path) -> Path | None:
+    """The file of the shapes that belong to a file of weights, ``<identity>_<sentence>.npy``; None for vertices."""
+    if path.parent.name != WEIGHTS_FOLDER:
+        return None
+    return path.parent.parent / RIGS_FOLDER / f"{path.stem.rpartition('_')[0]}.npy"
+
+
 def motion_path(root: Path, name: str) -> Path:
-    """The file with a clip's vertices; the usual place if there is none."""
-    paths = [root / folder / f"{name}.npy" for folder in MOTION_FOLDERS]
+    """The file with a clip's vertices, or else weights; the usual place if there is none."""
+    paths = [root / folder / f"{name}.npy" for folder in (*MOTION_FOLDERS, WEIGHTS_FOLDER)]
     return next((path for path in paths if path.is_file()), paths[0])

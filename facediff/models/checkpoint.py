@@ -110,7 +110,8 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
     source = checkpoint.get(DATA_SOURCE_KEY) or {}
     module = corpus_class(path, source)
     # An imported model knows its corpus, but not where its folder is.
-    stored = checkpoint.get("datamodule_hyper_parameters") or {name: source[name] for name in source.keys() & {"root"}}
+    saved = checkpoint.get("datamodule_hyper_parameters")
+    stored = {**module.former_options, **saved} if saved else {name: source[name] for name in source.keys() & {"root"}}
     options = {name: value for name, value in stored.items() if not name.startswith("_")}
     read_options(str(path), module, options, component_finders())
     return module, options

@@ -23,7 +23,12 @@ from facediff.utils.plain_files import read_rows
 SCORES = "test_scores.csv"
 """What ``facediff test`` calls its table of scores."""
 
-SPLITS = {"test_a": "test A, seen speakers", "test_b": "test B, unseen speakers", "val": "validation"}
+SPLITS = {
+    "test_a": "test A, seen speakers",
+    "test_b": "test B, unseen speakers",
+    "test_c": "test C, unseen voices",
+    "val": "validation",
+}
 METHODS = {
     "model": "this model",
     "still": "still face",

@@ -28,7 +28,7 @@ from facediff.utils.plain_files import read_json, write_json, write_table
 FORMAT = 1
 GENERATOR = "1.1"
 MANIFEST = "manifest.json"
-_CORPUS = "facediff-puppet"
+CORPUS = "facediff-puppet"
 _SAMPLES_PER_FRAME = SAMPLE_RATE // FRAME_RATE
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
 _PEAK = 0.6
@@ -116,7 +116,7 @@ def generate(
     chosen = _chosen(only, drawn)
     if only is None and is_complete(root, seed=seed, drawn=drawn):
         return
-    _refuse_foreign(root)
+    refuse_foreign(root)
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, chosen)
         frames = _write_clips(folder, chosen, seed, workers, scheduler, progress)
@@ -191,7 +191,7 @@ def regions() -> dict[str, NDArray[np.int64]]:
 
 
 def _facts(seed: int, count: int, drawn: int) -> dict[str, int | str]:
-    facts: dict[str, int | str] = {"corpus": _CORPUS, "format": FORMAT, "generator": GENERATOR, "seed": seed}
+    facts: dict[str, int | str] = {"corpus": CORPUS, "format": FORMAT, "generator": GENERATOR, "seed": seed}
     return {**facts, "clips": count, **({"drawn": drawn} if drawn else {})}
 
 
@@ -206,9 +206,9 @@ def _chosen(only: Sequence[str] | None, drawn: int) -> tuple[SyntheticClip, ...]
     return tuple(clips_by_name[name] for name in only)
 
 
-def _refuse_foreign(root: Path) -> None:
+def refuse_foreign(root: Path) -> None:
     """Never replace a folder that this generator did not write."""
-    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != _CORPUS:
+    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != CORPUS:
         raise FaceDiffError(
             f"{root}: is not empty and holds no manifest of the built-in corpus; choose another folder, or remove it"
         )

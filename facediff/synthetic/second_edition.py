@@ -2,7 +2,7 @@
 
 The truth of a clip is kept as weights of ARKit's shapes with gaze and head next to them, and each speaker's rig once: a
 head is a hundred times as many numbers as its weights. ``facediff.data`` decodes them to vertices as it reads a clip.
-Clips that are validated or tested with have their vertices next to them, so that any program can score against them.
+Clips that are tested with have their vertices next to them, so that any program can score against them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from facediff.errors import FaceDiffError
 from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.cast import CAST, KEPT_OUT_PEOPLE, SEEN, UNSEEN, drawn_names, member_of
-from facediff.synthetic.corpus import MANIFEST, in_quiet, write_ply
+from facediff.synthetic.corpus import CORPUS, MANIFEST, in_quiet, refuse_foreign, write_ply
 from facediff.synthetic.further_speech import WORDS
 from facediff.synthetic.head.parts import AROUND_EYE, build_head
 from facediff.synthetic.head.people import Complexion, coloured, dressed
@@ -37,8 +37,7 @@ from facediff.utils.jobs import run_tasks
 from facediff.utils.plain_files import read_json, write_json, write_table
 from facediff.utils.workers import WorkerDied
 
-GENERATOR = "2.0"
-CORPUS = "facediff-puppet-2"
+GENERATOR = "2.1"
 FRAME_RATE = 25
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
 _PEAK = 0.6
@@ -145,8 +144,7 @@ def generate_second(
     clips = [clip for clip in performed_clips(drawn) if only is None or clip.name in only]
     if only is None and is_second_complete(root, seed=seed, drawn=drawn, people=people):
         return
-    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != CORPUS:
-        raise FaceDiffError(f"{root}: is not empty and holds no second edition of the built-in corpus; choose another")
+    refuse_foreign(root)
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, clips, people)
         tasks = run_tasks(
@@ -164,20 +162,21 @@ def generate_second(
                     raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
                 frames += count
         counts = {"subjects": len(CAST) + drawn, "vertices": len(build_head().vertices), "frames": frames}
-        facts = _facts(seed, len(clips), drawn, people)
-        write_json(folder / MANIFEST, {**facts, **counts, "files": describe_files(folder)})
+        facts = {**_facts(seed, drawn, people), "whole": only is None, "clips": len(clips), **counts}
+        write_json(folder / MANIFEST, {**facts, "files": describe_files(folder)})
 
 
 def is_second_complete(root: Path, *, seed: int = 0, drawn: int = 0, people: Sequence[str] = ()) -> bool:
     """Whether a folder holds the whole corpus of this version, seed and voices; compares sizes, not contents."""
     manifest = read_json(Path(root) / MANIFEST) or {}
-    facts, files = _facts(seed, len(performed_clips(drawn)), drawn, people), manifest.get("files")
+    facts, files = {**_facts(seed, drawn, people), "whole": True}, manifest.get("files")
     same = all(manifest.get(key) == value for key, value in facts.items())
     return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
-def _facts(seed: int, count: int, drawn: int, people: Sequence[str]) -> dict[str, object]:
-    facts = {"corpus": CORPUS, "format": 1, "generator": GENERATOR, "seed": seed, "clips": count, "drawn": drawn}
+def _facts(seed: int, drawn: int, people: Sequence[str]) -> dict[str, object]:
+    # Without what test C is spoken with: a folder stays whole where flite is installed later, or is missing.
+    facts = {"corpus": CORPUS, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
     return {**facts, "people": list(people)}
 
 
@@ -317,7 +316,7 @@ def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[s
     )
     for name, track in (("weights", performance.weights), ("gaze", performance.gaze), ("head", performance.head)):
         np.save(folder / f"{name}_npy" / f"{clip.name}.npy", track.astype(np.float32))
-    if clip.split.startswith(("test", "val")):
+    if clip.split.startswith("test"):
         rig = rig_of(clip.identity)
         vertices = rig[0] + np.einsum("tk,kvc->tvc", performance.weights.astype(np.float32), rig[1:])
         np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))

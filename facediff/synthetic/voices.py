@@ -14,6 +14,7 @@ import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -105,8 +106,7 @@ class Espeak(Synthesiser):
             import espeakng_loader
         except ImportError:
             return []
-        folder = Path(espeakng_loader.get_data_path()) / "lang"
-        return sorted(path.name.lower() for path in folder.rglob("*") if path.is_file())
+        return _languages(espeakng_loader.get_data_path())
 
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
         """Speak a sentence."""
@@ -159,9 +159,7 @@ class Flite(Synthesiser):
     @classmethod
     def voices(cls) -> list[str]:
         """Flite's voices, without those that can tell the time only."""
-        if shutil.which("flite") is None:
-            return []
-        names = _run(["flite", "-lv"]).partition(":")[2].split()
+        names = _listed("flite", "-lv").partition(":")[2].split()
         return [name for name in names if not name.endswith("_time")]
 
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
@@ -188,10 +186,7 @@ class Festival(Synthesiser):
     @classmethod
     def voices(cls) -> list[str]:
         """Festival's voices, one package each."""
-        if shutil.which("festival") is None:
-            return []
-        listed = _run(["festival", "-b", "(print (voice.list))"])
-        return sorted(listed.strip().strip("()").split())
+        return sorted(_listed("festival", "-b", "(print (voice.list))").strip().strip("()").split())
 
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
         """Speak a sentence."""
@@ -206,6 +201,22 @@ class Festival(Synthesiser):
             _run(["festival", "-b", program])
             rows = [line.split() for line in labels.read_text().splitlines() if len(line.split()) == 3]
             return _utterance(sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}")
+
+
+@lru_cache
+def _languages(folder: str) -> list[str]:
+    return sorted(path.name.lower() for path in (Path(folder) / "lang").rglob("*") if path.is_file())
+
+
+def _listed(name: str, *arguments: str) -> str:
+    """The voices that a program prints; nothing where it is missing."""
+    program = shutil.which(name)
+    return "" if program is None else _printed_once(program, *arguments)
+
+
+@lru_cache
+def _printed_once(*command: str) -> str:
+    return _run(command)
 
 
 def _run(command: Sequence[str]) -> str:

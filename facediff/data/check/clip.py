@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.check.report import Findings, relative
+from facediff.data.storage import open_motion, rig_path
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import open_sound
 from facediff.speech.cut_short import CUT, cut_short
@@ -102,7 +103,11 @@ def examine(rules: Rules, clip: ClipFiles) -> ClipFacts:
 def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> None:
     findings, where, expected = facts.findings, relative(path, rules.root), rules.n_vertices
     try:
-        array = open_array(path)
+        rig = rig_path(path)
+        array: npt.NDArray[Any] = open_array(path)
+        if rig is not None:
+            motion = open_motion(path, expected)
+            array = motion.read(range(1 if rules.quick else motion.frames))
     except FaceDiffError as error:
         findings.error("motion_unreadable", where, str(error).removeprefix(f"{path}: "))
         return
@@ -124,7 +129,7 @@ def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> N
         return
     if array.dtype == np.float16:
         findings.warning("motion_dtype", where, "is in half precision, some three digits; get it in float32")
-    facts.frames = len(array)
+    facts.frames = len(array) if rig is None else motion.frames
     if not rules.quick:
         check_vertices(findings, array.reshape(len(array), expected, 3), where, subject, rules.templates)
 

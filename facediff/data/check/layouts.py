@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin,
 
 from facediff.data.check.report import CheckReport, Findings, few, number
 from facediff.data.manifest import load_manifest
+from facediff.data.storage import WEIGHTS_FOLDER, rig_path
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.arrays import open_array, vertices_of
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 STATE = "prepare.json"
 """In the folder while preparation is running or was interrupted."""
-SPLITS = ("train", "val", "test_a", "test_b")
+SPLITS = ("train", "val", "test_a", "test_b", "test_c")
 
 PROBED = 8  # files of motion whose header is read to find the topology
 HALF = 0.5  # share of the names that must be of a corpus's form to recognise it
@@ -74,7 +75,7 @@ class CorpusFolder:
         counts: Counter[int] = Counter()
         for path in islice(self.motions.values(), PROBED):
             try:
-                vertices = vertices_of(open_array(path).shape)
+                vertices = vertices_of(open_array(rig_path(path) or path).shape)
             except Exception:  # reported when the clips are checked
                 vertices = None
             if vertices is not None:
@@ -175,7 +176,7 @@ def view_of(root: Path, corpus: str | None) -> CorpusView:
 def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
     """List the files of clips in a corpus folder; ``motion_folders`` are in the order of preference."""
     folder = CorpusFolder(root)
-    motions = [(name, ".npy", folder.motions) for name in motion_folders]
+    motions = [(name, ".npy", folder.motions) for name in (*motion_folders, WEIGHTS_FOLDER)]
     for name, suffix, files in [*motions, ("wav", ".wav", folder.sounds)]:
         try:
             paths = sorted(root / name / file for file in os.listdir(root / name))
@@ -334,15 +335,18 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> CorpusView
             if names
             else f"--split: {module.corpus_name} is split in one way only; omit the option"
         )
+    ways = ways if split is None else [split]
+    modules = {way: instance(module, root, way) for way in ways}
+    first = modules[ways[0]]
     return CorpusView(
         corpus=module.corpus_name,
         data_module=f"{module.__module__}.{module.__qualname__}",
-        n_vertices=module.n_vertices,
+        n_vertices=first.n_vertices,
         frame_rate=module.frame_rate,
         stored_frame_rate=module.stored_frame_rate or module.frame_rate,
         parse=module.parse_name,
-        split_of={way: instance(module, root, way).split_of for way in (ways if split is None else [split])},
-        identities=list(module.identities),
+        split_of={way: data.split_of for way, data in modules.items()},
+        identities=list(first.identities),
         expected=module.expected_clips(),
         mesh_files=module.mesh_files,
         region_sources=dict(module.region_sources),

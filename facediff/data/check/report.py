@@ -17,7 +17,7 @@ FEW = 3  # how many names of a list are printed
 LISTED = 4  # findings of a kind that are printed one by one; of more, only the first is
 FORMAT = 1  # goes up when a field of the JSON object changes its meaning; new fields do not count
 
-SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "none": "(style references only)"}
+SPLIT_NAMES = {"test_a": "test A", "test_b": "test B", "test_c": "test C", "none": "(style references only)"}
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,9 @@ from facediff.data.packed.layout import (
 from facediff.data.packed.shards import shard_key
 from facediff.data.packed.stores import is_packed
 from facediff.data.prepare.runner import refuse_foreign, version
-from facediff.data.storage import MOTION_FOLDERS, motion_path, refuse_out_of_range
+from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, motion_path, open_motion, refuse_out_of_range
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.speech.audio import open_sound
-from facediff.utils.arrays import open_vertices
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import in_order, run_tasks
 from facediff.utils.limits import LIMITS
@@ -250,7 +249,7 @@ class PackingPlan:
         sounds = {path.stem: path for path in sorted((root / "wav").glob("*.wav"))}
         motions = {
             path.stem: path
-            for folder in reversed(MOTION_FOLDERS)
+            for folder in (WEIGHTS_FOLDER, *reversed(MOTION_FOLDERS))
             for path in sorted((root / folder).glob("*.npy"))
             if not path.name.startswith(".")
         }
@@ -260,18 +259,18 @@ class PackingPlan:
                 left_out += [str(paths[name].relative_to(root)) for paths in (sounds, motions) if name in paths]
                 continue
             path = motion_path(root, name)
-            vertices = open_vertices(path, view.n_vertices)
-            if vertices.dtype.name not in EXACT:
-                raise FaceDiffError(f"{path}: holds {vertices.dtype}; expected {', '.join(EXACT)}")
+            motion = open_motion(path, view.n_vertices)
+            if motion.dtype.name not in EXACT:
+                raise FaceDiffError(f"{path}: holds {motion.dtype}; expected {', '.join(EXACT)}")
             if clip.identity not in templates:
                 raise FaceDiffError(
                     f"{root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {name}; {REMEDY}"
                 )
-            own = coding if tolerance and name not in kept else vertices.dtype.name
+            own = coding if tolerance and name not in kept else motion.dtype.name
             nothing = PackedSound(0, (), "flac", 16_000, 1, 1, 16)
-            clips[name] = PackedClip(name, clip.identity, own, vertices.dtype.name, rows[own], len(vertices), nothing)
+            clips[name] = PackedClip(name, clip.identity, own, motion.dtype.name, rows[own], motion.frames, nothing)
             # Each clip begins at a chunk of its own, so that reading a window decodes no other clip.
-            rows[own] += -(-len(vertices) // chunk) * chunk
+            rows[own] += -(-motion.frames // chunk) * chunk
             for file in (path, sounds[name]):
                 facts = file.stat()
                 size += facts.st_size
@@ -485,9 +484,9 @@ def _write(out: Path, root: Path, record: Record, task: PackingTask) -> None:
         templates = read_templates(root / "templates.pkl", record.n_vertices)
         for part in task.parts:
             read = _quantised if task.coding in QUANTISED else _exact
-            vertices = open_vertices(part.path, record.n_vertices)
+            stored = open_motion(part.path, record.n_vertices).read(range(part.start, part.stop))
             rows[part.row : part.row + part.stop - part.start] = read(
-                part, vertices, templates[part.identity].numpy(), record, rows.dtype
+                part, stored, templates[part.identity].numpy(), record, rows.dtype
             )
             last = part.row + part.stop - part.start
             padded = -(-last // facts.chunk) * facts.chunk
@@ -505,13 +504,12 @@ def _write(out: Path, root: Path, record: Record, task: PackingTask) -> None:
 
 def _quantised(
     part: ShardPart,
-    vertices: npt.NDArray[np.floating],
+    stored: npt.NDArray[np.floating],
     template: npt.NDArray[np.float32],
     record: Record,
     dtype: np.dtype[Any],
 ) -> npt.NDArray[Any]:
     """Offsets from the template in whole quantisation steps (frames, 3V)."""
-    stored = vertices[part.start : part.stop]
     steps = np.empty((len(stored), stored.shape[1] * 3), dtype)
     limit = np.iinfo(dtype).max
     for first in range(0, len(stored), FRAMES):
@@ -534,13 +532,13 @@ def _quantised(
 
 def _exact(
     part: ShardPart,
-    vertices: npt.NDArray[np.floating],
+    stored: npt.NDArray[np.floating],
     template: npt.NDArray[np.float32],
     record: Record,
     dtype: np.dtype[Any],
 ) -> npt.NDArray[Any]:
     """The bits of absolute vertices as whole numbers (frames, 3V)."""
-    stored = np.ascontiguousarray(vertices[part.start : part.stop], vertices.dtype.newbyteorder("<"))
+    stored = np.ascontiguousarray(stored, stored.dtype.newbyteorder("<"))
     with np.errstate(all="ignore"):
         refuse_out_of_range(stored.astype(np.float32), range(part.start, part.stop), part.path)
     return stored.reshape(len(stored), -1).view(dtype)
