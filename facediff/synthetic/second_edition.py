@@ -42,7 +42,8 @@ FRAME_RATE = 25
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
 _PEAK = 0.6
 _DRAWS = 7  # Performances of a test sentence of which the one of middle liveliness is taken
-_TRAIN_EACH, _REFERENCES_EACH, _TEST_EACH, _TEST_C_EACH = 32, 24, 10, 5
+TRAIN_EACH, REFERENCES_EACH, TEST_EACH, TEST_C_EACH = 32, 24, 10, 5
+"""Sentences of each speaker."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +87,14 @@ def performed_clips(drawn: int = 0) -> tuple[PerformedClip, ...]:
     """
     plan: list[tuple[str, str, list[tuple[int, str]], str]] = []
     for place, identity in enumerate(SEEN):
-        plan.append((identity, "train", turn(TRAIN, 11 * place, _TRAIN_EACH), ""))
+        plan.append((identity, "train", turn(TRAIN, -6 * place, TRAIN_EACH), ""))
         plan.append((identity, "val", turn(VALIDATION, place, 3), ""))
-        plan.append((identity, "test_a", turn(TEST, 3 * place, _TEST_EACH), ""))
+        plan.append((identity, "test_a", turn(TEST, 3 * place, TEST_EACH), ""))
     for place, identity in enumerate(UNSEEN):
-        plan.append((identity, "references", turn(TRAIN, 17 * place, _REFERENCES_EACH), ""))
-        plan.append((identity, "test_b", turn(TEST, 4 * place + 1, _TEST_EACH), ""))
+        plan.append((identity, "references", turn(TRAIN, 17 * place, REFERENCES_EACH), ""))
+        plan.append((identity, "test_b", turn(TEST, 4 * place + 1, TEST_EACH), ""))
     for identity, voice in zip(SEEN, _voices_of_test_c(), strict=False):
-        texts = turn(GERMAN if voice.startswith("espeak:de") else TEST[-6:], 0, _TEST_C_EACH)
+        texts = turn(GERMAN if voice.startswith("espeak:de") else TEST[-6:], 0, TEST_C_EACH)
         plan.append((identity, "test_c", texts, voice))
     plan += [(name, "train", turn(TRAIN, 5 * place, 24), "") for place, name in enumerate(drawn_names(drawn))]
     moods = tuple(MOODS)

@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from facediff import synthetic as puppet
 from facediff.data import Puppet
+from facediff.data.puppet import FirstEdition, SecondEdition
+from facediff.errors import FaceDiffError
 from facediff.synthetic.corpus import generate
 
 
@@ -16,3 +20,14 @@ def test_data_module_trains_on_drawn_speakers_and_compares_the_eight(tmp_path: P
     assert len(data.train_dataloader().dataset) == 4  # all but the unseen speaker's clip
     assert data.compared_speakers == (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
     assert Puppet(drawn_speakers=2).root != Puppet().root
+
+
+def test_a_folder_says_which_edition_it_holds(tmp_path: Path) -> None:
+    generate(tmp_path / "first", only=["F1_e01"], progress=False)
+    assert isinstance(Puppet(root=str(tmp_path / "first")).edition, FirstEdition)
+    assert Puppet(root=str(tmp_path / "first")).n_vertices == 1008
+    assert isinstance(Puppet(root=str(tmp_path / "none")).edition, SecondEdition)
+    assert Puppet(edition=1).root != Puppet().root
+    assert Puppet(edition=1).compared_speakers != Puppet().compared_speakers
+    with pytest.raises(FaceDiffError, match="edition"):
+        Puppet(root=str(tmp_path / "first"), people_voices=True)

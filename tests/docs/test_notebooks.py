@@ -17,18 +17,17 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 SMALL = """
-from facediff import synthetic
-from facediff.synthetic import corpus
+from facediff.synthetic import second_edition
 
-for module in (synthetic, corpus):  # 32 clips instead of 250
-    module.TRAIN_SENTENCES = module.REFERENCE_SENTENCES = (2, 3)
-    module.VAL_SENTENCES, module.TEST_SENTENCES = (25,), (28,)
+# 42 clips instead of 420
+second_edition.TRAIN_EACH = second_edition.REFERENCES_EACH = 3
+second_edition.TEST_EACH = second_edition.TEST_C_EACH = 1
 """
 """Runs before a notebook."""
 
 OPTIONS = ["--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1", "--trainer.enable_progress_bar=false"]
 OPTIONS += ["--trainer.callbacks=[]", "--model.dim=32", "--model.sampler.steps=2"]
-PARAMETERS = {"epochs": 1, "options": OPTIONS, "clips": ["F1_e28", "M1_e28"]}
+PARAMETERS = {"epochs": 1, "options": OPTIONS, "clips": ["F1_t01", "M1_t10"]}
 """What a notebook's cell with the tag ``parameters`` may set, and what it is here."""
 
 

@@ -68,8 +68,11 @@ def workplace(saved_model: Path, puppet_corpus: Path, tmp_path: Path, monkeypatc
     shutil.copy(saved_model, folder / "demo" / "puppet.ckpt")
     shutil.copy(puppet_corpus / "wav" / "F1_e28.wav", folder / "speech.wav")
     shutil.copy(puppet_corpus / "PUPPET.ply", folder / "face.ply")
-    for name in ("vertices_npy", "templates.pkl"):
-        (folder / name).symlink_to(puppet_corpus / name)
+    (folder / "templates.pkl").symlink_to(puppet_corpus / "templates.pkl")
+    shutil.copytree(puppet_corpus / "vertices_npy", folder / "vertices_npy")
+    shutil.copy(
+        folder / "vertices_npy" / "F1_e28.npy", folder / "vertices_npy" / "F1_t01.npy"
+    )  # its name in the manual
     write_puppet_shapes(folder / "shapes", "F1")
     # The model is hardly trained, and no shapes explain its motion: refused else, as of another face.
     monkeypatch.setattr("facediff.editing.blendshapes.VISIBLE_MM", np.inf)

@@ -79,10 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--recordings", type=int, default=60, help="how many clips")
     args = parser.parse_args(arguments)
     if args.corpus is None:
-        from facediff.data.puppet import cache_root
+        from facediff.data.puppet import FirstEdition, cache_root
         from facediff.synthetic import generate
 
-        args.corpus = cache_root(0)
+        args.corpus = cache_root(FirstEdition())
         generate(args.corpus)
     sounds = sorted((args.corpus / "wav").glob("*.wav"))[: args.recordings]
     print(

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from facediff.data import SpeechMotionDataModule
 from facediff.data.check.layouts import by_name, list_folder, recognise
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-from facediff.data.puppet import built_in_mesh, cache_root, made_root
+from facediff.data.puppet import SecondEdition, built_in_mesh, cache_root, made_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import FigureData, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
@@ -60,7 +60,9 @@ def gather(
     if truth == Path("puppet") and not truth.is_dir():
         built_in = made_root(0)
         if built_in is None:
-            raise FaceDiffError(f"{cache_root(0)}: the built-in corpus does not exist yet; `facediff demo` makes it")
+            raise FaceDiffError(
+                f"{cache_root(SecondEdition())}: the built-in corpus does not exist yet; `facediff demo` makes it"
+            )
         truth = built_in
     folder, corpus = find_truths(truth)
     manifest = read_manifest(corpus) if corpus else {}
