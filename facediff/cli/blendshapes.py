@@ -73,7 +73,7 @@ def blendshapes(
             **switches,
             **others,
         )
-        from facediff.synthetic.arkit import write_puppet_shapes as write
+        from facediff.synthetic.known_faces import write_puppet_shapes as write
 
         written = write(write_puppet_shapes, source.identity)
         tell(f"{write_puppet_shapes}: neutral face and {len(written)} shapes: {', '.join(sorted(written))}")

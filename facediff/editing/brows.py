@@ -11,15 +11,12 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.eyes import Array, Eyes, nearest_puppet
+from facediff.editing.eyes import Array, Eyes
 from facediff.editing.procedural import copied
 from facediff.errors import OptionError
 
 REGION = "brows"
 """A region of this name says where the brows are."""
-UP = ("inner_brow_up", "outer_brow_up")
-DOWN = ("brow_frown",)
-"""Controls of the built-in face that raise brows, and lower them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +59,17 @@ def brows_of(
         weights = region_factors(template, {REGION: named}, {REGION: 1.0, ALL: 0.0})
         up = weights[:, None] * np.array([0.0, 1.0, 0.0])
         return Brows(_one_millimetre(up, unit), _one_millimetre(-up, unit))
-    from facediff.synthetic.corpus import rig_of
-    from facediff.synthetic.rig import LINEAR_FIELDS
+    from facediff.synthetic.face import build_face
+    from facediff.synthetic.known_faces import known_face, resting_faces
 
-    puppet = nearest_puppet(template, faces)
-    rig = rig_of("F1" if puppet is None else puppet[0])
-    fields = [sum(rig.fields[LINEAR_FIELDS.index(name)] for name in names) for names in (UP, DOWN)]
-    if puppet is None:
-        fields = list(_carried(rig.neutral, np.stack(fields), template, faces))
+    puppet = known_face(template, faces)
+    if puppet is None:  # those of a speaker of the first edition, whose mesh is small
+        neutral, triangles = resting_faces(1)["F1"], build_face().faces
+        lender = known_face(neutral, triangles)
+        assert lender is not None  # noqa: S101 - for type checkers
+        fields = _carried(neutral, np.stack([lender.brows_up, lender.brows_down]), template, faces)
+    else:
+        fields = np.stack([puppet.brows_up, puppet.brows_down])
     return Brows(*(_one_millimetre(field, unit) for field in fields))
 
 

@@ -72,48 +72,16 @@ def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Pa
 
 def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Eyes | None:
     """The eyes of a face (V, 3) of the built-in corpus, by the rig that its blinks are made with; None for others."""
-    from facediff.synthetic.corpus import rig_of
-    from facediff.synthetic.face import build_face
-    from facediff.synthetic.rig import LINEAR_FIELDS
+    from facediff.synthetic.known_faces import known_face
 
-    nearest = nearest_puppet(template, faces)
-    if nearest is None:
+    face = known_face(template, faces)
+    if face is None:
         return None
-    speaker, distance = nearest
-    mesh = build_face()
-    left = np.concatenate([mesh.groups[name] for name in mesh.groups if name.startswith("eyeball") or name == "pupil"])
-    balls = (np.sort(left), np.sort(mesh.mirror[left]))
-    if distance <= SAME_FACE:
-        closing = rig_of(speaker).fields[LINEAR_FIELDS.index("lids_close")].astype(np.float32)
+    if face.distance <= SAME_FACE:
+        closing = face.closing.astype(np.float32)
     else:  # another speaker's face on the puppet's mesh has no rig: the edges of its own lids say how they shut
-        ring = mesh.groups["eye_0"]  # from the inner corner over the upper lid to the outer one, and back below
-        upper, lower = ring[:9], np.concatenate([ring[:1], ring[:7:-1]])
-        lids = [(upper, lower), (mesh.mirror[upper], mesh.mirror[lower])]
-        closing = closing_of_lids(template, lids, np.concatenate(balls))
-    return Eyes(closing, balls, "the built-in puppet")
-
-
-def nearest_puppet(template: Vertices, faces: npt.NDArray[np.integer] | None) -> tuple[str, float] | None:
-    """The speaker of the built-in corpus that a face (V, 3) is most like, and its largest distance from theirs.
-
-    Returns:
-        None for a face of another topology.
-    """
-    from facediff.synthetic import N_VERTICES
-    from facediff.synthetic.face import build_face
-    from facediff.synthetic.speakers import SPEAKERS
-
-    if len(template) != N_VERTICES or faces is None:
-        return None
-    mesh = build_face()  # takes a second or two
-    if not np.array_equal(np.asarray(faces), mesh.faces):
-        return None
-    # Templates pass through float32, and through files that round them, hence the tolerance of those who ask.
-    distances = {
-        name: float(np.abs(speaker.shape(mesh.vertices) - template).max()) for name, speaker in SPEAKERS.items()
-    }
-    speaker = min(distances, key=lambda name: distances[name])
-    return speaker, distances[speaker]
+        closing = closing_of_lids(template, face.lids, np.concatenate(face.eyeballs))
+    return Eyes(closing, face.eyeballs, "the built-in puppet")
 
 
 def read_eyes(path: Path, template: Vertices) -> Eyes:

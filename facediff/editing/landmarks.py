@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,9 @@ import numpy.typing as npt
 from facediff.editing.face_features import Features, Opening, find_features
 from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.face import N_VERTICES, build_face
+from facediff.synthetic.geometry import HeadMesh
+from facediff.synthetic.head.mesh import QuadMesh
+from facediff.synthetic.head.parts import build_head
 from facediff.utils.limits import check_format
 from facediff.utils.plain_files import load_json, read_table, write_json
 
@@ -72,27 +76,34 @@ No list was found for BIWI (23370 vertices), and Multiface's authors say that th
 """
 
 
-def puppet_landmarks() -> dict[str, int]:
-    """Vertices of the built-in face.
+def puppet_landmarks(edition: Literal[1, 2] = 1) -> dict[str, int]:
+    """Vertices of the built-in face, of the corpus's first edition or of the second one.
 
     Example:
         >>> puppet_landmarks()["nose_tip"]
         124
     """
-    face = build_face()
-    middle = np.flatnonzero(face.mirror == np.arange(len(face.vertices)))
+    face: HeadMesh | QuadMesh = build_face() if edition == 1 else build_head()
+    points = 1000.0 * face.vertices if edition == 1 else face.vertices
+    lips, eyes = ("mouth_0", "eye_0") if edition == 1 else ("lip_border", "eye_edge")
+    border, front, eye = face.groups[lips], face.groups["lip_front"], face.groups[eyes]
+    middle = np.flatnonzero(face.mirror == np.arange(len(points)))
     # Of the skin in front: without the crown, the teeth and the inside of the mouth.
-    middle = middle[np.isin(middle, face.groups["skin"]) & (face.vertices[middle, 2] > 0.03)]
-    height, depth = face.vertices[middle, 1], face.vertices[middle, 2]
-    border, front, eye = face.groups["mouth_0"], face.groups["lip_front"], face.groups["eye_0"]
-    lowest, level = face.vertices[border[-1], 1], face.vertices[eye[0], 1]
-    nose = face.groups["nose"][np.isin(face.groups["nose"], middle)]
-    left = {"mouth_corner": border[7], "eye_outer": eye[8], "eye_inner": eye[0]}
+    middle = middle[np.isin(middle, face.groups["skin"]) & (points[middle, 2] > 30.0)]
+    height, depth = points[middle, 1], points[middle, 2]
+    tip, level = middle[depth.argmax()], points[eye[0], 1]
+    if edition == 1:
+        nose = middle[np.isin(middle, face.groups["nose"])]
+        base = nose[points[nose, 1].argmin()]
+    else:  # the nose begins where the profile lies furthest back between its tip and the lips
+        nose = middle
+        base = middle[np.where((height < points[tip, 1]) & (height > points[border[0], 1]), depth, np.inf).argmin()]
+    left = {"mouth_corner": border[len(border) // 2], "eye_outer": eye[len(eye) // 2], "eye_inner": eye[0]}
     vertices = {
-        "nose_tip": middle[depth.argmax()],
-        "chin": middle[np.where(height < lowest - 0.01, depth, -1.0).argmax()],
-        "nose_bridge": nose[np.abs(face.vertices[nose, 1] - level).argmin()],
-        "nose_base": nose[face.vertices[nose, 1].argmin()],
+        "nose_tip": tip,
+        "chin": middle[np.where(height < points[border[-1], 1] - 10.0, depth, -1.0).argmax()],
+        "nose_bridge": nose[np.abs(points[nose, 1] - level).argmin()],
+        "nose_base": base,
         "upper_lip_top": border[0],
         "lower_lip_bottom": border[-1],
         "upper_lip_middle": front[0],
@@ -146,7 +157,11 @@ def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.in
 def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
     """The named places of a mesh of a known topology; None of another one."""
     points = np.asarray(vertices, np.float64)
-    for topology, count, table in (("puppet", N_VERTICES, puppet_landmarks), ("FLAME", FLAME_VERTICES, FLAME.copy)):
+    for topology, count, table in (
+        ("puppet", N_VERTICES, puppet_landmarks),
+        ("puppet", len(build_head().vertices), partial(puppet_landmarks, 2)),
+        ("FLAME", FLAME_VERTICES, FLAME.copy),
+    ):
         if len(points) == count and _lie_as_on_a_face(points, landmarks := table()):
             return Known(topology, landmarks)
     return None

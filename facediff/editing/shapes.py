@@ -316,17 +316,14 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
 
 def _built_in(template: Array | None) -> ShapeFiles:
     """The built-in shapes: of the speaker with the face nearest to a template (V, 3) in metres, or the common ones."""
-    from facediff.synthetic.arkit import puppet_shapes
-    from facediff.synthetic.face import build_face
-    from facediff.synthetic.speakers import SPEAKERS
+    from facediff.synthetic.known_faces import built_in_shapes, edition_of_mesh, resting_faces
 
-    common, nearest = build_face().vertices, None
-    if template is not None and template.shape == common.shape:
-        at_rest: dict[str | None, Array] = {name: speaker.shape(common) for name, speaker in SPEAKERS.items()}
-        at_rest[None] = common
+    edition, nearest = None if template is None else edition_of_mesh(len(template)), None
+    if template is not None and edition is not None:
+        at_rest: dict[str | None, Array] = {None: built_in_shapes(None, edition)[0], **resting_faces(edition)}
         centred = template - template.mean(0)
         nearest = min(at_rest, key=lambda name: np.square(at_rest[name] - at_rest[name].mean(0) - centred).sum())
-    neutral, faces, shapes = puppet_shapes(nearest)
+    neutral, faces, shapes = built_in_shapes(nearest, edition or 2)
     points = np.stack(list(shapes.values()))
     path = Path(BUILT_IN)
     return ShapeFiles(path, path, tuple(shapes), points, neutral, faces, metric=True, rest=BUILT_IN)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
 
@@ -12,7 +10,6 @@ from facediff.synthetic.face import EYE_CENTRE, build_face
 from facediff.synthetic.geometry import Array, HeadMesh, bump, rise
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig, jaw_share, lip_side, soft_parts
 from facediff.synthetic.speakers import SPEAKERS
-from facediff.utils.files import atomic_folder
 
 WHOLE = {
     "jawOpen": "jaw_open",
@@ -127,20 +124,3 @@ def _look(mesh: HeadMesh, canonical: Array, sign: float, sideways: float, up: fl
     moved = np.zeros_like(canonical)
     moved[ball] = points @ (around_y @ around_x).T - points
     return moved
-
-
-def write_puppet_shapes(folder: Path, speaker: str | None = None) -> list[str]:
-    """Write the shapes as OBJ files, and the face at rest as ``neutral.obj``; the folder appears whole or not at all.
-
-    Returns:
-        the names of the shapes.
-    """
-    if folder.exists():
-        raise FaceDiffError(f"{folder}: exists already; choose a new folder")
-    neutral, faces, shapes = puppet_shapes(speaker)
-    triangles = "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1)
-    with atomic_folder(folder) as temporary:
-        for name, vertices in {"neutral": neutral, **shapes}.items():
-            points = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in vertices)
-            (temporary / f"{name}.obj").write_text(points + triangles, encoding="ascii")
-    return list(shapes)

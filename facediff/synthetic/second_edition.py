@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
 from facediff.synthetic.articulation import speech_sounds
-from facediff.synthetic.cast import CAST, KEPT_OUT_PEOPLE, SEEN, UNSEEN, drawn_names, member_of
+from facediff.synthetic.cast import CAST, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
 from facediff.synthetic.corpus import CORPUS, MANIFEST, in_quiet, refuse_foreign, write_ply
 from facediff.synthetic.further_speech import WORDS
 from facediff.synthetic.head.parts import AROUND_EYE, build_head
@@ -181,6 +181,11 @@ def _facts(seed: int, drawn: int, people: Sequence[str]) -> dict[str, object]:
     return {**facts, "people": list(people)}
 
 
+def resting_head(member: CastMember) -> NDArray[np.float64]:
+    """A speaker's head at rest in metres, (V, 3)."""
+    return np.asarray(dressed(member.face, build_head(), member.complexion) / 1000.0)
+
+
 @lru_cache(maxsize=4)
 def rig_of(identity: str) -> NDArray[np.float32]:
     """A speaker's head at rest and the displacements of :data:`SHAPES`, in metres, (55, V, 3).
@@ -191,7 +196,7 @@ def rig_of(identity: str) -> NDArray[np.float32]:
     member, mesh, shapes = member_of(identity), build_head(), head_shapes()
     rest = member.face(mesh.vertices)
     rig = np.zeros((1 + len(SHAPES), *rest.shape), np.float32)
-    rig[0] = dressed(member.face, mesh, member.complexion) / 1000.0
+    rig[0] = resting_head(member)
     for number, name in enumerate(SHAPES, start=1):
         moved = np.flatnonzero(np.abs(shapes[name]).max(axis=1) > 1e-9)
         posed = member.face(mesh.vertices[moved] + shapes[name][moved])

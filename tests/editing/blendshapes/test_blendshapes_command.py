@@ -14,12 +14,13 @@ from facediff.cli.app import main
 from facediff.editing.shapes import ARKIT, read_shapes
 from facediff.mesh import read_mesh
 from facediff.synthetic.arkit import puppet_shapes
+from facediff.synthetic.known_faces import write_puppet_shapes
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("shapes") / "puppet"
-    assert main(["blendshapes", "--write-puppet-shapes", str(made)]) == 0
+    write_puppet_shapes(made, edition=1)
     return made
 
 
