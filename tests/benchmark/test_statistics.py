@@ -109,6 +109,22 @@ def test_a_difference_is_that_of_the_pooled_scores_over_common_sentences() -> No
     assert less.value == pytest.approx(mine - theirs)
 
 
+def test_a_sentence_without_a_value_in_a_run_does_not_count_there() -> None:
+    """As zero it would pull that run's mean, and with it the difference, towards zero."""
+    rng = np.random.default_rng(6)
+    frames = rng.integers(10, 90, 12).astype(float)
+    values, others = 5 + rng.normal(0, 1, (2, 12)), 4 + rng.normal(0, 1, (2, 12))
+    values[1, 3] = np.nan
+    kept = np.isfinite(values[1])
+    means = [np.average(values[0], weights=frames), np.average(values[1, kept], weights=frames[kept])]
+    one = RowScores(np.array(means), values, frames, tuple(map(str, range(12))))
+    gap = difference(one, scores(others, frames), BOOTSTRAP)
+    expected = np.mean(means) - np.average(others, axis=1, weights=frames).mean()
+    assert gap.value == pytest.approx(expected)
+    assert gap.sentences is not None
+    assert gap.sentences.low < expected < gap.sentences.high
+
+
 def test_tables_of_noise_mark_nothing_as_best() -> None:
     """In at most 5 % of them, up to the chance of 150 tables; sentences alone would mark far more."""
     rng = np.random.default_rng(5)

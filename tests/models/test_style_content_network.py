@@ -17,7 +17,7 @@ import torch
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import StyleContentDisentanglement
-from facediff.models.style_content.losses import pair_up
+from facediff.models.style_content.losses import pair_up, relative_distance
 from facediff.models.style_content.network import WindowedTransformer
 from facediff.speech.cepstra import align_features, cepstra
 from tests.fakes.style_content import make
@@ -336,6 +336,50 @@ def test_every_term_of_whole_clips_is_its_formula(tiny: Tiny) -> None:
     weights |= {"recording_content": 5, "identity_style": 10, "speech_content": 5}
     total = sum(weight * float(made[name]) for name, weight in weights.items())
     assert float(made["loss"]) == pytest.approx(total, rel=1e-5)
+
+
+def test_speech_is_decoded_with_another_clips_style(tiny: Tiny) -> None:
+    """Unless told to take the clip's own. The style is made to count, so that the two differ by more than rounding."""
+    batch, apart = clips(tiny, "A_e01", "B_e01", "A_e02", "B_e03"), []
+    for chosen in ("other_clip", "own"):
+        model = ready(tiny, speech_style=chosen)
+        plain = model.network.style
+        model.network.style = lambda *motion, plain=plain: 20 * plain(*motion)
+        with torch.no_grad():
+            made = float(model.losses(batch)["speech_reconstruction"])
+        expected = Objective(model, batch).terms(squared=False, own_style=chosen == "own")["speech_reconstruction"]
+        assert made == pytest.approx(expected, rel=2e-3)
+        apart.append(made)
+    assert abs(apart[0] / apart[1] - 1) > 0.01
+
+
+def test_what_comes_back_from_a_swap_follows_what_went_in(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No gradient goes through the content and the style that swapped motion is to give back."""
+    from facediff.models.style_content import model as module
+
+    model, batch, targets = ready(tiny), clips(tiny, "A_e02", "B_e03"), []
+
+    def distance(values: torch.Tensor, target: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
+        targets.append((values.requires_grad, target.requires_grad))
+        return relative_distance(values, target, counted)
+
+    monkeypatch.setattr(module, "relative_distance", distance)
+    content = torch.randn(2, batch.motion.shape[1], 8, requires_grad=True)
+    style = torch.randn(2, 4, requires_grad=True)
+    pairing = pair_up(batch, model.alignments)
+    model.branch_losses(batch, batch.motion * SCALE, pairing, content, style, style)
+    assert targets == [(True, False), (True, False)]
+
+
+@pytest.mark.parametrize(("rate", "before", "after"), [(30.0, 10, 9), (25.0, 8, 8)])
+def test_windows_have_the_frames_that_their_first_frame_listens_to(
+    tiny: Tiny, rate: float, before: int, after: int
+) -> None:
+    """Of 32 steps at 50 a second 16 lie before the middle, ⌈16 · rate / 50⌉ frames, and 15 after it."""
+    model = make(speech_rate=50.0, frame_rate=rate)
+    decoder = model.network.decoder.past_frames
+    assert decoder < 10, "or it would hide what speech needs"
+    assert model.context_frames() == (max(decoder, before), after)
 
 
 PUBLISHED: dict[str, object] = {

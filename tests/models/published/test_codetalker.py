@@ -139,6 +139,21 @@ def one_clip(model: CodeTalker, frames: int) -> Any:  # noqa: ANN401
     return collate([replace(sample, motion=motion, template=torch.zeros(VERTICES, 3), identity=1)])
 
 
+def test_tokens_are_drawn_to_codes_by_a_quarter_of_what_codes_are_drawn_by(tmp_path: Path) -> None:
+    """β = 0.25 stands at the tokens (van den Oord et al. 2017, eq. 3); the values of the two terms are equal."""
+    prior = imported(write(tmp_path, one=codetalker.stage_one("vocaset"))[:1], "vocaset").eval()
+    batch = one_clip(prior, 24)
+    tokens = prior.prior.encode_clips(batch.motion.flatten(2), batch.frame_lengths).detach().requires_grad_()
+    prior.prior.encode_clips = lambda *_: tokens
+    table = prior.prior.codebook
+    to_tokens, to_codes = torch.autograd.grad(prior.losses(batch)["quantisation"], (tokens, table))
+    codes = prior.prior.quantise(tokens)
+    error = 2 * (tokens - codes.chosen) / tokens.numel()
+    torch.testing.assert_close(to_tokens, 0.25 * error)
+    moved = torch.zeros_like(table).index_add_(0, codes.numbers.flatten(), -error.reshape(-1, table.shape[1]))
+    torch.testing.assert_close(to_codes, moved)
+
+
 def test_the_losses_of_both_stages_are_the_published_ones(tmp_path: Path) -> None:
     one, two = codetalker.stage_one("vocaset"), codetalker.stage_two("vocaset")
     files = write(tmp_path, one=one, two=two)

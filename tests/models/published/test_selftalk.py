@@ -18,6 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, SelfTalk, load_model
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files, save_model
+from facediff.models.published.selftalk import Transcription
 from tests.fakes import published
 from tests.fakes.published import COORDINATES, IDENTITIES, LIPS, VERTICES, write_author_files
 from tests.fakes.tiny import Tiny
@@ -90,6 +91,22 @@ def test_the_loss(dataset: str, frames: int, tmp_path: Path) -> None:
     weights = {"reconstruction": 1e3, "velocity": 1e3, "consistency": 1e-3, "ctc": 1e-4}
     total = sum(weights[name] * value for name, value in expected.items())
     assert losses["loss"].item() == pytest.approx(total, rel=1e-4)
+
+
+def test_each_weight_is_of_its_own_term(tmp_path: Path) -> None:
+    """Positions and velocities, a million times the lip reader's terms, would hide a weight at the wrong one."""
+    model = imported(published.selftalk_state("vocaset"), tmp_path, "vocaset", **LIP_OPTIONS)
+    assert isinstance(model, SelfTalk)
+    model.vertex_weight = model.velocity_weight = 0.0
+    losses = model.losses(collate([sample_of(speech_of(40), 0.1 * torch.randn(24, VERTICES, 3), identity=1)]))
+    expected = 1e-3 * losses["consistency"].item() + 1e-4 * losses["ctc"].item()
+    assert losses["loss"].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_transcript_has_no_blanks_and_keeps_letters_that_a_blank_divides() -> None:
+    letters = torch.tensor([[0, 3, 3, 0, 3, 5, 5, 0, 7, 7], [0, 0, 4, 4, 0, 9, 9, 9, 9, 9]])
+    said = Transcription(torch.zeros(2, 10, 1), letters, torch.tensor([9, 5]), 0).transcripts()
+    assert [row.tolist() for row in said] == [[3, 3, 5, 7], [4]]
 
 
 def test_the_recogniser_hears_each_clip_by_itself(tmp_path: Path) -> None:
