@@ -344,7 +344,7 @@ def draw_clip(
         template=sample.template.numpy(),
         view=view,
         size=(size, round(ASPECT * size)),
-        colours=None if assets.colours is None else assets.colours.numpy(),
+        colours=None if (colours := assets.colours_of(sample.identity_name)) is None else colours.numpy(),
     )
     frames = comparison(
         renderer,

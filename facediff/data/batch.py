@@ -249,6 +249,7 @@ class Assets:
         inner_lip_pairs: (upper, lower) vertex pairs on the inner lips, for the mouth's opening.
         references: a default style reference for every identity that has one.
         motion_scale: factor that gives the training motion unit variance; None until it has been measured.
+        identity_colours: vertex colours of identities that have their own.
     """
 
     corpus: str
@@ -263,6 +264,7 @@ class Assets:
     inner_lip_pairs: Int[Tensor, "pairs 2"] | None = None
     references: dict[str, Reference] = field(default_factory=dict)
     motion_scale: float | None = None
+    identity_colours: dict[str, UInt8[Tensor, "vertices 3"]] = field(default_factory=dict)
 
     @property
     def n_vertices(self) -> int:
@@ -276,6 +278,10 @@ class Assets:
                 f'identity: there is no "{identity}"; the checkpoint has {", ".join(sorted(self.templates))}'
             )
         return self.templates[identity]
+
+    def colours_of(self, identity: str) -> UInt8[Tensor, "vertices 3"] | None:
+        """The vertex colours of an identity: its own, else those of the mesh file."""
+        return self.identity_colours.get(identity, self.colours)
 
     def identity_index(self, identity: str) -> int:
         """Index of a training identity, −1 for any other."""
@@ -300,6 +306,8 @@ class Assets:
                 may be hostile, and these fields reach meshes, file names and sizes of arrays.
         """
         expected = {attribute.name for attribute in fields(cls)}
+        if isinstance(state, dict):
+            state = {"identity_colours": {}, **state}  # checkpoints of 0.2 and older have none
         if not isinstance(state, dict) or state.keys() != expected:
             odd = sorted(map(str, expected ^ state.keys())) if isinstance(state, dict) else []
             raise FaceDiffError(
@@ -309,7 +317,7 @@ class Assets:
         if not isinstance(names, list) or not names or not all(map(is_name, names)) or len(set(names)) < len(names):
             raise _bad("identities", names, "a list of different names without path separators")
         LIMITS.check("identities", len(names), "assets")
-        for key in ("templates", "regions", "references"):
+        for key in ("templates", "regions", "references", "identity_colours"):
             if not isinstance(state[key], dict) or not all(map(is_name, state[key])):
                 raise _bad(key, state[key], "a dict by name")
             LIMITS.check("identities", len(state[key]), f"assets {key}")
@@ -348,8 +356,10 @@ class Assets:
         for name, shape in (("faces", (None, 3)), ("inner_lip_pairs", (None, 2))):
             if state[name] is not None:
                 _check_tensor(name, state[name], shape, below=count)
-        if state["colours"] is not None:
-            _check_tensor("colours", state["colours"], (count, 3), below=256)
+        own = {f"identity_colours[{name}]": colours for name, colours in state["identity_colours"].items()}
+        for name, colours in {"colours": state["colours"], **own}.items():
+            if colours is not None:
+                _check_tensor(name, colours, (count, 3), below=256)
 
 
 def _check_tensor(name: str, value: object, shape: tuple[int | None, ...], *, below: int | None = None) -> None:

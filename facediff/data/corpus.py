@@ -29,7 +29,7 @@ from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
 from facediff.speech.audio import samples_for
-from facediff.utils.arrays import ArrayStore
+from facediff.utils.arrays import ArrayStore, read_arrays
 from facediff.utils.checksums import sha256
 from facediff.utils.files import cache_dir
 from facediff.utils.limits import COORDINATE, LIMITS, quoted
@@ -258,6 +258,16 @@ class Corpus:
         if len(mesh.vertices) != self.n_vertices:
             raise FaceDiffError(f"{path}: has {len(mesh.vertices)} vertices, expected {self.n_vertices}")
         return mesh
+
+    def read_colours(self) -> dict[str, Tensor]:
+        """Colours (V, 3) from 0 to 255 of speakers who have their own, from ``colours.npz``; empty without the file."""
+        path = self.root / "colours.npz"
+        arrays = read_arrays(path) if path.is_file() else {}
+        for name, array in arrays.items():
+            if array.shape != (self.n_vertices, 3) or array.dtype != np.uint8:
+                kind = f"{array.dtype} {array.shape}"
+                raise FaceDiffError(f"{path}: colours of {name} are {kind}; expected uint8 ({self.n_vertices}, 3)")
+        return {name: torch.from_numpy(array) for name, array in arrays.items() if name in self.templates}
 
     def read_pairs(self, file: str) -> Tensor | None:
         """Vertex pairs (P, 2) of a file below the folder, one ``upper, lower`` a line; None if it does not exist."""

@@ -450,6 +450,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 },
                 inner_lip_pairs=corpus.read_pairs(LIP_PAIRS),
                 references=references,
+                identity_colours=corpus.read_colours(),
             )
         return self._assets
 

@@ -284,6 +284,10 @@ def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDAr
     for name in ("faces", "colours", "inner_lip_pairs"):
         if facts[name] is not None:
             arrays[name] = facts[name]
+    if assets.identity_colours:  # of each face
+        grey = np.full((assets.n_vertices, 3), 190, np.uint8)
+        own = [assets.colours_of(name) for name in faces]
+        arrays["colours"] = np.stack([grey if colours is None else colours.numpy() for colours in own])
     if graphs.sampling is not None and graphs.sampling.noise is not None:
         arrays["noise"] = graphs.sampling.noise.numpy()
     if graphs.style != "reference":

@@ -208,19 +208,20 @@ class FirstSample:
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
     """A checkpoint's assets as :class:`facediff.animation.Animation` takes them.
 
-    The neutral face is that of ``identity``, the first one trained on if None.
+    The neutral face and its colours are those of ``identity``, the first one trained on if None.
     """
     import numpy as np
 
     def array(value: object, kind: type) -> object:
         return None if value is None else np.asarray(value, kind)
 
+    name = identity or assets.identities[0]
     return {
-        "template": array(assets.template(identity or assets.identities[0]), np.float32),
+        "template": array(assets.template(name), np.float32),
         "faces": array(assets.faces, np.int32),
         "frame_rate": assets.frame_rate,
         "unit": assets.unit,
-        "colours": array(assets.colours, np.uint8),
+        "colours": array(assets.colours_of(name), np.uint8),
         "regions": {name: np.asarray(indices, np.int64) for name, indices in assets.regions.items()},
         "inner_lip_pairs": array(assets.inner_lip_pairs, np.int64),
     }

@@ -286,7 +286,8 @@ def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
     if "faces" in arrays:
         need("faces", (None, 3), "iu")
     if "colours" in arrays:
-        need("colours", (vertices, 3), "u")
+        each = (len(description.faces),) if arrays["colours"].ndim == 3 else ()  # one for all faces, or one for each
+        need("colours", (*each, vertices, 3), "u")
     if "inner_lip_pairs" in arrays:
         need("inner_lip_pairs", (None, 2), "iu")
     for name in arrays:

@@ -111,6 +111,8 @@ class RuntimeModel(ExportedGraphs):
         if conditions.choices.expressivity != 1:
             metadata["expressivity"] = f"{conditions.choices.expressivity:g}"
         optional = {key: arrays[key] for key in ("faces", "colours", "inner_lip_pairs") if key in arrays}
+        if "colours" in optional and optional["colours"].ndim == 3:
+            optional["colours"] = optional["colours"][stream.face]
         return Animation(
             name=name,
             vertices=np.ascontiguousarray(vertices, np.float32),

@@ -37,7 +37,7 @@ from facediff.utils.jobs import run_tasks
 from facediff.utils.plain_files import read_json, write_json, write_table
 from facediff.utils.workers import WorkerDied
 
-GENERATOR = "2.1"
+GENERATOR = "2.2"
 FRAME_RATE = 25
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
 _PEAK = 0.6
@@ -296,6 +296,8 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
         templates[identity] = rig[0].astype(np.float64)
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
+    complexions = {name: coloured(mesh, member_of(name, people).complexion) for name in templates}
+    np.savez(folder / "colours.npz", **complexions)
     mean = np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0
     write_ply(folder / "PUPPET.ply", mean, mesh.faces, coloured(mesh, Complexion()))
     for name, index in region_vertices().items():

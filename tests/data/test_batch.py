@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
+import trimesh
 
-from facediff.data import collate
-from tests.fakes.tiny import Tiny
+from facediff.animation import Animation
+from facediff.data import Assets, collate
+from facediff.errors import FaceDiffError
+from facediff.export import write_animations
+from facediff.pipelines.trained import facts_of
+from tests.fakes.glb_reader import Reader
+from tests.fakes.tiny import Tiny, write_tiny
 
 
 def test_a_batch_pads_with_zeros_and_says_what_is_valid(tiny: Tiny) -> None:
@@ -22,8 +30,6 @@ def test_a_batch_pads_with_zeros_and_says_what_is_valid(tiny: Tiny) -> None:
 
 
 def test_assets_survive_a_round_trip_through_a_safe_file(tiny: Tiny, tmp_path: Path) -> None:
-    from facediff.data import Assets
-
     assets = tiny.assets().with_motion_scale(3.0)
     torch.save(assets.state(), tmp_path / "assets.pt")
     loaded = Assets.from_state(torch.load(tmp_path / "assets.pt", weights_only=True))
@@ -34,3 +40,34 @@ def test_assets_survive_a_round_trip_through_a_safe_file(tiny: Tiny, tmp_path: P
     assert loaded.regions["lips"].tolist() == list(range(12))
     assert loaded.faces is not None
     assert loaded.faces.shape == (15, 3)
+
+
+def test_speakers_take_their_own_colours_through_a_checkpoint_into_exports(tiny: Tiny, tmp_path: Path) -> None:
+    with np.load(Path(tiny.root) / "colours.npz") as stored:
+        own = dict(stored)
+    torch.save(tiny.assets().state(), tmp_path / "assets.pt")
+    state = torch.load(tmp_path / "assets.pt", weights_only=True)
+    assets = Assets.from_state(state)
+    assert assets.identity_colours["B"].dtype == torch.uint8
+    facts = facts_of(assets, "B")
+    assert np.array_equal(facts["colours"], own["B"])
+    assert facts_of(assets, "C")["colours"] is None  # without own colours those of the mesh file, which has none here
+    animation = Animation(name="b", vertices=facts["template"][None], **facts)
+    for suffix in (".glb", ".ply"):
+        write_animations(tmp_path / f"b{suffix}", [animation])
+    reader = Reader(tmp_path / "b.glb")
+    share = own["B"] / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    np.testing.assert_allclose(reader.values(reader.primitive.attributes.COLOR_0), linear, atol=1e-6)
+    mesh = trimesh.load(tmp_path / "b_ply" / "b_0000.ply", process=False)
+    assert np.array_equal(mesh.visual.vertex_colors[:, :3], own["B"])
+    # Checkpoints that were written before speakers had colours have no such entry.
+    del state["identity_colours"]
+    assert facts_of(Assets.from_state(state), "B")["colours"] is None
+
+
+def test_colours_that_do_not_fit_name_their_file(tmp_path: Path) -> None:
+    root = write_tiny(tmp_path / "tiny")
+    np.savez(root / "colours.npz", A=np.zeros((5, 3), np.uint8))
+    with pytest.raises(FaceDiffError, match="colours.npz"):
+        Tiny(root=str(root)).assets()

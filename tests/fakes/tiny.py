@@ -44,6 +44,8 @@ def write_tiny(root: Path, *, sentences: int = 7, seed: int = 0) -> Path:
             soundfile.write(root / "wav" / f"{clip}.wav", 0.5 * samples, 16000, subtype="PCM_16")
             rows.append(f"{clip},{subject},e{sentence:02d},{'calm' if sentence % 2 else 'lively'}")
     (root / "templates.pkl").write_bytes(pickle.dumps(templates))
+    own = {name: rng.integers(0, 256, (VERTICES, 3)).astype(np.uint8) for name in SEEN}
+    np.savez(root / "colours.npz", **own)
     (root / "clips.csv").write_text("\n".join(rows) + "\n")
     (root / "regions" / "lve.txt").write_text(", ".join(map(str, range(12))))
     (root / "regions" / "fdd.txt").write_text(",".join(map(str, range(12, 24))))

@@ -175,6 +175,7 @@ def test_folder_gives_what_the_model_gives(
     found = runtime.animate(speech, identity="B", seed=seed, expressivity=expressivity)
     assert largest(found.vertices, wanted.vertices.numpy()) < 1e-4
     assert found.metadata["identity"] == "B"
+    assert np.array_equal(found.colours, model.assets.identity_colours["B"])
     assert found.metadata["seed"] == str(seed)
 
 

@@ -108,7 +108,7 @@ function checkArrays(about, arrays) {
   if (arrays.noise) need("noise", [about.state, about.state], true);
   if (!arrays.faces) throw new Error("arrays.npz: has no triangles (faces), which a picture needs; export a model whose corpus has a mesh");
   need("faces", [null, 3], false);
-  if (arrays.colours) need("colours", [vertices, 3], null);
+  if (arrays.colours) need("colours", arrays.colours.shape.length === 3 ? [about.faces.length, vertices, 3] : [vertices, 3], null);
   if (arrays.inner_lip_pairs) need("inner_lip_pairs", [null, 2], null);
   for (const [name, { data }] of Object.entries(arrays)) {
     if (!name.startsWith("region_") && !["faces", "inner_lip_pairs"].includes(name)) continue;

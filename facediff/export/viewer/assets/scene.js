@@ -126,6 +126,12 @@ class Scene {
     }
   }
 
+  /** Give an animation other colours (3 V); it has some already. */
+  paint(number, colours) {
+    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.meshes[number].colours);
+    this.gl.bufferSubData(this.gl.ARRAY_BUFFER, 0, colours);
+  }
+
   /** Fit the canvas to its place on the page, with so many times the pixels of the screen on each axis. */
   resize(sharpness) {
     const scale = Math.min(devicePixelRatio || 1, SHARPEST) * sharpness;
@@ -261,7 +267,7 @@ function buildMesh(gl, face) {
   };
   mesh.positions = attribute(0, 3, gl.FLOAT, false, face.positions, gl.DYNAMIC_DRAW);
   mesh.normals = attribute(1, 3, gl.FLOAT, false, face.normals, gl.DYNAMIC_DRAW);
-  if (face.colours) attribute(2, 3, gl.UNSIGNED_BYTE, true, face.colours, gl.STATIC_DRAW);
+  if (face.colours) mesh.colours = attribute(2, 3, gl.UNSIGNED_BYTE, true, face.colours, gl.STATIC_DRAW);
   if (face.distances) mesh.distances = attribute(3, 1, gl.FLOAT, false, face.distances, gl.DYNAMIC_DRAW);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, (mesh.faces = gl.createBuffer()));
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.faces, gl.STATIC_DRAW);

@@ -43,9 +43,10 @@ class Stage {
     this.fresh = true;
   }
 
-  /** Another face of the same mesh. */
-  wear(template) {
+  /** Another face of the same mesh, with its colours. */
+  wear(template, colours) {
     this.face.template = template;
+    if (colours) this.scene.paint(0, (this.face.colours = colours));
     const { centre, extent } = boundsOf(template, this.face.faces);
     this.face.centre = centre;
     this.extent = extent;

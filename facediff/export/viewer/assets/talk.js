@@ -60,7 +60,7 @@ class TalkingPage {
     this.size = 3 * arrays.templates.shape[1];
     const faces = Uint32Array.from(arrays.faces.data);
     if (this.facts.inward) for (let i = 0; i < faces.length; i += 3) [faces[i], faces[i + 1]] = [faces[i + 1], faces[i]];
-    this.stage = new Stage(find("view"), find("stage"), { template: this.template(0), faces, colours: arrays.colours?.data ?? null }, about.frame_rate);
+    this.stage = new Stage(find("view"), find("stage"), { template: this.template(0), faces, colours: this.colours(0) }, about.frame_rate);
     this.stage.push(null);
     this.fill();
     this.say("open a recording, drop one here, or switch the microphone on");
@@ -73,6 +73,12 @@ class TalkingPage {
   /** A face at rest (3 V), in mm. */
   template(number) {
     return this.arrays.templates.data.slice(number * this.size, (number + 1) * this.size).map((value) => value * this.facts.millimetres);
+  }
+
+  /** The colours (3 V) of a face: its own, those of all faces, or null. */
+  colours(number) {
+    const { data, shape } = this.arrays.colours ?? { data: null, shape: [] };
+    return shape.length === 3 ? data.slice(number * this.size, (number + 1) * this.size) : data;
   }
 
   show(offsets) {
@@ -121,7 +127,8 @@ class TalkingPage {
   wear() {
     const name = find("identity").value;
     if (this.about.styles.includes(name)) find("style").value = name;
-    this.stage.wear(this.template(this.about.faces.indexOf(name)));
+    const number = this.about.faces.indexOf(name);
+    this.stage.wear(this.template(number), this.colours(number));
   }
 
   /** What the reader has chosen. */
@@ -441,7 +448,7 @@ class TalkingPage {
       textEntry("about", JSON.stringify(words)),
       ["speech", "<f4", [animated.samples.length], [bytesOf(animated.samples)]],
     ];
-    if (arrays.colours) entries.push(["colours", "|u1", arrays.colours.shape, [bytesOf(arrays.colours.data)]]);
+    if (arrays.colours) entries.push(["colours", "|u1", [size / 3, 3], [bytesOf(this.colours(face))]]);
     for (const [name, array] of Object.entries(arrays)) {
       if (name === "inner_lip_pairs" || name.startsWith("region_")) entries.push([name, "<i4", array.shape, indices(array)]);
     }
