@@ -25,6 +25,7 @@ class's docstring has the formula, its source, its unit, and what about it is a 
 - several samples: :class:`MeanEstimateError`, :class:`CoverageError`, :class:`SampleDiversity`
 - does it generate: :class:`MotionLiveliness`, :class:`SpectrumDistance`, :class:`SpreadErrorRatio`,
   :class:`EnergyScore`
+- does it shiver: :class:`FrameStep`, :class:`DifferenceRatio`
 - the eyes: :class:`BlinkRate`, :class:`BlinkRateRatio`
 - several identities: :class:`IdentityDiversity`, :class:`StyleRetrievalAccuracy`, :class:`NearestSpeakerAccuracy`
 - speed: :class:`RealTimeFactor`
@@ -54,12 +55,16 @@ from facediff.metrics.eyes import BlinkRate as BlinkRate
 from facediff.metrics.eyes import BlinkRateRatio as BlinkRateRatio
 from facediff.metrics.eyes import blink_rate as blink_rate
 from facediff.metrics.eyes import blink_rate_ratio as blink_rate_ratio
+from facediff.metrics.generation import DifferenceRatio as DifferenceRatio
 from facediff.metrics.generation import EnergyScore as EnergyScore
+from facediff.metrics.generation import FrameStep as FrameStep
 from facediff.metrics.generation import MotionLiveliness as MotionLiveliness
 from facediff.metrics.generation import RatioMetric as RatioMetric
 from facediff.metrics.generation import SpectrumDistance as SpectrumDistance
 from facediff.metrics.generation import SpreadErrorRatio as SpreadErrorRatio
+from facediff.metrics.generation import difference_ratio as difference_ratio
 from facediff.metrics.generation import energy_score as energy_score
+from facediff.metrics.generation import frame_step as frame_step
 from facediff.metrics.generation import motion_liveliness as motion_liveliness
 from facediff.metrics.generation import spectrum_distance as spectrum_distance
 from facediff.metrics.generation import spread_error_ratio as spread_error_ratio

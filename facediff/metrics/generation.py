@@ -1,8 +1,8 @@
 """Does a model generate? How lively motion is, whether samples scatter as much as they err, and a proper score of both.
 
 A model that predicts the mean of all that speech leaves open scores well in every distance from the truth, and moves
-the upper face hardly at all. These metrics see that. All but :class:`MotionLiveliness` and :class:`SpectrumDistance`
-compare several samples of each sequence with the one recorded truth.
+the upper face hardly at all. These metrics see that. Those of
+calibration compare several samples of each sequence with the one recorded truth.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class RatioMetric(SequenceMetric):
         self._latest_parts: list[Tensor] = []
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
-        """Numerator and denominator of one sequence, float64 scalars."""
+        """Numerator and denominator of one sequence, float64 scalars, or those of several ratios."""
         raise NotImplementedError
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The ratio of one sequence; infinity where its denominator is zero."""
         above, below = self.clip_parts(clip)
         self._latest_parts.append(torch.stack([above, below]))
-        return above / below
+        return (above / below).prod()
 
     def add(self, clips: Clips) -> None:
         """Check aligned sequences and add their parts to the sums; nothing is added where one is refused."""
@@ -75,7 +75,7 @@ class RatioMetric(SequenceMetric):
         """
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
-        if float(self.parts[1]) == 0:
+        if bool((self.parts[1] == 0).any()):
             self.leave_synchronised_state()
             raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
         return self.finish(self.parts[0] / self.parts[1])
@@ -110,6 +110,85 @@ class MotionLiveliness(RatioMetric):
     def finish(self, ratio: Tensor) -> Tensor:
         """A ratio of variances becomes one of deviations."""
         return ratio.sqrt()
+
+
+def _differences(motion: Tensor) -> Tensor:
+    """Summed squares of the first and the second differences over time of one sequence, (2,)."""
+    return torch.stack([torch.diff(motion, n, dim=0).square().sum() for n in (1, 2)])
+
+
+@metric.register("frame_step")
+class FrameStep(RatioMetric):
+    r"""Frame step: how far a region moves from a frame to the next, as a share of how far the truth's does.
+
+    √(Σ ‖x[t+1] − x[t]‖² / Σ ‖y[t+1] − y[t]‖²), over frames, vertices and sequences. 1 is as quick as the truth.
+
+    >>> import torch
+    >>> truth = torch.randn(9, 4, 3, generator=torch.Generator().manual_seed(0))
+    >>> round(frame_step(0.5 * truth, truth).item(), 6)
+    0.5
+    """
+
+    divides_by = "the truth does not move in any sequence"
+
+    def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
+        definition = "root mean square of the prediction's steps from frame to frame, over that of the truth, {region}"
+        super().__init__(region, definition=definition, **options)
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Summed squared steps of each side."""
+        prediction, truth = (_differences(_of(side, self.indices))[0] for side in (clip.prediction, clip.truth))
+        return prediction, truth
+
+    def finish(self, ratio: Tensor) -> Tensor:
+        """A ratio of squares becomes one of lengths."""
+        return ratio.sqrt()
+
+
+@metric.register("difference_ratio")
+class DifferenceRatio(RatioMetric):
+    r"""Difference ratio: how much a region shivers, the size of its second over that of its first differences in time.
+
+    √(Σ ‖x[t+1] − 2x[t] + x[t−1]‖² / Σ ‖x[t+1] − x[t]‖²), over frames, vertices and sequences: √3 for noise that is
+    independent from frame to frame, near 0 for slow movement. 0.7 is usual for an upper face that blinks.
+
+    Args:
+        of: ``"share"``, the prediction's as a share of the truth's; or the ``"prediction"`` or ``"truth"`` alone.
+
+    >>> import torch
+    >>> noise = torch.randn(4000, 4, 3, generator=torch.Generator().manual_seed(0))
+    >>> round(difference_ratio(noise, noise, of="prediction").item(), 2)
+    1.73
+    """
+
+    divides_by = "the prediction or the truth does not move in any sequence"
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        of: Literal["share", "prediction", "truth"] = "share",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Literal["share", "prediction", "truth"])
+        definition = f"size of second over first differences in time, {of}, over {{region}}"
+        super().__init__(region, definition=definition, **options)
+        self.of = of
+        self.add_state("parts", torch.zeros(2, 2, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Numerators and denominators of the prediction's ratio, and of one over the truth's."""
+        prediction, truth = (_differences(_of(side, self.indices)) for side in (clip.prediction, clip.truth))
+        one = torch.ones_like(truth)
+        first, second = one if self.of == "truth" else prediction
+        true_first, true_second = truth if self.of != "prediction" else one
+        if self.of == "truth":
+            true_first, true_second = true_second, true_first
+        return torch.stack([second, true_first]), torch.stack([first, true_second])
+
+    def finish(self, ratio: Tensor) -> Tensor:
+        """The product of both, from squares to lengths."""
+        return ratio.prod().sqrt()
 
 
 @metric.register("spectrum_distance")
@@ -203,10 +282,13 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
     Σ mean_{i<j} d(x_i, x_j) / Σ mean_i d(x_i, y), with d(a, b) = Σ_t mean_v ‖a_v[t] − b_v[t]‖₂ and sums over sequences.
     If samples are drawn from the distribution that the truth was drawn from, the truth is one more sample, and the
     ratio is 1: the model is calibrated. 0 is a model without any choice, below 1 one that is too sure, above 1 one that
-    scatters more than it knows.
+    scatters more than it knows. Frames in which little happens rule it, since there are many; with ``squared`` it is
+    (1 + 1/N) Σ σ²(x) / Σ d²(mean x, y), the variance of N samples over the squared error of their mean, which is ruled
+    by large movements such as blinks.
 
     Args:
         n_samples: how many samples there are of each sequence; other numbers are refused.
+        squared: compare variances and not distances.
 
     >>> import torch
     >>> random = torch.Generator().manual_seed(0)
@@ -219,21 +301,32 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
     divides_by = "every sample equals the truth"
 
     def __init__(
-        self, region: RegionLike | None = None, *, n_samples: int = 4, **options: Unpack[SequenceOptions]
+        self,
+        region: RegionLike | None = None,
+        *,
+        n_samples: int = 4,
+        squared: bool = False,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        definition = (
-            f"of {n_samples} samples, mean distance between two of them, over that between one and the truth, over "
-        )
-        super().__init__(n_samples=n_samples, region=region, definition=f"{definition}{{region}}", **options)
+        compared = "mean distance between two of them, over that between one and the truth"
+        if squared:
+            compared = "their variance, over the squared error of their mean, times (1 + 1/n)"
+        definition = f"of {n_samples} samples, {compared}, over {{region}}"
+        super().__init__(n_samples=n_samples, region=region, definition=definition, **options)
+        self.squared = squared
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Distances between samples, and between samples and truth, summed over frames."""
-        several, error = clip.prediction, ErrorOf(self.indices, "mean", squared=False)
+        several, error = clip.prediction, ErrorOf(self.indices, "mean", squared=self.squared)
 
         def apart(one: Tensor, other: Tensor) -> Tensor:
             return one_pass(one, other, errors=[error])[0][0] * clip.frames
 
         between = [apart(several[:, i], several[:, j]) for i, j in combinations(range(several.shape[1]), 2)]
+        if self.squared:
+            # Half of the mean squared distance of two samples is their variance, without bias.
+            share = (1 + 1 / several.shape[1]) / 2
+            return share * torch.stack(between).mean(), apart(several.mean(1), clip.truth)
         off = [apart(sample, clip.truth) for sample in several.unbind(1)]
         return torch.stack(between).mean(), torch.stack(off).mean()
 
@@ -303,3 +396,5 @@ motion_liveliness = functional(MotionLiveliness)
 spread_error_ratio = functional(SpreadErrorRatio)
 energy_score = functional(EnergyScore)
 spectrum_distance = functional(SpectrumDistance)
+frame_step = functional(FrameStep)
+difference_ratio = functional(DifferenceRatio)

@@ -19,8 +19,10 @@ from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.metrics import (
     Context,
+    DifferenceRatio,
     EnergyScore,
     EyelidPairs,
+    FrameStep,
     LipPairs,
     ProtocolMetrics,
     Region,
@@ -94,7 +96,7 @@ METHODS = ("model", "still", "mean_face", "shuffled")
 training clips; the model given another sentence's speech."""
 
 ENERGY_REGIONS = ("lips", "upper_face")
-"""Regions by whose energy scores the best checkpoint is chosen."""
+"""Regions by whose energy scores the best checkpoint is chosen, and whose smoothness is scored."""
 
 OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
@@ -196,9 +198,20 @@ class Evaluation:
                     for request in self.requests
                     if method == "model" or not OF_THE_MODEL & set(request.needs)
                 }
+                | self._smoothness(regions, device)
                 for method in methods
             }
             for split in self.splits
+        }
+
+    def _smoothness(self, regions: Mapping[str, Region], device: torch.device) -> dict[str, Metric]:
+        """Difference ratio and frame step by region, of tests."""
+        if self.splits == ["val"]:
+            return {}
+        return {
+            f"{name}_{region}": metric(regions[region]).to(device)
+            for name, metric in (("difference_ratio", DifferenceRatio), ("frame_step", FrameStep))
+            for region in ENERGY_REGIONS
         }
 
     def _prepare_energies(self, model: Inference, regions: Mapping[str, Region], device: torch.device) -> None:
@@ -348,7 +361,7 @@ class Evaluation:
         metrics = self.metrics[split][method].to(motion.device)
         metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
         scores: dict[str, Metric] = {**metrics.scores()}
-        inputs = self._inputs(motion, batch) | dict(inputs or {}) if self.requests else {}
+        inputs = self._inputs(motion, batch) | dict(inputs or {}) if self.chosen[split][method] else {}
         for name, metric in self.chosen[split][method].items():
             own_inputs = inputs
             if "samples" in inputs and hasattr(metric, "n_samples"):

@@ -343,6 +343,19 @@ def liveliness(corpus: Corpus, *, region: Sequence[int]) -> float:
     return float(np.sqrt(sum(moved(p) for p, _ in both) / sum(moved(g) for _, g in both)))
 
 
+def smoothness(corpus: Corpus, *, region: Sequence[int], of: str) -> float:
+    """Frame step or difference ratio, by NumPy's differences."""
+
+    def size(side: int, order: int) -> float:
+        motions = [
+            sides(corpus, place)[side][:, list(region)].astype(np.float64) for place in range(len(corpus.truths))
+        ]
+        return float(np.sqrt(sum((np.diff(x, order, axis=0) ** 2).sum() for x in motions)))
+
+    step, ratio = size(0, 1) / size(1, 1), [size(side, 2) / size(side, 1) for side in (0, 1)]
+    return {"step": step, "share": ratio[0] / ratio[1], "prediction": ratio[0], "truth": ratio[1]}[of]
+
+
 def decibels_off(corpus: Corpus, *, octaves: int, region: Sequence[int]) -> float:
     """By the formula, with a sum over frames for every frequency."""
     powers = np.zeros((2, octaves))
@@ -370,6 +383,16 @@ def spread_over_error(corpus: Corpus, *, region: Sequence[int]) -> float:
         spread += np.mean([np.linalg.norm(x[a] - x[b], axis=-1).mean(1).sum() for a, b in pairs])
         error += np.mean([np.linalg.norm(one - g, axis=-1).mean(1).sum() for one in x])
     return spread / error
+
+
+def variance_over_error(corpus: Corpus, *, region: Sequence[int]) -> float:
+    variance = error = 0.0
+    for place in range(len(corpus.truths)):
+        x = several(corpus, place).astype(np.float64)[:, :, list(region)]
+        g = corpus.truths[place].astype(np.float64)[:, list(region)]
+        variance += x.var(0, ddof=1).sum(-1).mean(1).sum()
+        error += ((x.mean(0) - g) ** 2).sum(-1).mean(1).sum()
+    return (1 + 1 / SAMPLES) * variance / error
 
 
 def energy(corpus: Corpus, place: int, *, of: str, region: Sequence[int]) -> tuple[float, float]:
@@ -481,6 +504,15 @@ def _cases() -> list[Case]:
         expected = partial(liveliness, region=region or range(40))
         word, only = "region" if region else "", {"n_samples": SAMPLES}
         add(fm.MotionLiveliness, twin, (region,), {}, pair_batch, expected, word)
+        twin, expected = (
+            partial(fm.frame_step, region=region),
+            partial(smoothness, region=region or range(40), of="step"),
+        )
+        add(fm.FrameStep, twin, (region,), {}, pair_batch, expected, word)
+        for side in ("share", "prediction", "truth"):
+            twin = partial(fm.difference_ratio, region=region, of=side)
+            expected = partial(smoothness, region=region or range(40), of=side)
+            add(fm.DifferenceRatio, twin, (region,), {"of": side}, pair_batch, expected, word)
         for octaves in (1, 4):
             twin = partial(fm.spectrum_distance, region=region, octaves=octaves)
             expected = partial(decibels_off, octaves=octaves, region=region or range(40))
@@ -488,6 +520,9 @@ def _cases() -> list[Case]:
         twin = partial(fm.spread_error_ratio, region=region)
         expected = partial(spread_over_error, region=region or range(40))
         add(fm.SpreadErrorRatio, twin, (region,), {}, samples_batch, expected, word, only)
+        twin = partial(fm.spread_error_ratio, region=region, squared=True)
+        expected = partial(variance_over_error, region=region or range(40))
+        add(fm.SpreadErrorRatio, twin, (region,), {"squared": True}, samples_batch, expected, word, only)
         for of, pooling in product(("frames", "sequences"), poolings):
             options = {"of": of, "pooling": pooling}
             twin = partial(fm.energy_score, region=region, **options)

@@ -64,6 +64,15 @@ def test_one_still_truth_does_not_rule_the_liveliness() -> None:
     assert metric.compute().item() == pytest.approx(2.0)
 
 
+def test_white_noise_shivers_by_the_root_of_three_and_a_calibrated_model_has_the_variance_of_its_error() -> None:
+    noise = torch.randn(6, 3000, 4, 3, generator=torch.Generator().manual_seed(2))
+    assert fm.difference_ratio(noise[0], noise[0], of="prediction").item() == pytest.approx(3**0.5, abs=0.02)
+    assert fm.difference_ratio(noise[0], noise[1].cumsum(0)).item() == pytest.approx((3 / 2) ** 0.5, abs=0.02)
+    assert fm.spread_error_ratio(noise[:4], noise[4], squared=True).item() == pytest.approx(1.0, abs=0.03)
+    with pytest.raises(ValueError, match="DifferenceRatio"):
+        fm.difference_ratio(torch.zeros(5, 3, 3), noise[0, :5, :3])
+
+
 def test_liveliness_without_any_motion_of_the_truth_is_refused() -> None:
     with pytest.raises(ValueError, match="MotionLiveliness"):
         fm.motion_liveliness(torch.rand(5, 3, 3), torch.zeros(5, 3, 3))
