@@ -33,7 +33,7 @@ from facediff.data.dataset import (
     ReferencePolicy,
     ResumableLoader,
 )
-from facediff.data.measuring import measure_components, measure_scale
+from facediff.data.measuring import measure_components, measure_scale, measure_windows
 from facediff.data.packed.stores import address_of, is_packed
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.registry import defaults, keeps_arguments, plain
@@ -483,6 +483,18 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             first.
         """
         return measure_components(self.corpus, self.clips("train"), self.trainer, count, weights)
+
+    def covariance_over_time(self, project: Callable[[Tensor], Tensor], frames: int) -> Tensor:
+        """Covariance of projections of the training motion over the frames of a window, (K, frames, frames).
+
+        Args:
+            project: from motion in the corpus's unit (1, T, V, 3) to the projections (1, T, K), linear.
+            frames: length of the window.
+
+        Raises:
+            FaceDiffError: if no training clip is that long.
+        """
+        return measure_windows(self.corpus, self.clips("train"), self.trainer, project, frames)
 
     # The loaders.
 

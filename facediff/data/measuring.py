@@ -25,6 +25,9 @@ from facediff.utils.files import cache_dir
 FRAMES = 16
 """Frames of each training clip, evenly spread, from which size and principal components of motion are measured."""
 
+WINDOWS = 4
+"""Windows, end to end, that are read of each training clip for its covariance over time."""
+
 PRINCIPAL_NUMBERS = 30_000_000
 """Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
 
@@ -81,6 +84,42 @@ def measure_components(
     what = ("components", FRAMES, PRINCIPAL_NUMBERS, count, weighted)
     components = torch.from_numpy(np.array(_measured(corpus, clips, trainer, what, measure)))
     return components[0], components[1:]
+
+
+def measure_windows(
+    corpus: Corpus,
+    clips: Sequence[Clip],
+    trainer: Trainer | None,
+    project: Callable[[Tensor], Tensor],
+    width: int,
+) -> Tensor:
+    """Covariance (K, width, width) of K projections of the motion over the frames of a window, about zero.
+
+    Over windows and not from autocovariances: those of clips of a few seconds leak a hundredth of the power of the slow
+    movement into the highest frequencies, more than there is.
+    """
+    probe = torch.randn(1, 2, corpus.n_vertices, 3, generator=torch.Generator().manual_seed(0))
+    projected = hashlib.sha256(project(probe).detach().cpu().numpy().tobytes()).hexdigest()
+
+    def measure() -> npt.NDArray[np.float64]:
+        total, count = torch.zeros((), dtype=torch.float64), 0
+        for clip in clips:
+            # From the middle of long clips: a part of each tells as much as all of it.
+            frames = corpus.frames(clip)
+            first = max(0, (frames - WINDOWS * width) // 2)
+            motion = corpus.read_motion(clip, first, min(frames, WINDOWS * width))
+            windows = project(motion[None].float())[0].double().unfold(0, width, 1) if frames >= width else motion[:0]
+            if len(windows):
+                total = total + torch.einsum("nki,nkj->kij", windows, windows)
+                count += len(windows)
+        if not count:
+            raise FaceDiffError(
+                f"{corpus.root}: no training clip lasts {width} frames; choose a smaller motion_space.prior_frames"
+            )
+        return (total / count).numpy()
+
+    what = ("windows", WINDOWS, width, projected)
+    return torch.from_numpy(np.array(_measured(corpus, clips, trainer, what, measure)))
 
 
 def _spread_frames(corpus: Corpus, clips: Sequence[Clip], count: int) -> Iterator[Tensor]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
@@ -250,6 +250,7 @@ class PreconditionedDenoiser(ConditionalDenoiser):
         network: predicts that.
         conditions: as :class:`ConditionalDenoiser` takes them.
         preconditioning: the scales around the network.
+        mask: True on valid frames, one row for each row of the state.
         blend: changes the predictions of every step.
         shares: as :class:`ConditionalDenoiser` takes them.
     """
@@ -259,11 +260,13 @@ class PreconditionedDenoiser(ConditionalDenoiser):
         network: DenoisingNetwork,
         conditions: object,
         preconditioning: Preconditioning,
+        mask: Bool[Tensor, "batch frames"],
         blend: Blend = unchanged,
         shares: Sequence[float] = (1.0,),
     ) -> None:
         super().__init__(network, conditions, None, blend, shares)
         self.preconditioning = preconditioning
+        self.mask = mask
 
     def denoise(self, state: State, step: Step) -> State:
         """M̂⁰."""
@@ -272,7 +275,7 @@ class PreconditionedDenoiser(ConditionalDenoiser):
         scaled = self.preconditioning.into[steps][:, None] * state
         features = self.features(self.network.embed(scaled), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
-        return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps))
+        return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps, self.mask))
 
 
 # The products of the two maps.

@@ -17,9 +17,10 @@ from collections.abc import Mapping
 from typing import Annotated, Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from facediff.errors import ArgumentError
 from facediff.models.layers import Share
 from facediff.models.principal import SMALLEST, PrincipalComponents
 from facediff.models.samplers import Steps
@@ -33,6 +34,7 @@ Coordinates = Float[Tensor, "batch frames coordinates"]
 """A frame as the numbers that are noised."""
 
 RegionWeight = Annotated[float, Range(1e-3, 1e3)]
+PriorFrames = Annotated[int, Range(1, 99)]
 
 
 class MotionSpace(nn.Module, ABC):
@@ -41,10 +43,12 @@ class MotionSpace(nn.Module, ABC):
     Attributes:
         coordinates: numbers in a frame.
         preconditioning: the scales around the network; None if it predicts clean motion itself.
+        prior_frames: length of the windows whose covariance over time :meth:`fit` wants; 1 for none.
     """
 
     coordinates: int
     preconditioning: Preconditioning | None
+    prior_frames: int = 1
 
     @property
     def region_weights(self) -> Mapping[str, float]:
@@ -55,11 +59,14 @@ class MotionSpace(nn.Module, ABC):
         """Variances of principal components as the noise sees them, from those of the motion."""
         return variances
 
-    def fit(self, signal: Float[Tensor, " steps"]) -> None:  # noqa: B027
+    def fit(  # noqa: B027
+        self, signal: Float[Tensor, " steps"], covariance: Float[Tensor, "components window window"] | None = None
+    ) -> None:
         """Take over the noise process, once the principal components are known.
 
         Args:
             signal: ᾱ of every step.
+            covariance: of the components over the frames of a window, where the space asks for it.
         """
 
     @abstractmethod
@@ -119,6 +126,9 @@ class ComponentMotion(MotionSpace):
         upper_face_weight: how much more a movement of the upper face counts than another of the same size, in the
             components and in the losses.
         lips_weight: the same for the lips.
+        prior_frames: length W of the windows, in frames, in which the preconditioning knows how each component moves
+            over time, measured on the training split; odd. 1 takes every frame by itself, so that what a network leaves
+            of the noise is jitter.
     """
 
     sizes: Tensor
@@ -132,6 +142,7 @@ class ComponentMotion(MotionSpace):
         whitening: Share = 0.5,
         upper_face_weight: RegionWeight = 1.0,
         lips_weight: RegionWeight = 1.0,
+        prior_frames: PriorFrames = 1,
     ) -> None:
         super().__init__()
         self.coordinates = count
@@ -139,7 +150,14 @@ class ComponentMotion(MotionSpace):
         self._region_weights = {"upper_face": upper_face_weight, "lips": lips_weight}
         self.components = PrincipalComponents(n_vertices, count)
         self.register_buffer("sizes", torch.ones(count))
-        self.preconditioning: Preconditioning = Preconditioning(steps, count)
+        if prior_frames % 2 == 0:
+            raise ArgumentError(
+                {"prior_frames": prior_frames}, "expected an odd number, since a frame is in the middle"
+            )
+        self.prior_frames = prior_frames
+        self.preconditioning: Preconditioning = (
+            Preconditioning(steps, count) if prior_frames == 1 else TemporalPreconditioning(steps, count, prior_frames)
+        )
 
     @property
     def region_weights(self) -> Mapping[str, float]:
@@ -156,13 +174,20 @@ class ComponentMotion(MotionSpace):
         share = (deviations / deviations[0]).clamp_min(SMALLEST)
         return deviations[0] * share ** (1 - self.whitening)
 
-    def fit(self, signal: Float[Tensor, " steps"]) -> None:
-        """Precondition the network by each component's own variance."""
+    def fit(
+        self, signal: Float[Tensor, " steps"], covariance: Float[Tensor, "components window window"] | None = None
+    ) -> None:
+        """Precondition the network by each component's own variance, or covariance over time."""
         deviations = self.components.deviations
         self.sizes.copy_(self._sizes(deviations))
         # The importance undoes the whitening in the loss: an error of one unit in the noised coordinate is deviation /
         # size on the vertices, however large the component was made for the noise.
-        self.preconditioning.fit(signal, self.sizes.square(), (deviations / self.sizes).square())
+        importance = (deviations / self.sizes).square()
+        if isinstance(self.preconditioning, TemporalPreconditioning) and covariance is not None:
+            covariance = covariance.to(self.sizes) * self.sizes.square()[:, None, None]
+            self.preconditioning.fit_covariance(signal, covariance, importance)
+        else:
+            self.preconditioning.fit(signal, self.sizes.square(), importance)
 
     def encode(self, motion: Offsets) -> Coordinates:
         """Components of weighted offsets from the mean, in the sizes that are noised."""
@@ -228,8 +253,114 @@ class Preconditioning(nn.Module):
         # such steps would otherwise not be trained.
         self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
 
-    def clean(self, noisy: Coordinates, features: Coordinates, step: Int[Tensor, " batch"]) -> Coordinates:
-        """The prediction of clean motion from the noisy one and the network's output."""
+    def clean(
+        self,
+        noisy: Coordinates,
+        features: Coordinates,
+        step: Int[Tensor, " batch"],
+        mask: Bool[Tensor, "batch frames"],  # noqa: ARG002 - every frame by itself
+    ) -> Coordinates:
+        """The prediction of clean motion from the noisy one and the network's output; ``mask`` is True on frames."""
         # c_skip and c_out of Karras et al. (2022, eq. 7), one for each component and step. At the clean end skip is 1
         # and out 0, so that a network's errors no longer reach the sample.
         return self.skip[step][:, None] * noisy + self.out[step][:, None] * features
+
+
+class TemporalPreconditioning(Preconditioning):
+    """The same for motion whose covariance over time is known: the skip is a smoother, and so is the output's scale.
+
+    With the covariance C = V Λ Vᵀ of a coordinate in a window of W frames, noised window y, the posterior mean is
+    V [√ᾱ Λ / (ᾱΛ + 1 − ᾱ)] Vᵀ y, and the posterior covariance V [Λ (1 − ᾱ) / (ᾱΛ + 1 − ᾱ)] Vᵀ. The prediction is the
+    mean plus the symmetric root of the covariance times the network's output: what the network errs from frame to
+    frame comes out as small as motion is at that frequency. Without any network it is the posterior mean of Gaussian
+    motion with this covariance, and so the exact sampler of it.
+
+    A frame lies in the middle of its window, and nearer to an end only where the clip or the window of a stream ends.
+
+    Args:
+        steps: of the noise process.
+        coordinates: numbers in a frame.
+        frames: W, odd.
+
+    Attributes:
+        vectors: V of every coordinate, (coordinates, W, W).
+        variances: Λ, (coordinates, W).
+        signal: ᾱ of every step.
+    """
+
+    vectors: Tensor
+    variances: Tensor
+    signal: Tensor
+
+    def __init__(self, steps: int, coordinates: int, frames: int) -> None:
+        super().__init__(steps, coordinates)
+        self.frames = frames
+        self.register_buffer("vectors", torch.zeros(coordinates, frames, frames))
+        self.register_buffer("variances", torch.zeros(coordinates, frames))
+        self.register_buffer("signal", torch.zeros(steps))
+
+    def fit_covariance(
+        self,
+        signal: Float[Tensor, " steps"],
+        covariance: Float[Tensor, "coordinates window window"],
+        importance: Float[Tensor, " coordinates"],
+    ) -> None:
+        """Fill the tables for motion of given covariances over time.
+
+        Args:
+            signal: as :meth:`fit` takes it.
+            covariance: C of every coordinate.
+            importance: as :meth:`fit` takes it.
+        """
+        wide = covariance.cpu().double()
+        variances, vectors = torch.linalg.eigh((wide + wide.flip(1, 2)) / 2)  # motion runs both ways alike
+        middle = self.frames // 2
+        self.fit(signal, wide[:, middle, middle], importance)
+        variances = variances.clamp_min(SMALLEST**2 * variances.amax(1, keepdim=True))
+        self.vectors.copy_(vectors)
+        self.variances.copy_(variances)
+        self.signal.copy_(signal)
+        kept, counted = signal.cpu().double()[:, None, None], importance.cpu().double()
+        left = variances * (1 - kept) / (kept * variances + 1 - kept)
+        left = (vectors[:, middle].square() * left).sum(2)
+        self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
+
+    def clean(
+        self,
+        noisy: Coordinates,
+        features: Coordinates,
+        step: Int[Tensor, " batch"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Coordinates:
+        """The prediction of clean motion from the noisy one and the network's output."""
+        kept, own = self.signal[step][:, None, None], self.variances
+        total = kept * own + 1 - kept
+        mean = self._filtered(noisy, kept.sqrt() * own / total, mask)
+        return mean + self._filtered(features, (own * (1 - kept) / total).sqrt(), mask)
+
+    def _filtered(
+        self,
+        values: Coordinates,
+        gains: Float[Tensor, "batch coordinates window"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Coordinates:
+        """The rows of V diag(gains) Vᵀ, each times the window of its frame."""
+        width, half, count = self.frames, self.frames // 2, values.shape[1]
+        rows = (self.vectors * gains[:, :, None]) @ self.vectors.transpose(1, 2)  # batch, coordinates, row, window
+        values = nn.functional.pad(values * mask[..., None], (0, 0, half, width)).transpose(1, 2)
+        inner = torch.einsum("bctw,bcw->btc", values.unfold(2, width, 1)[:, :, :count], rows[:, :, half])
+        # The first and the last frames are in the middle of no window: they take other rows of the outermost ones.
+        place, length = torch.arange(count, device=mask.device), mask.sum(1)[:, None]
+        start = (length - width).clamp_min(0)
+        index = (start + half + torch.arange(width, device=mask.device))[:, None].expand(-1, values.shape[1], -1)
+        outermost = [
+            torch.einsum("bcw,bcrw->brc", window, rows).gather(
+                1, row[..., None].expand(*values.shape[:1], -1, values.shape[1])
+            )
+            for window, row in (
+                (values[..., half : half + width], place.clamp_max(width - 1)[None]),
+                (values.gather(2, index), (place - start).clamp(0, width - 1)),
+            )
+        ]
+        filtered = torch.where((place < half)[:, None], outermost[0], inner)
+        return torch.where((place >= length - half)[..., None], outermost[1], filtered)

@@ -17,12 +17,13 @@ from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.losses import preconditioned_losses
-from facediff.models.motion_space import ComponentMotion, Preconditioning
+from facediff.models.motion_space import ComponentMotion, Preconditioning, TemporalPreconditioning
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler, half_hidden
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., Any]
 VARIANCES = torch.tensor([9.0, 1.0, 0.04])
+ALL = torch.ones(1, 1000, dtype=torch.bool)
 
 
 def motion(frames: int = 300, vertices: int = 6, rank: int = 5) -> Tensor:
@@ -134,7 +135,7 @@ def test_a_silent_network_gives_the_posterior_mean_of_gaussian_motion(step: int)
     # Regression of x on y = √ᾱ x + √(1 − ᾱ) ε: cov(x, y) / var(y); what is left is var(x) − cov² / var(y).
     covariance, variance = np.sqrt(kept) * own, kept * own + 1 - kept
     scales = gaussian(process)
-    found = scales.clean(torch.from_numpy(noisy).float(), torch.zeros(1, 1, 3), torch.tensor([step]))
+    found = scales.clean(torch.from_numpy(noisy).float(), torch.zeros(1, 1, 3), torch.tensor([step]), ALL[:, :1])
     np.testing.assert_allclose(found.numpy(), covariance / variance * noisy, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(scales.out[step].numpy() ** 2, own - covariance**2 / variance, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(scales.into[step].numpy() ** 2 * variance, 1, rtol=1e-4)
@@ -161,11 +162,81 @@ def test_sampling_with_a_silent_network_gives_gaussian_motion(
         return torch.randn(like.shape, generator=random)
 
     def denoise(noisy: Tensor, step: int) -> Tensor:
-        return scales.clean(noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step))
+        return scales.clean(noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step), ALL.expand(len(noisy), -1))
 
     sample = sampler(process).run(denoise, noise(torch.empty(20, 1000, 3)), noise=noise)
     deviations = sample.flatten(0, 1).std(0) / VARIANCES.sqrt()
     assert (deviations - 1).abs().max() < tolerance
+
+
+SLOWNESS = torch.tensor([3.0, 1.0, 6.0])
+
+
+def over_time(lags: Tensor) -> Tensor:
+    """Covariance (3, …) of smooth stationary motion at some lags: bells over a little that is white."""
+    bells = torch.exp(-((lags.double() / SLOWNESS.double().view(-1, *[1] * lags.dim())) ** 2) / 2)
+    return VARIANCES.double().view(-1, *[1] * lags.dim()) * (0.97 * bells + 0.03 * (lags == 0))
+
+
+def smooth(process: NoiseProcess, frames: int) -> TemporalPreconditioning:
+    scales = TemporalPreconditioning(process.steps, len(VARIANCES), frames)
+    places = torch.arange(frames)
+    scales.fit_covariance(process.signal, over_time(places[:, None] - places), torch.ones(3))
+    return scales
+
+
+@pytest.mark.parametrize("step", [0, 300, 999])
+def test_a_silent_network_smooths_by_the_frames_of_its_window(step: int) -> None:
+    """The posterior mean by a linear system, in the middle and at both ends; padding changes nothing."""
+    process, random = NoiseProcess(), np.random.default_rng(1)
+    scales, kept = smooth(process, 7), float(process.signal.double()[step])
+    noisy = torch.from_numpy(random.standard_normal((2, 15, 3))).float()
+    mask = torch.arange(15) < torch.tensor([[15], [9]])
+    steps, silence = torch.tensor([step, step]), torch.zeros(2, 15, 3)
+    clean = scales.clean(noisy, silence, steps, mask)
+    places = torch.arange(7)
+    covariance = over_time(places[:, None] - places).numpy()
+    for clip, length in enumerate((15, 9)):
+        for frame, start in ((0, 0), (2, 0), (5, 2), (length - 2, length - 7), (length - 1, length - 7)):
+            window = noisy[clip, start : start + 7].double().numpy()
+            for k, own in enumerate(covariance):
+                gain = np.linalg.solve(kept * own + (1 - kept) * np.eye(7), np.sqrt(kept) * own[frame - start])
+                assert float(clean[clip, frame, k]) == pytest.approx(gain @ window[:, k], rel=1e-3, abs=1e-5)
+    features = torch.randn(2, 15, 3)
+    alone = scales.clean(noisy[1:, :9], features[1:, :9], steps[1:], mask[1:, :9])
+    torch.testing.assert_close(scales.clean(noisy, features, steps, mask)[1:, :9], alone)
+    # White features leave what the posterior leaves open.
+    many = scales.clean(torch.zeros(1, 100_000, 3), torch.randn(1, 100_000, 3), steps[:1], torch.ones(1, 100_000) > 0)
+    for k, own in enumerate(covariance):
+        total = kept * own + (1 - kept) * np.eye(7)
+        left = own[3, 3] - kept * own[3] @ np.linalg.solve(total, own[3])
+        assert float(many[0, :, k].var()) == pytest.approx(left, rel=0.03, abs=1e-6)
+    assert scales.clean(noisy[:, :3], silence[:, :3], steps, mask[:, :3]).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "sampler", [lambda p: DdpmSampler(process=p, steps=100), lambda p: DpmSolverSampler(process=p, steps=50)]
+)
+def test_sampling_with_a_silent_network_gives_motion_of_the_covariance_over_time(
+    sampler: Callable[[NoiseProcess], Sampler],
+) -> None:
+    process = NoiseProcess()
+    scales, random = smooth(process, 25), torch.Generator().manual_seed(0)
+
+    def noise(like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=random)
+
+    def denoise(noisy: Tensor, step: int) -> Tensor:
+        mask = ALL[:, : noisy.shape[1]].expand(len(noisy), -1)
+        return scales.clean(noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step), mask)
+
+    sample = sampler(process).run(denoise, noise(torch.empty(120, 60, 3)), noise=noise)
+    for lag in (0, 1, 2, 4, 8):
+        expected = over_time(torch.tensor(lag)).float()
+        found = (sample[:, lag:] * sample[:, : 60 - lag]).mean((0, 1))
+        assert ((found - expected).abs() < 0.1 * VARIANCES).all(), (lag, found, expected)
+    ends = sample[:, [0, -1]].square().mean((0, 1))  # as lively as the middle
+    assert ((ends / VARIANCES - 1).abs() < 0.25).all()
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.5, 3.0])
@@ -267,6 +338,28 @@ def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion
     assert float((share * variances / (variances + 1)).sum()) == pytest.approx(0.5, abs=0.02)
     assert trained.sampler.process is trained.process
     torch.testing.assert_close(space.preconditioning.skip[0, :2], torch.ones(2), rtol=0.2, atol=0)
+
+
+def test_training_measures_the_covariance_over_time(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:
+    model = make_model(motion_space=partial(SPACE, prior_frames=5), noise_scale=0.1)
+    make_trainer(max_epochs=1).fit(model, datamodule=tiny)
+    space = model.motion_space
+    assert isinstance(space.preconditioning, TemporalPreconditioning)
+    windows = []
+    for clip in tiny.clips("train"):
+        coordinates = space.encode(tiny.corpus.read_motion(clip)[None] * model.scale)[0].double()
+        first = max(0, (len(coordinates) - 20) // 2)
+        windows.append(coordinates[first : first + 20].unfold(0, 5, 1).numpy())
+    stacked = np.concatenate(windows)
+    expected = np.einsum("nki,nkj->kij", stacked, stacked) / len(stacked)
+    expected = (expected + expected[:, ::-1, ::-1]) / 2
+    scales = space.preconditioning
+    measured = scales.vectors * scales.variances[:, None] @ scales.vectors.transpose(1, 2)
+    np.testing.assert_allclose(measured[:3].detach(), expected[:3], rtol=1e-3, atol=1e-3 * float(expected[:3].max()))
+    with pytest.raises(FaceDiffError, match="prior_frames"):
+        ComponentMotion(n_vertices=6, steps=10, prior_frames=4)
+    with pytest.raises(FaceDiffError, match="prior_frames"):
+        tiny.covariance_over_time(lambda x: x.flatten(2), 9999)
 
 
 def test_a_checkpoint_animates_as_the_model_that_wrote_it(

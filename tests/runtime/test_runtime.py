@@ -270,11 +270,12 @@ def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:
     [
         {"sampling_space": "vertices"},
         {"motion_space": partial(registry.motion_space.components, count=6)},
+        {"motion_space": partial(registry.motion_space.components, count=6, prior_frames=7)},
         {"sampler": partial(registry.sampler.ddpm, steps=4)},
         {"style_encoder": registry.style_encoder.none, "fusion": registry.fusion.add},
         {"decoder": registry.decoder.gru},
     ],
-    ids=["vertices", "components", "ddpm", "no style", "gru"],
+    ids=["vertices", "components", "prior over time", "ddpm", "no style", "gru"],
 )
 def test_other_parts_are_exported_too(tiny_root: Path, tmp_path: Path, options: dict[str, object]) -> None:
     made = ready(tiny_root, **options)

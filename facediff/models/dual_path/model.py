@@ -37,7 +37,7 @@ from facediff.models.layers import Share, Weight, Width
 from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoderFactory
-from facediff.models.motion_space import MotionSpaceFactory, Preconditioning, VertexMotion
+from facediff.models.motion_space import ComponentMotion, MotionSpaceFactory, Preconditioning, VertexMotion
 from facediff.models.samplers import (
     DpmSolverSampler,
     NoiseProcess,
@@ -226,7 +226,12 @@ class DualPathDiffusion(AnimationModel):
             # Shapes are as long as their standard deviations, so their squared lengths are the components' variances.
             variances = shapes[:PRINCIPAL].square().sum(1)
             self.rescale_noise(half_hidden(self.motion_space.noised_variances(variances), variances))
-        self.motion_space.fit(self.process.signal)
+        space = self.motion_space
+        covariance = None
+        if space.prior_frames > 1 and isinstance(space, ComponentMotion):
+            project = space.components.project
+            covariance = data.covariance_over_time(lambda motion: project(motion * self.scale), space.prior_frames)
+        space.fit(self.process.signal, covariance)
         return shapes
 
     def motion_weights(self) -> Float[Tensor, "vertices 3"]:
@@ -430,7 +435,7 @@ class DualPathDiffusion(AnimationModel):
         noisy = self.process.add_noise(clean, noise, step)
         embedded = self.network.embed(scales.into[step][:, None] * noisy)
         features = self.network.clean_motion(self.network.core(embedded, step, conditions))
-        predicted = scales.clean(noisy, features, step)
+        predicted = scales.clean(noisy, features, step, mask)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
 
     def _with_style_losses(self, losses: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:

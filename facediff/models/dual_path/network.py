@@ -266,7 +266,8 @@ class DualPathNetwork(nn.Module):
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
         ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
         if preconditioning is not None:
-            return PreconditionedDenoiser(self, ready, preconditioning, blend, ready.shares)
+            own = mask if len(ready.shares) == 1 else mask.chunk(len(ready.shares))[0]  # guided views repeat the rows
+            return PreconditionedDenoiser(self, ready, preconditioning, own, blend, ready.shares)
         return ConditionalDenoiser(self, ready, product, blend, ready.shares)
 
 
