@@ -1,14 +1,15 @@
 """How sure a difference between two rows is, with its two sources of chance kept apart.
 
 A score depends on which sentences were recorded, and on which numbers the training happened to draw. A bootstrap or a
-permutation over sentences knows nothing of the second, and the spread over seeds nothing of the first. A difference
-counts as one between methods only if it is larger than either chance explains: its p-value is the larger of the two,
-which is a valid test that neither is the reason (an intersection–union test, Berger 1982).
+permutation over sentences knows nothing of the second, and the spread over seeds nothing of the first. Where both act,
+their variances add up: a test by one of them alone, or by the less significant of the two, calls too many differences
+significant. The p-value is therefore of Student's t with the sum of the variances and Satterthwaite's (1946) degrees of
+freedom.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,7 +80,8 @@ class Difference:
         p_sentences: of the permutation test over sentences; None if the score is no mean of those of sentences.
         runs: interval over training runs (Welch); None if the chance between runs is not known.
         p_runs: of Welch's test; None as for ``runs``.
-        p: the larger of the two; None if one is not known.
+        both: interval over sentences and training runs together; None if the chance between runs is not known.
+        p: of the test with both; None as for ``both``.
         common: sentences that both have.
     """
 
@@ -88,6 +90,7 @@ class Difference:
     p_sentences: float | None
     runs: Interval | None
     p_runs: float | None
+    both: Interval | None
     p: float | None
     common: int
 
@@ -103,15 +106,45 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
     common = [clip for clip in one.clips if clip in other.clips]
     p_runs, runs = welch(one, other, bootstrap.level)
     if one.values is None or other.values is None or not common:
-        p = p_runs if one.values is None and other.values is None else None
-        return Difference(one.mean - other.mean, None, None, runs, p_runs, p, len(common))
+        alone = one.values is None and other.values is None
+        p, both = (p_runs, runs) if alone else (None, None)
+        return Difference(one.mean - other.mean, None, None, runs, p_runs, both, p, len(common))
     ours, theirs = one.shares(common), other.shares(common)
     valued = ~(np.isnan(ours) | np.isnan(theirs))
-    p_sentences = sign_flip(ours[valued] - theirs[valued], seed=bootstrap.seed)
+    gaps = ours[valued] - theirs[valued]
+    p_sentences = sign_flip(gaps, seed=bootstrap.seed)
     mine, yours = one._resampled(bootstrap, common), other._resampled(bootstrap, common)
     interval = None if mine is None or yours is None else bootstrap.intervals((mine - yours)[:, None], 1)[0]
-    p = None if p_runs is None else max(p_sentences, p_runs)
-    return Difference(float((ours - theirs).sum()), interval, p_sentences, runs, p_runs, p, len(common))
+    p, both = both_chances(gaps, [scores.runs for scores in (one, other) if not scores.fixed], bootstrap.level)
+    return Difference(float((ours - theirs).sum()), interval, p_sentences, runs, p_runs, both, p, len(common))
+
+
+def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tuple[float | None, Interval | None]:
+    """Student's t-test of a difference by which both sentences and training runs are chance, and its interval.
+
+    What is common to a run and a sentence is in both variances, so the test errs on the safe side.
+
+    Args:
+        gaps: what each sentence adds to the difference (sentences,).
+        runs: the score of each training run (runs,), for each of the rows that were trained.
+        level: of the interval.
+
+    Returns:
+        p-value and interval; None with a single sentence, or where a row that was trained has a single run.
+    """
+    from scipy.stats import t as student
+
+    if len(gaps) < 2 or any(len(scores) < 2 for scores in runs):
+        return None, None
+    # The difference is a sum over sentences, hence the factor; a row's score is a mean over runs.
+    variances = np.array([len(gaps) * gaps.var(ddof=1), *(scores.var(ddof=1) / len(scores) for scores in runs)])
+    freedoms = np.array([len(gaps) - 1, *(len(scores) - 1 for scores in runs)])
+    gap, variance = float(gaps.sum()), float(variances.sum())
+    if variance == 0:
+        return (0.0 if gap else 1.0), Interval(gap, gap)
+    freedom, error = variance**2 / (variances**2 / freedoms).sum(), float(np.sqrt(variance))
+    reach = error * float(student.ppf((1 + level) / 2, freedom))
+    return 2 * float(student.sf(abs(gap) / error, freedom)), Interval(gap - reach, gap + reach)
 
 
 def welch(one: RowScores, other: RowScores, level: float = 0.95) -> tuple[float | None, Interval | None]:
@@ -139,14 +172,18 @@ def welch(one: RowScores, other: RowScores, level: float = 0.95) -> tuple[float 
 
 
 def compared(
-    rows: Mapping[str, RowScores], baseline: str, bootstrap: Bootstrap
+    rows: Mapping[str, RowScores], baseline: str, bootstrap: Bootstrap, references: Container[str] = ()
 ) -> dict[str, tuple[Difference, float | None]]:
-    """Every row against one, with p-values corrected for the number of rows: one family for each score and split."""
+    """Every row against one, with p-values corrected for the number of rows: one family for each score and split.
+
+    Reference rows are not in the family, whose power they would cost; their p-values stay as they are.
+    """
     differences = {
         name: difference(scores, rows[baseline], bootstrap) for name, scores in rows.items() if name != baseline
     }
     tested = {name: comparison.p for name, comparison in differences.items() if comparison.p is not None}
-    adjusted = dict(zip(tested, holm(list(tested.values())), strict=True))
+    family = [name for name in tested if name not in references]
+    adjusted = tested | dict(zip(family, holm([tested[name] for name in family]), strict=True))
     return {name: (comparison, adjusted.get(name)) for name, comparison in differences.items()}
 
 

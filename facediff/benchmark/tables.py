@@ -98,7 +98,7 @@ class TableRow:
     clips: int = 0
 
     def significant(self, column: str, level: float) -> bool:
-        """Whether the difference from the baseline is larger than both sorts of chance explain."""
+        """Whether the difference from the baseline is larger than chance explains."""
         adjusted = self.differences[column][1] if column in self.differences else None
         return adjusted is not None and adjusted < 1 - level
 
@@ -352,7 +352,7 @@ def _with_comparisons(
         for name, mark in marked(own, facts.get("better"), bootstrap).items():
             marks.setdefault(name, {})[column] = mark
         if baseline in all_rows:
-            for name, difference in compared(all_rows, baseline, bootstrap).items():
+            for name, difference in compared(all_rows, baseline, bootstrap, all_rows.keys() - own.keys()).items():
                 differences.setdefault(name, {})[column] = difference
     return [
         TableRow(

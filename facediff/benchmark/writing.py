@@ -211,11 +211,11 @@ def details(table: Table, report: BenchmarkReport) -> list[Block]:
     return blocks
 
 
-COMPARISON = ("row", "score", "difference", "over sentences", "p", "over runs", "p", "corrected p", "")
+COMPARISON = ("row", "score", "difference", "over sentences", "over runs", "over both", "p", "corrected p", "")
 
 
 def comparison_rows(table: Table, report: BenchmarkReport) -> list[list[str]]:
-    """Each row against the baseline, score by score; a star where neither chance explains the difference."""
+    """Each row against the baseline, score by score; a star where chance does not explain the difference."""
     scale = scales(table)
     rows = []
     for row in table.rows:
@@ -223,8 +223,9 @@ def comparison_rows(table: Table, report: BenchmarkReport) -> list[list[str]]:
             own = scale[column]
             star = "*" if row.significant(column, report.bootstrap.level) else ""
             cells = [row.label, title_of(column), own.number(difference.value, sign="+")]
-            cells += [own.interval(difference.sentences, sign="+"), p_value(difference.p_sentences)]
-            cells += [own.interval(difference.runs, sign="+"), p_value(difference.p_runs), p_value(adjusted), star]
+            chances = (difference.sentences, difference.runs, difference.both)
+            cells += [own.interval(interval, sign="+") for interval in chances]
+            cells += [p_value(difference.p), p_value(adjusted), star]
             rows.append(cells)
     return rows
 
@@ -238,8 +239,9 @@ def about(report: BenchmarkReport) -> list[str]:
         f"seeds: the chance between runs",
         f"intervals: {boot.resamples} bootstrap resamples of the sentences, seed {boot.seed}: the chance between "
         f"sentences, with the trained models as they are",
-        "p over sentences: permutation test by signs, paired by sentence; p over runs: Welch's t-test between training "
-        "runs; the larger of the two is corrected after Holm for the rows of one score",
+        "differences are paired by sentence; over runs: Welch's interval; over both: the variances of sentences and of "
+        "training runs added up (Satterthwaite), of which p is; corrected after Holm for the rows of one score without "
+        "the references",
         f"a star, bold (best) and underlined (second best): corrected p below {alpha:.2g}; best and second best only "
         f"where they differ so from every row behind them, corrected for those alone; references are never marked; "
         f"where nothing is marked, the data do not say which is best",
@@ -300,7 +302,7 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
 
 # CSV.
 
-NOTHING = Difference(0.0, None, None, None, None, None, 0)
+NOTHING = Difference(0.0, None, None, None, None, None, None, 0)
 """Of the row that all others are compared with."""
 
 
@@ -329,6 +331,8 @@ def _csv_rows(table: Table, report: BenchmarkReport) -> Iterator[dict[str, Any]]
                 "p_sentences": difference.p_sentences,
                 **ends("difference_runs", difference.runs),
                 "p_runs": difference.p_runs,
+                **ends("difference_both", difference.both),
+                "p": difference.p,
                 "p_corrected": adjusted,
                 "printed": table.published.scores.get(row.name, {}).get(column),
                 **{"frames": table.frames, "sentences": row.clips, "parameters": row.cost.parameters},

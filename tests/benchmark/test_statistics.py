@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from facediff.benchmark.statistics import RowScores, compared, difference, marked, welch
+from facediff.benchmark.statistics import RowScores, both_chances, compared, difference, marked, welch
 from facediff.reporting.statistics import Bootstrap, holm, sign_flip
 
 BOOTSTRAP = Bootstrap(2000, 0.95, 0)
@@ -100,7 +100,10 @@ def test_a_difference_is_that_of_the_pooled_scores_over_common_sentences() -> No
     one, other = (scores(rng.normal(0, 1, (2, 12)), frames) for _ in range(2))
     found = difference(one, other, BOOTSTRAP)
     assert found.value == pytest.approx(one.mean - other.mean)
-    assert found.p == max(found.p_sentences or 0, found.p_runs or 0)
+    values = [np.average(row.values, axis=1, weights=frames) for row in (one, other)]  # type: ignore[arg-type]
+    assert found.p == scipy_both(one.values, other.values, frames)  # type: ignore[arg-type]
+    assert found.both is not None
+    assert found.both.low < values[0].mean() - values[1].mean() < found.both.high
     part = RowScores(other.runs, other.values[:, 3:], frames[3:], other.clips[3:])  # type: ignore[index]
     less = difference(one, part, BOOTSTRAP)
     assert less.common == 9
@@ -123,6 +126,43 @@ def test_a_sentence_without_a_value_in_a_run_does_not_count_there() -> None:
     assert gap.value == pytest.approx(expected)
     assert gap.sentences is not None
     assert gap.sentences.low < expected < gap.sentences.high
+
+
+def scipy_both(one: np.ndarray, other: np.ndarray, frames: np.ndarray) -> object:
+    """p of a difference with the variances of sentences and of both rows' runs, from SciPy's distributions."""
+    weights = frames / frames.sum()
+    gaps = weights * (one.mean(0) - other.mean(0))
+    runs = [(values * weights).sum(1) for values in (one, other)]
+    parts = [(len(gaps) ** 2 * scipy.stats.sem(gaps) ** 2, len(gaps) - 1)]
+    parts += [(scipy.stats.sem(scores) ** 2, len(scores) - 1) for scores in runs]
+    total = sum(variance for variance, _ in parts)
+    freedom = total**2 / sum(variance**2 / count for variance, count in parts)
+    return pytest.approx(2 * scipy.stats.t.sf(abs(gaps.sum()) / np.sqrt(total), freedom))
+
+
+@pytest.mark.parametrize("runs", [3, 5, 10])
+def test_false_positives_stay_at_five_per_cent_where_both_chances_act(runs: int) -> None:
+    """Of two equal methods, whatever share of the variance is that of sentences; the larger p-value gave 10 %."""
+    rng, count = np.random.default_rng(runs), 700
+    for share in (0.3, 1.0, 3.0):  # variance of the mean over runs, by that over sentences
+        wrong = 0
+        for _ in range(count):
+            sentences = rng.normal(0, 1, 30)
+            trained = [rng.normal(0, np.sqrt(share * runs / 60), runs) for _ in range(2)]
+            p, _ = both_chances((sentences + trained[0].mean() - trained[1].mean()) / 30, trained)
+            wrong += p is not None and p < 0.05
+        assert wrong / count <= 0.06, share
+
+
+def test_references_cost_the_methods_no_power() -> None:
+    rng = np.random.default_rng(8)
+    rows = table(4, rng)
+    everyone, methods = compared(rows, "0", BOOTSTRAP), compared(rows, "0", BOOTSTRAP, {"3"})
+    plain = {name: comparison.p for name, (comparison, _) in everyone.items()}
+    assert {name: p for name, (_, p) in methods.items() if name != "3"} == dict(
+        zip(("1", "2"), holm([plain["1"], plain["2"]]), strict=True)  # type: ignore[list-item]
+    )
+    assert methods["3"][1] == plain["3"]
 
 
 def test_tables_of_noise_mark_nothing_as_best() -> None:
