@@ -29,6 +29,7 @@ from facediff.render.meshes import (
     is_open,
     vertex_normals,
 )
+from facediff.render.occlusion import occlusion
 from facediff.render.refinement import Refinement
 
 Picture = npt.NDArray[np.uint8]
@@ -46,9 +47,9 @@ GAMMA_STEPS = 4095  # Steps of the gamma table: fine enough that the darkest ste
 class Renderer:
     """Draws one topology in one view; keeps its buffers between frames, so use one (a `twin`) per thread.
 
-    Normals are computed again for every frame; the light is looked up per vertex of a mesh that is refined until its
-    triangles are small in the picture, interpolated over them per sample of the supersampled picture, averaged in
-    linear light and gamma-corrected last. The same input gives the same bytes.
+    Normals are computed again for every frame, ambient occlusion once for the face at rest; the light is looked up per
+    vertex of a mesh that is refined until its triangles are small in the picture, interpolated over them per sample of
+    the supersampled picture, averaged in linear light and gamma-corrected last. The same input gives the same bytes.
 
     Args:
         faces: triangles (F, 3) as vertex numbers; either winding.
@@ -95,6 +96,7 @@ class Renderer:
         self._open = is_open(self.faces)
         self._canvas = _Canvas(self.camera, self.height, self.width, supersample)
         self._sums = VertexSums(self.faces, self.n_vertices)
+        self._occluded = occlusion(rest, self.faces)
         self._backs = np.ascontiguousarray(self.faces[:, ::-1])
         pixel = self.camera.pixel_size(self.height)
         normals = vertex_normals(rest, self.faces, self._sums)
@@ -123,7 +125,9 @@ class Renderer:
         picture = self.backdrop.copy()
         window = self._canvas.window(points)
         if window is not None:
-            picture[window.pixels] = self._draw(points, linear, window)
+            # Colours of a frame stand for numbers (errors), which nothing may darken.
+            occluded = self._occluded if colours is None else None
+            picture[window.pixels] = self._draw(points, linear, occluded, window)
         return picture
 
     def twin(self) -> Renderer:
@@ -132,11 +136,11 @@ class Renderer:
         other._canvas = _Canvas(self.camera, self.height, self.width, self._canvas.supersample)
         return other
 
-    def _draw(self, points: Float64, colours: Float32 | None, window: _Window) -> Picture:
+    def _draw(self, points: Float64, colours: Float32 | None, occluded: Float32 | None, window: _Window) -> Picture:
         """The window's pixels: light the vertices, rasterise, darken what lies behind, put over the background."""
         canvas = self._canvas
         canvas.clear(window)
-        fine = self._fine_vertices(points, colours)
+        fine = self._fine_vertices(points, colours, occluded)
         canvas.draw(fine[:, :3], self._lit(fine), self._refinement.faces)
         if self._open:
             # Backs are drawn against the same depth buffer: they show only where one looks inside. It is dark there, so
@@ -151,10 +155,12 @@ class Renderer:
         picture += self._background[window.pixels] * (1 - coverage)[..., None]
         return self._to_bytes(picture)
 
-    def _fine_vertices(self, points: Float64, colours: Float32 | None) -> Float32:
+    def _fine_vertices(self, points: Float64, colours: Float32 | None, occluded: Float32 | None) -> Float32:
         """Of each vertex of the refined mesh: position, normal's x and y, light left in a hollow, own colour if any."""
         normals = vertex_normals(points, self.faces, self._sums)
         shade = np.clip(1 - HOLLOW_STRENGTH * hollowness(points, normals, self._sums), 0, 1)
+        if occluded is not None:
+            shade *= occluded
         parts: list[Floats] = [points, normals[:, :2], shade[:, None]]
         if colours is not None:
             parts.append(colours)

@@ -24,15 +24,16 @@ from facediff.render.rasteriser import (
 
 
 class PerSampleRenderer(Renderer):
-    """Draws normals and hollows, then colours, and lights each sample."""
+    """Draws normals, hollows and occlusion, then colours, and lights each sample."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 - those of Renderer
         super().__init__(*arguments, **options)
         self._table = light_table(self.look)
 
-    def _draw(self, points: Float64, colours: Float32 | None, window: _Window) -> Picture:
+    def _draw(self, points: Float64, colours: Float32 | None, occluded: Float32 | None, window: _Window) -> Picture:
         normals = vertex_normals(points, self.faces, self._sums)
         shade = np.clip(1 - HOLLOW_STRENGTH * hollowness(points, normals, self._sums), 0, 1)
+        shade = shade if occluded is None else shade * occluded
         front = np.column_stack([normals[:, :2] * 0.5 + 0.5, shade])
         back = np.column_stack([0.5 - normals[:, :2] * 0.5, INSIDE * shade])
         drawn, depth = self._samples(points, front, back, window)
