@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import av
@@ -23,6 +24,7 @@ from facediff.cli.app import main
 from facediff.mesh import read_mesh
 from facediff.models import DualPathDiffusion, load_model
 from facediff.speech.audio import read_speech
+from tests.fakes.processes import Forked, program
 from tests.fakes.words import last_of_each
 
 
@@ -333,34 +335,34 @@ def test_half_precision_is_the_same_for_a_stream(checkpoint: Path, tmp_path: Pat
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_ctrl_c_ends_the_speech_and_what_was_said_is_kept(checkpoint: Path, tmp_path: Path) -> None:
     """A microphone has no other end."""
-    words = stream_words(checkpoint, tmp_path / "live.npy")
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None
-        assert process.stderr is not None
-        # docs/streaming.md promises this line to programs that wait for it.
-        ready = process.stderr.readline().decode()
-        told = r"look-ahead 4.50 s .* 75 frames at a time, 25 a second, 24 vertices; reading 16000 Hz, 16 bit"
-        assert re.fullmatch(f"facediff animate: ready; {told}\n", ready)
-        process.stdin.write(pcm(2))
-        process.stdin.flush()
-        time.sleep(1)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
-        assert b"2.00 s of speech" in process.stderr.read()
+    process = Forked(program("facediff", *stream_words(checkpoint, tmp_path / "live.npy")[3:]))
+    deadline = time.monotonic() + 60
+    while "\n" not in process.printed(1) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    # docs/streaming.md promises this line to programs that wait for it.
+    told = r"look-ahead 4.50 s .* 75 frames at a time, 25 a second, 24 vertices; reading 16000 Hz, 16 bit"
+    assert re.fullmatch(f"facediff animate: ready; {told}\n", process.printed(1))
+    process.stdin.write(pcm(2))
+    process.stdin.flush()
+    time.sleep(1)
+    os.kill(process.pid, signal.SIGINT)
+    while process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert process.wait(1) == 0
+    assert "2.00 s of speech" in process.printed(1)
     assert np.load(tmp_path / "live.npy").shape == (50, 24, 3)
     assert [path.name for path in tmp_path.iterdir()] == ["live.npy"]
 
 
 def test_a_renderer_that_ends_ends_the_stream(checkpoint: Path) -> None:
-    with subprocess.Popen(
-        stream_words(checkpoint, "-"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        process.stdout.close()
-        process.stdout = None
-        _, printed = process.communicate(pcm(6))
-    assert process.returncode == 141
-    assert len(printed.splitlines()) == 1  # the look-ahead
+    read, write = os.pipe()
+    process = Forked(program("facediff", *stream_words(checkpoint, "-")[3:]), stdout=write)
+    os.close(read)
+    os.close(write)
+    with suppress(BrokenPipeError):
+        process.stdin.write(pcm(6))
+    assert process.wait(60) == 141
+    assert len(process.printed(1).splitlines()) == 1  # the look-ahead
 
 
 @pytest.mark.parametrize("rate", ["16000", "44100"])

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,36 +18,12 @@ from facediff.animation import read_archive
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import load_model
-from facediff.pipelines.folder import LOCK, output_names, recordings, run_folder, seed_of_recording
-from facediff.utils.files import atomic, locked
+from facediff.pipelines.folder import LOCK, output_names, recordings, seed_of_recording
+from facediff.utils.files import locked
+from tests.fakes.batches import run
 
 ROOT = Path(__file__).parents[2]
 FACES = "".join(f"f {r * 6 + c + 1} {r * 6 + c + 2} {r * 6 + c + 7}\n" for r in range(3) for c in range(5))
-
-
-def worker(command: list[str]) -> Callable[[Path, Path], None]:
-    """Writes which process animated, the how many-th recording of that process it is, and the seed."""
-    done: list[Path] = []
-    if "no-model" in command:
-        raise FaceDiffError("C.ckpt: no such checkpoint")
-    pause = float(command[command.index("--pause") + 1]) if "--pause" in command else 0.0
-
-    def animate(speech: Path, output: Path) -> None:
-        words = speech.read_text()
-        if words == "deadly":
-            os._exit(9)
-        if words == "bad":
-            raise FaceDiffError(f"{speech}: holds only silence")
-        if words == "bug":
-            raise ValueError("no such thing")
-        done.append(speech)
-        with atomic(output) as temporary:
-            temporary.write_text("half")
-            time.sleep(pause)
-            seed = seed_of_recording(speech, 3)
-            temporary.write_text(json.dumps({"pid": os.getpid(), "nth": len(done), "said": words, "seed": seed}))
-
-    return animate
 
 
 @pytest.fixture
@@ -61,21 +36,6 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
-def run(folder: Path, *command: str, workers: int = 1, retry_failed: bool = False) -> int:
-    checkpoint = folder.parent / "C.ckpt"
-    speeches, out = sorted(folder.glob("*.wav")), folder.parent / "out"
-    return run_folder(
-        speeches,
-        out,
-        ".npy",
-        command,
-        make_worker=worker,
-        files=[checkpoint],
-        workers=workers,
-        retry_failed=retry_failed,
-    )
-
-
 def outputs(folder: Path) -> dict[str, dict[str, object]]:
     out = folder.parent / "out"
     assert not [path for path in out.rglob("*") if "partial" in path.name]
@@ -86,7 +46,6 @@ def times(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder.parent / "out").glob("*.npy")}
 
 
-@pytest.mark.slow
 def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, words in (("b", "bad"), ("c", "deadly"), ("d", "bug")):
         (folder / f"{name}.wav").write_text(words)
@@ -117,7 +76,6 @@ def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.Cap
     assert run(folder, retry_failed=True) == 0
 
 
-@pytest.mark.slow
 def test_each_process_loads_the_model_once_and_seeds_do_not_depend_on_it(folder: Path) -> None:
     assert run(folder, "--pause", "0.2", workers=2) == 0
     made = outputs(folder)
@@ -202,7 +160,7 @@ def test_names_that_collide_keep_their_suffix(folder: Path, tmp_path: Path) -> N
 
 PROGRAM = """
 from pathlib import Path
-from tests.cli.test_animate_folder import run
+from tests.fakes.batches import run
 if __name__ == "__main__":
     run(Path({folder!r}), "--pause", "0.6", workers=2)
 """
@@ -248,7 +206,6 @@ def test_ctrl_c_finishes_running_recordings_and_a_second_run_the_rest(folder: Pa
     assert {name: after[name] for name in before} == before
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 def test_workers_end_when_their_parent_is_killed(folder: Path, tmp_path: Path) -> None:
     process = started(folder, tmp_path)

@@ -1,7 +1,5 @@
 """One of the processes of test_metric_processes.py: scores its share and writes what it got.
 
-Run as a file: its folder, with further_cases.py in it, is where Python looks for modules.
-
 Usage: distributed_worker.py RANK WORLD RENDEZVOUS CORPUS OUTPUT
 """
 
@@ -14,6 +12,7 @@ import torch
 import torch.distributed as dist
 
 from facediff.metrics import RealTimeFactor, Region, StyleRetrievalAccuracy, protocol
+from tests.metrics.further_cases import CASES
 
 # Rounds of sequences by rank: unequal shares, all on rank 0, none at all.
 ROUNDS: list[list[list[int]]] = [[[0, 1, 2], [3, 4]], [[0, 1, 2, 3, 4], []], [[], []]]
@@ -34,8 +33,6 @@ def score(metric: Any, batches: list[dict[str, Any]]) -> Any:  # noqa: ANN401
 
 def main(rank: int, world: int, rendezvous: str, corpus: str, output: str) -> None:
     """Score every round of shares and save the results."""
-    from further_cases import CASES  # not above: the doctest collector imports this file without its folder
-
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=world)
     given: dict[str, Any] = torch.load(corpus, weights_only=True)

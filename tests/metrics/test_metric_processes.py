@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-import facediff
 from facediff.metrics import RealTimeFactor, Region, StyleRetrievalAccuracy, protocol
+from tests.fakes.processes import Forked, program
 from tests.metrics.further_cases import CASES
 
 Corpus = Any  # the class of that name in conftest.py, which test files cannot import
@@ -54,18 +51,7 @@ def test_two_processes_equal_one(corpus: Corpus, lips: tuple[int, ...], upper: t
     further = further_batches(corpus)
     torch.save({"clips": clips, "further": further}, tmp_path / "corpus.pt")
     processes = [
-        subprocess.Popen(  # noqa: S603
-            [
-                sys.executable,
-                str(WORKER),
-                str(rank),
-                "2",
-                str(tmp_path / "rendezvous"),
-                str(tmp_path / "corpus.pt"),
-                str(tmp_path / f"rank{rank}.pt"),
-            ],
-            env=os.environ | {"PYTHONPATH": str(Path(facediff.__file__).parents[1])},
-        )
+        Forked(program(WORKER, rank, 2, tmp_path / "rendezvous", tmp_path / "corpus.pt", tmp_path / f"rank{rank}.pt"))
         for rank in range(2)
     ]
     try:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from facediff import registry
 from facediff.models.published.base import PublishedModel
+from tests.fakes.processes import run
 
 SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "published_methods.py"
 
 
 def test_every_method_is_timed_at_both_sizes_and_the_table_is_markdown() -> None:
-    command = [sys.executable, SCRIPT, "--toy", "--seconds", "0.5", "--steps", "2"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = run(SCRIPT, "--toy", "--seconds", "0.5", "--steps", "2")
     assert done.returncode == 0, done.stderr
     head, line, *rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in done.stdout.splitlines()]
     assert set(line) == {"---"}

@@ -1,10 +1,10 @@
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.fakes.processes import run
 
 SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "sampling.py"
 TOY = "--vertices 30 --seconds 1 --dim 32 --layers 2 --threads 1 --repeats 2 --full 3 --tiny-encoder"
@@ -16,8 +16,7 @@ Output = tuple[str, dict[str, Any]]
 def output(tmp_path_factory: pytest.TempPathFactory) -> Output:
     """What a toy run prints, and its unrounded numbers."""
     numbers = tmp_path_factory.mktemp("sampling") / "numbers.json"
-    command = [sys.executable, SCRIPT, *TOY.split(), "--json", numbers]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = run(SCRIPT, *TOY.split(), "--json", numbers)
     assert done.returncode == 0, done.stderr
     return done.stdout, json.loads(numbers.read_text())
 

@@ -1,16 +1,19 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
+
+import pytest
+
+from tests.fakes.processes import run
 
 SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "viewer.py"
 
 
+@pytest.mark.slow  # the pages that it measures are tested in tests/export/viewer
 def test_a_toy_run_prints_a_line_for_each_motion() -> None:
     words = ["--vertices=600", "--seconds=4", "--watch=0.3"]
-    done = subprocess.run([sys.executable, SCRIPT, *words], capture_output=True, text=True, check=False, timeout=200)
+    done = run(SCRIPT, *words)
     assert done.returncode == 0, done.stderr
     rows = [line for line in done.stdout.splitlines() if " vertices, " in line]
     assert len(rows) == 4

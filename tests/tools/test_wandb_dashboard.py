@@ -6,7 +6,6 @@ import importlib.util
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,8 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+
+from tests.fakes.processes import run
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "tools" / "wandb_dashboard.py"
@@ -98,17 +99,11 @@ def test_without_the_package(
     assert "pip install wandb wandb-workspaces" in capsys.readouterr().err
 
 
-def test_saving_without_a_key_is_one_sentence(tmp_path: Path) -> None:
+def test_saving_without_a_key_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("wandb_workspaces")
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("WANDB", "NETRC"))}
-    done = subprocess.run(
-        [sys.executable, SCRIPT, "--entity=team"],
-        env={**kept, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT)},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
+    for name in [name for name in os.environ if name.startswith(("WANDB", "NETRC"))]:
+        monkeypatch.delenv(name)
+    done = run(SCRIPT, "--entity=team", env={"HOME": str(tmp_path)})
     assert done.returncode == 2
     assert done.stderr.startswith("error: the dashboard of team/facediff was not saved: no API key found")
     assert len(done.stderr.splitlines()) == 1
