@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +22,7 @@ import yaml
 from facediff.cli.app import main
 from facediff.models import load_model
 from tests.cli.conftest import SMALL
+from tests.fakes import processes
 
 Fit = Callable[..., int]
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -250,7 +252,16 @@ def test_a_component_chosen_by_name_starts_from_its_own_defaults(
     assert model["decoder"]["init_args"] == {"num_layers": 2, "bidirectional": True, "dropout": 0.3}
 
 
-@pytest.mark.parametrize("config", sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml")))
+EXPERIMENTS = sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml"))
+QUICK = ("biwi", "biwi_paper", "mead3d", "vocaset", "vocaset_style_content_paper", "puppet_hubert", "biwi_faceformer")
+QUICK += ("vocaset_diffspeaker", "puppet_codetalker_prior")
+"""Those that are parsed in the quick suite: every corpus, trainer and kind of model; others differ by their sizes."""
+
+
+@pytest.mark.parametrize(
+    "config",
+    [name if name[:-5] in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EXPERIMENTS],
+)
 def test_every_shipped_experiment_is_parsed(config: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = print_config("--config", f"configs/experiment/{config}", capsys=capsys)
     assert printed["model"]["init_args"]["dim"]  # type: ignore[index]
@@ -289,6 +300,17 @@ def test_runs_carry_the_name_of_their_experiment(
     assert first["init_args"]["name"] == expected
 
 
+def test_the_quick_experiments_use_every_corpus_and_trainer() -> None:
+    """Which files a config names, those that its files name included."""
+
+    def named(path: Path) -> set[str]:
+        paths = {(path.parent / name).resolve() for name in re.findall(r"[\w./]+\.yaml", path.read_text())}
+        return {str(path)}.union(*map(named, paths))
+
+    parts = [named(CONFIGS / "experiment" / f"{name}.yaml") for name in QUICK]
+    assert {path.stem for path in (CONFIGS / "data").iterdir()} <= {Path(p).stem for p in set().union(*parts)}
+
+
 def test_configs_are_short() -> None:
     assert all(len(path.read_text().splitlines()) <= 40 for path in CONFIGS.rglob("*.yaml"))
 
@@ -324,15 +346,10 @@ def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
     words = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--data.batch_size=2", *SMALL]
     ddp = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
     out = [f"--trainer.logger.save_dir={tmp_path}"]
-    done = subprocess.run(
-        [sys.executable, "-m", "facediff", "fit", "--config", "configs/experiment/puppet.yaml", *words, *ddp, *out],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).parents[2],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        timeout=240,
-    )
+    words = ["fit", "--config", "configs/experiment/puppet.yaml", *words, *ddp, *out]
+    done = processes.run(
+        "facediff", *words, env={"OMP_NUM_THREADS": "1"}, timeout=240
+    )  # Lightning starts the other one cold
     assert done.returncode == 0, done.stderr[-3000:]
     assert "world_size: 2" in done.stdout + done.stderr or "MEMBER: 2/2" in done.stdout + done.stderr
     run = tmp_path / "puppet" / "version_0" / "checkpoints"

@@ -108,7 +108,10 @@ def _work_and_end(work: Callable[[], object], files: tuple[int, ...], cwd: Path,
             if number > 2:
                 with suppress(OSError):
                     os.dup2(nowhere, number)
-        sys.stdin, sys.stdout, sys.stderr = (os.fdopen(number, mode) for number, mode in enumerate("rww"))
+        sys.stdin, sys.stdout, sys.stderr = (
+            open(number, mode, closefd=False)  # noqa: SIM115
+            for number, mode in enumerate("rww")
+        )
         warnings.resetwarnings()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         os.environ.update(env)
