@@ -75,8 +75,8 @@ def shown(sheet: Path, model: DualPathDiffusion, clip: str, tiny: Tiny, seed: in
         motion = model.eval().generate(collate([sample]), seed=seed)[0]
     mesh = tiny.assets()
     assert mesh.faces is not None
-    width = SIZE * 3 // 4
-    renderer = Renderer(mesh.faces.numpy(), template=sample.template.numpy(), size=(SIZE, width), colours=mesh.colours)
+    width, colours = SIZE * 3 // 4, mesh.colours_of(sample.identity_name)
+    renderer = Renderer(mesh.faces.numpy(), template=sample.template.numpy(), size=(SIZE, width), colours=colours)
     first = round(0.5 * (len(motion) - 1) / 6)
     true, moved = ((found + sample.template)[first].numpy() for found in (sample.motion, motion))
     heat = heat_colours(np.linalg.norm(moved - true, axis=1), SCALE)

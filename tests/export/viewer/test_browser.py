@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from facediff.animation import Animation
 from facediff.export.viewer import write_page
+from facediff.render.occlusion import occlusion
 from tests.fakes.clicks import FRAMES, OPEN_FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
 from tools.browser.chromium import Chromium, Page
@@ -211,6 +213,15 @@ def test_the_heat_map_is_the_distance_from_the_truth(show: Show) -> None:
     assert page.evaluate("key.hidden")
     alone = show([truth, replace(other, faces=other.triangles[::-1])], truth=0)
     assert alone.evaluate("heat.hidden")
+
+
+def test_the_page_has_the_same_occlusion_as_pictures(show: Show) -> None:
+    shape = trimesh.creation.torus(0.05, 0.02, 24, 12)
+    template, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int32)
+    ring = Animation(name="ring", vertices=template[None], template=template, faces=faces, frame_rate=25.0, unit="m")
+    sky = show([ring]).evaluate("[...facediff.sky(0)]")
+    assert np.allclose(sky, occlusion(template, faces), atol=0.02)
+    assert min(sky) < 0.8
 
 
 @pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (375, 740, False), (900, 420, False)])

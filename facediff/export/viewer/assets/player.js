@@ -205,6 +205,7 @@ async function start() {
     turn: (yaw, pitch) => player.current.camera.turn(yaw, pitch),
     positions: (number) => player.current.faces[number].positions,
     distances: (number) => player.current.faces[number].distances,
+    sky: (number) => player.current.faces[number].sky,
   };
   fillInformation(find("about"), facts);
   connectDialogs();

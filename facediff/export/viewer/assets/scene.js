@@ -5,13 +5,15 @@ layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
 layout(location = 2) in vec3 colour;
 layout(location = 3) in float distance;
+layout(location = 4) in float sky;
 uniform mat4 view, project;
 uniform float highest; // of the heat map in mm; 0 for none
 centroid out vec3 facing, albedo; // at the edge of a triangle, values beyond it would show
-centroid out float heat;
+centroid out float heat, open;
 void main() {
   facing = mat3(view) * normal;
   albedo = colour * colour;
+  open = sky;
   heat = clamp(distance / max(highest, 1e-6), 0.0, 1.0) * (255.0 / 256.0) + 0.5 / 256.0;
   gl_Position = project * (view * vec4(position, 1.0));
 }`;
@@ -20,7 +22,7 @@ void main() {
 const FRAGMENT_SHADER = `#version 300 es
 precision highp float;
 centroid in vec3 facing, albedo;
-centroid in float heat;
+centroid in float heat, open;
 uniform float highest;
 uniform vec4 ink; // of edges, already multiplied by its opacity; clear for a surface
 uniform sampler2D ramp;
@@ -54,7 +56,7 @@ void main() {
   wide *= wide; // 8
   wide *= wide; // 16
   float narrow = wide * wide; // 32
-  vec3 lit = albedo * light + 0.096 * wide * shine + 0.064 * narrow * narrow;
+  vec3 lit = open * (albedo * light + 0.096 * wide * shine + 0.064 * narrow * narrow);
   if (!gl_FrontFacing) lit = mix(vec3(0.10, 0.02, 0.015), lit, 0.18); // the hollow of the mouth is dark and warm
   colour = vec4(sqrt(lit), 1.0);
 }`;
@@ -126,10 +128,15 @@ class Scene {
     }
   }
 
-  /** Give an animation other colours (3 V); it has some already. */
-  paint(number, colours) {
-    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.meshes[number].colours);
-    this.gl.bufferSubData(this.gl.ARRAY_BUFFER, 0, colours);
+  /** Take up an animation's other face at rest, and its colours if it has some. */
+  wear(number) {
+    const { gl } = this, face = this.faces[number];
+    face.sky = skyLight(face.template, face.faces);
+    for (const name of ["sky", "colours"]) {
+      if (!face[name]) continue;
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.meshes[number][name]);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, face[name]);
+    }
   }
 
   /** Fit the canvas to its place on the page, with so many times the pixels of the screen on each axis. */
@@ -181,6 +188,7 @@ class Scene {
       gl.bindVertexArray(this.meshes[number].array);
       gl.vertexAttrib3f(2, ...SKIN);
       gl.vertexAttrib1f(3, 0);
+      gl.vertexAttrib1f(4, 1);
       if (ink) gl.clear(gl.DEPTH_BUFFER_BIT); // of the part alone: what hides these edges is their own surface
       if (ink || edges) gl.enable(gl.POLYGON_OFFSET_FILL);
       gl.colorMask(!ink, !ink, !ink, !ink);
@@ -269,6 +277,8 @@ function buildMesh(gl, face) {
   mesh.normals = attribute(1, 3, gl.FLOAT, false, face.normals, gl.DYNAMIC_DRAW);
   if (face.colours) mesh.colours = attribute(2, 3, gl.UNSIGNED_BYTE, true, face.colours, gl.STATIC_DRAW);
   if (face.distances) mesh.distances = attribute(3, 1, gl.FLOAT, false, face.distances, gl.DYNAMIC_DRAW);
+  face.sky ??= skyLight(face.template ?? face.positions, face.faces);
+  mesh.sky = attribute(4, 1, gl.FLOAT, false, face.sky, gl.STATIC_DRAW);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, (mesh.faces = gl.createBuffer()));
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.faces, gl.STATIC_DRAW);
   gl.bindVertexArray(null);

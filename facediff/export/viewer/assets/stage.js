@@ -46,7 +46,8 @@ class Stage {
   /** Another face of the same mesh, with its colours. */
   wear(template, colours) {
     this.face.template = template;
-    if (colours) this.scene.paint(0, (this.face.colours = colours));
+    if (colours) this.face.colours = colours;
+    this.scene.wear(0);
     const { centre, extent } = boundsOf(template, this.face.faces);
     this.face.centre = centre;
     this.extent = extent;
