@@ -1,9 +1,11 @@
 """Draw the head of the built-in corpus's second edition: views, expressions, speech sounds, wireframe and people.
 
-    python tools/puppet_sheet.py docs/images/puppet_head.png
+    python tools/puppet_sheet.py docs/images/puppet_head.webp
+    python tools/puppet_sheet.py docs/images/puppet_editions.webp --editions
 
-Rows: front, three quarters, side, wireframe; rest, smile, brows up, frown; /a/, /o/, /f/, /m/; open eyes, half a blink,
-a whole blink, a glance; and the ten of the cast. Needs the extras ``render`` and ``puppet``.
+Rows: front, three quarters, side, wireframe; rest, smile, brows up, frown; /a/, /o/, /f/, /m/; open eyes, half a
+blink, a whole blink, a glance; and the ten of the cast. With ``--editions`` the first edition's head
+is above the second one's. Needs the extras ``render`` and ``puppet``.
 """
 
 from __future__ import annotations
@@ -15,14 +17,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from facediff.render import contact_sheet, save_image  # noqa: E402
+from facediff.render import contact_sheet  # noqa: E402
 from facediff.render.rasteriser import FIELD_OF_VIEW, Camera, Renderer, opencv  # noqa: E402
 from facediff.synthetic.cast import CAST  # noqa: E402
+from facediff.synthetic.face import build_face  # noqa: E402
+from facediff.synthetic.geometry import HeadMesh  # noqa: E402
+from facediff.synthetic.head.mesh import QuadMesh  # noqa: E402
 from facediff.synthetic.head.parts import build_head  # noqa: E402
 from facediff.synthetic.head.people import Complexion, coloured, dressed  # noqa: E402
 from facediff.synthetic.head.rig import LEFT_AND_RIGHT, head_shapes  # noqa: E402
+from facediff.synthetic.rig import CONTROLS, build_rig  # noqa: E402
+from facediff.synthetic.speakers import SPEAKERS  # noqa: E402
+
+Points = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 SIZE = 300
 EXPRESSIONS: dict[str, dict[str, float]] = {
@@ -80,29 +91,63 @@ def wireframe(view: Camera) -> NDArray[np.uint8]:
 def main() -> None:
     """Draw the sheet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("output", type=Path, help="a .png file")
-    output = parser.parse_args().output
+    parser.add_argument("output", type=Path, help="a .webp file")
+    parser.add_argument("--editions", action="store_true", help="draw the first edition's head above the second one's")
+    options = parser.parse_args()
+    pictures, labels = editions() if options.editions else sheet()
+    Image.fromarray(contact_sheet(pictures, 4, labels=labels)).save(options.output, quality=85, method=6)
+    mesh = build_head()
+    print(f"{options.output}: {len(mesh.vertices)} vertices, {len(mesh.quads)} quads")
+
+
+def sheet() -> tuple[list[Picture], list[str]]:
+    """Everything that the second edition's head can do, with labels."""
     mesh = build_head()
     average = coloured(mesh, Complexion())
-
-    def draw(vertices: NDArray[np.float64], view: Camera, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return Renderer(mesh.faces, template=mesh.vertices, size=SIZE, camera=view, colours=colours).render(vertices)
-
-    pictures = [draw(mesh.vertices, camera((0, -15, 0), turn, 340), average) for turn in (0, 40, 90)]
+    pictures = [draw(mesh, mesh.vertices, camera((0, -25, 0), turn, 350), average) for turn in (0, 40, 90)]
     pictures.append(wireframe(camera((0, -10, 40), 25, 230)))
     labels = ["front", "three quarters", "side", "quads"]
     for (name, weights), turn in zip(EXPRESSIONS.items(), (0, 0, 0, 0, 20, 40, 20, 20), strict=True):
-        pictures.append(draw(posed(weights), camera((0, -12, 50), turn, 205), average))
+        pictures.append(draw(mesh, posed(weights), camera((0, -12, 50), turn, 205), average))
         labels.append(name)
     for name, weights in BLINKS.items():
-        pictures.append(draw(posed(weights), camera((31, 27, 60), 10, 62), average))
+        pictures.append(draw(mesh, posed(weights), camera((31, 27, 60), 10, 62), average))
         labels.append(name)
     for name, member in CAST.items():
         vertices = dressed(member.face, mesh, member.complexion)
-        pictures.append(draw(vertices, camera((0, -20, 0), 25, 345), coloured(mesh, member.complexion)))
+        colours = coloured(mesh, member.complexion)
+        pictures.append(draw(mesh, vertices, camera((0, -25, 0), 25, 350), colours, vertices))
         labels.append(name)
-    save_image(output, contact_sheet(pictures, 4, labels=labels))
-    print(f"{output}: {len(mesh.vertices)} vertices, {len(mesh.quads)} quads")
+    return pictures, labels
+
+
+def editions() -> tuple[list[Picture], list[str]]:
+    """A speaker of the first edition above one of the second: at rest, from the side, saying /a/, and blinking."""
+    first, rig, mesh, member = build_face(), build_rig(SPEAKERS["F1"].shape), build_head(), CAST["F1"]
+    rest, colours = dressed(member.face, mesh, member.complexion), coloured(mesh, member.complexion)
+    pictures, labels = [], []
+    for name, old, new, turn in (
+        ("rest", {}, {}, 0),
+        ("three quarters", {}, {}, 35),
+        ("/a/", {"jaw_open": 1.0}, EXPRESSIONS["/a/"], 20),
+        ("a whole blink", {"lids_close": 1.0}, {"eyeBlink": 1.0}, 0),
+    ):
+        weights = np.array([[old.get(control, 0.0) for control in CONTROLS]])
+        moved = 1000.0 * rig.pose(weights)[0]
+        pictures.append(draw(first, moved, camera((0, 0, 0), turn, 330), first.colours, 1000.0 * rig.neutral))
+        labels.append(f"first edition, {name}")
+        points = rest + member.face(posed(new)) - member.face(mesh.vertices)
+        pictures.append(draw(mesh, points, camera((0, -25, 0), turn, 350), colours, rest))
+        labels.append(f"second edition, {name}")
+    return pictures[::2] + pictures[1::2], labels[::2] + labels[1::2]
+
+
+def draw(
+    mesh: QuadMesh | HeadMesh, vertices: Points, view: Camera, colours: Picture, rest: Points | None = None
+) -> Picture:
+    """One picture; ``rest`` is the face at rest where it is not the mesh's own."""
+    template = mesh.vertices if rest is None else rest
+    return Renderer(mesh.faces, template=template, size=SIZE, camera=view, colours=colours).render(vertices)
 
 
 if __name__ == "__main__":
