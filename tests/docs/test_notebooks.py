@@ -22,6 +22,7 @@ from facediff.synthetic import second_edition
 # 42 clips instead of 420
 second_edition.TRAIN_EACH = second_edition.REFERENCES_EACH = 3
 second_edition.TEST_EACH = second_edition.TEST_C_EACH = 1
+second_edition.TRAIN = second_edition.TRAIN[:4]  # so that all say the same ones
 """
 """Runs before a notebook."""
 
