@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from facediff.data import Puppet
+from facediff.data.check import check, text, truth
 from facediff.data.storage import ClipFolder, WeightFile
 from facediff.errors import FaceDiffError
 from facediff.synthetic.cast import KEPT_OUT, SEEN, UNSEEN, drawn_names, member_of
@@ -75,6 +76,33 @@ def test_vertices_are_what_weights_decode_to(corpus: Path) -> None:
     rig = rig_of("F1")
     assert np.allclose(vertices, rig[0] + np.einsum("tk,kvc->tvc", weights, rig[1:]), atol=1e-6)
     assert rig.shape == (1 + len(SHAPES), len(build_head().vertices), 3)
+
+
+def test_the_check_reads_weights_and_measures_the_truth(corpus: Path) -> None:
+    report = check(corpus)
+    assert report.sound, text(report)
+    assert report.n_vertices == len(build_head().vertices)
+    assert {row["split"]: row["present"] for row in report.splits} == {"train": 1, "test_a": 1, "test_b": 1}
+    values = {row["measure"]: row["value"] for row in report.truth}
+    frames, blinks = 0, 0
+    for name in ONLY:
+        shut = np.load(corpus / "weights_npy" / f"{name}.npy")[:, SHAPES.index("eyeBlinkLeft")] > 0.5
+        frames, blinks = frames + len(shut), blinks + int((np.diff(shut.astype(int)) == 1).sum())
+    assert float(values["blinks a minute"]) == pytest.approx(blinks / (frames / 1500), abs=0.06)
+    assert float(values["lips apart at p, b, m, 95th percentile, mm"]) < 2
+    assert "how the truth moves" in text(report)
+
+
+def test_frequencies_and_jumps_are_measured() -> None:
+    times = np.arange(500) / 25.0
+    waves = [np.sin(2 * np.pi * 3.0 * times), np.sin(2 * np.pi * 3.0 * times + 1.0)]
+    assert truth._median_frequency(waves, 25.0) == pytest.approx(3.0, abs=0.1)
+    two = np.sin(2 * np.pi * 3.0 * times) + 0.5 * np.sin(2 * np.pi * 10.0 * times)
+    assert truth._share_above([two[:, None, None]], 25.0, 8.0) == pytest.approx(0.2, abs=0.01)  # 0.25 of 1.25
+    gaze = np.zeros((20, 2))
+    gaze[5:] += [3.0, 4.0]
+    gaze[12:] -= [6.0, 0.0]
+    assert truth._jumps(gaze, 25.0) == pytest.approx([5.0, 6.0])
 
 
 def test_the_data_module_decodes_weights(corpus: Path) -> None:
