@@ -300,7 +300,10 @@ export_format = Kind(
     aliases=False,
 )
 puppet_voice = Kind(
-    "puppet_voice", "facediff.synthetic.voices", "speaks the sentences of the built-in corpus", aliases=False
+    "puppet_voice",
+    "facediff.synthetic.recordings facediff.synthetic.voices",
+    "speaks the sentences of the built-in corpus",
+    aliases=False,
 )
 receiver = Kind(
     "receiver",

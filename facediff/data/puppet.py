@@ -21,11 +21,12 @@ from facediff.data.manifest import read_manifest
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
 from facediff.synthetic import second_edition
-from facediff.synthetic.cast import SEEN, UNSEEN
+from facediff.synthetic.cast import MOST_DRAWN, SEEN, UNSEEN, drawn_names
 from facediff.synthetic.face import build_face
 from facediff.synthetic.further_speech import further_speech
+from facediff.synthetic.recordings import ALIGNED, speakers_of
 from facediff.synthetic.rig import eyelid_pairs
-from facediff.synthetic.speakers import MOST_DRAWN, drawn_names
+from facediff.synthetic.speakers import MOST_DRAWN as FIRST_MOST_DRAWN
 from facediff.utils.files import cache_dir
 from facediff.utils.licences import Commercial
 from facediff.utils.ranges import Range
@@ -156,6 +157,8 @@ class Puppet(SpeechMotionDataModule):
         edition: 1 or 2; the one in the folder if None, and the second where there is none yet.
         people_voices: let every second drawn speaker speak with a voice made from recordings of people, as far as flite
             and Festival are installed.
+        recordings: folder of people's recordings, ``SPEAKER/NAME.wav`` or ``.flac`` with ``NAME.TextGrid``: each drawn
+            speaker speaks with those of one person.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
     """
@@ -184,11 +187,16 @@ class Puppet(SpeechMotionDataModule):
         drawn_speakers: Annotated[int, Range(0, MOST_DRAWN)] = 0,
         edition: Literal[1, 2] | None = None,
         people_voices: bool = False,
+        recordings: str | None = None,
         batch_size: Count = 8,
         extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
+        if people_voices and recordings is not None:
+            raise FaceDiffError("data.people_voices and data.recordings both say who speaks; give one of them")
         people = second_edition.people_voices() if people_voices else ()
+        if recordings is not None:
+            people = tuple(f"{ALIGNED}:{speaker}" for speaker in speakers_of(Path(recordings).expanduser()))
         facts = EDITIONS[edition or 2](seed, drawn_speakers, people)
         drawn = drawn_names(drawn_speakers)
         super().__init__(
@@ -199,8 +207,11 @@ class Puppet(SpeechMotionDataModule):
         )
         stored = None if edition or root is None else edition_of(self.root)
         self.edition = facts if stored is None else EDITIONS[stored](seed, drawn_speakers, people)
-        if people and isinstance(self.edition, FirstEdition):
-            raise FaceDiffError("data.people_voices: belongs to the second edition; set data.edition=2 as well")
+        if isinstance(self.edition, FirstEdition) and (people or drawn_speakers > FIRST_MOST_DRAWN):
+            raise FaceDiffError(
+                f"data.edition: the first has no voices of people and {FIRST_MOST_DRAWN} drawn speakers at most; "
+                f"choose the second, or leave data.people_voices and data.recordings out"
+            )
         self.n_vertices = self.edition.n_vertices
         self.compared_speakers = (*SEEN, *self.edition.unseen)
         # The first identity is animated unless another is named, so it is one of the cast, not a drawn one.

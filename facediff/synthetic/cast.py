@@ -111,7 +111,7 @@ CAST = {member.name: member for member in _CAST}
 
 DRAWN = "X"
 """How names of drawn speakers start: ``X01``, ``X02`` …"""
-MOST_DRAWN = 99
+MOST_DRAWN = 9999
 KEPT_OUT = ("espeak:en-us+f5", "espeak:en-gb-x-rp+f1", "espeak:en-us+m1", "espeak:en-gb-scotland+m6", "espeak:en+m8")
 """espeak-ng's voices that no speaker is trained with: those of the unseen speakers and one of test C."""
 KEPT_OUT_PEOPLE = ("flite:slt",)
@@ -130,7 +130,7 @@ def member_of(name: str, people: Sequence[str] = ()) -> CastMember:
     return CAST[name] if name in CAST else _drawn(int(name.removeprefix(DRAWN)), tuple(people))
 
 
-@lru_cache(maxsize=MOST_DRAWN)
+@lru_cache(maxsize=128)
 def _drawn(number: int, people: tuple[str, ...]) -> CastMember:
     """A speaker with random face, complexion, voice and habits; the same number gives the same speaker.
 
@@ -160,5 +160,7 @@ def _drawn(number: int, people: tuple[str, ...]) -> CastMember:
     own = [f"espeak:{language}+{kind}" for language in _LANGUAGES for kind in _VARIANTS if kind.startswith(letter)]
     espeak = str(random.choice([voice for voice in own if voice not in KEPT_OUT]))
     voice = people[(number // 2) % len(people)] if people and number % 2 else espeak
+    if people and people[0].startswith("aligned:"):  # recorded people are many, and each of them is one speaker
+        voice = people[(number - 1) % len(people)]
     rate, pitch, spread = random.uniform(0.92, 1.12), random.uniform(-1.5, 1.5), random.uniform(0.7, 1.35)
     return CastMember(f"{DRAWN}{number:02d}", voice, rate, pitch, spread, face, complexion, SpeakingHabits(**habits))

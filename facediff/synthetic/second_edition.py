@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
 from facediff.synthetic.articulation import speech_sounds
-from facediff.synthetic.cast import CAST, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
+from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
 from facediff.synthetic.corpus import CORPUS, MANIFEST, in_quiet, refuse_foreign, write_ply
 from facediff.synthetic.further_speech import WORDS
 from facediff.synthetic.head.parts import AROUND_EYE, build_head
@@ -27,6 +27,7 @@ from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
 from facediff.synthetic.motion import analyse
 from facediff.synthetic.performance import MOODS, FaceMotion, perform
+from facediff.synthetic.recordings import ALIGNED, recordings_of
 from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION, turn
 from facediff.synthetic.speech import SpokenPhoneme, Utterance
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
@@ -79,7 +80,7 @@ class PerformedClip:
         return f"{self.identity}_{self.sentence}"
 
 
-def performed_clips(drawn: int = 0) -> tuple[PerformedClip, ...]:
+def performed_clips(drawn: int = 0, people: Sequence[str] = ()) -> tuple[PerformedClip, ...]:
     """All clips, speaker by speaker; moods take turns, so that every speaker has each of them equally often.
 
     Every speaker says other sentences in training, so that no sentence can be known by heart. On test A and B all
@@ -96,8 +97,14 @@ def performed_clips(drawn: int = 0) -> tuple[PerformedClip, ...]:
     for identity, voice in zip(SEEN, _voices_of_test_c(), strict=False):
         texts = turn(GERMAN if voice.startswith("espeak:de") else TEST[-6:], 0, TEST_C_EACH)
         plan.append((identity, "test_c", texts, voice))
-    plan += [(name, "train", turn(TRAIN, 5 * place, 24), "") for place, name in enumerate(drawn_names(drawn))]
     moods = tuple(MOODS)
+    for place, name in enumerate(drawn_names(drawn)):
+        voice = member_of(name, people).voice
+        if voice.startswith(f"{ALIGNED}:"):  # who is recorded says what was recorded
+            recordings = recordings_of(voice.partition(":")[2], REFERENCES_EACH)
+            plan += [(name, "train", [(number, said.text)], said.voice) for number, said in enumerate(recordings, 1)]
+        else:
+            plan.append((name, "train", turn(TRAIN, 5 * place, 24), ""))
     return tuple(
         PerformedClip(identity, split, number, text, moods[(number + place) % len(moods)], voice)
         for place, (identity, split, texts, voice) in enumerate(plan)
@@ -142,10 +149,10 @@ def generate_second(
         progress: whether to show a progress bar.
         only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
     """
-    clips = [clip for clip in performed_clips(drawn) if only is None or clip.name in only]
     if only is None and is_second_complete(root, seed=seed, drawn=drawn, people=people):
         return
     refuse_foreign(root)
+    clips = [clip for clip in performed_clips(drawn, people) if only is None or clip.name in only]
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, clips, people)
         tasks = run_tasks(
@@ -214,6 +221,7 @@ def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] =
     random = np.random.default_rng([number, len(WORDS), 2])
     text = " ".join(random.choice(WORDS, size=random.integers(5, 9)))
     identity = identities[int(random.integers(len(identities)))]
+    people = [voice for voice in people if not voice.startswith(ALIGNED)]  # recordings say their own words only
     return speak_clip(PerformedClip(identity, "train", 1, text, str(random.choice([*MOODS]))), people).samples
 
 
@@ -259,8 +267,9 @@ def perform_clip(
     member, sounds = member_of(clip.identity), speech_sounds(spoken.phonemes)
     contours = analyse(spoken.samples, SAMPLE_RATE)
     frames = round(len(spoken.samples) / SAMPLE_RATE * frame_rate)
-    everybody = (*CAST, *drawn_names(99))
-    key = [seed, everybody.index(clip.identity), *map(ord, clip.sentence)]
+    everybody = list(CAST)
+    drawn = len(everybody) - 1 + int(clip.identity.removeprefix(DRAWN)) if clip.identity not in CAST else 0
+    key = [seed, drawn or everybody.index(clip.identity), *map(ord, clip.sentence)]
     draws = _DRAWS if clip.split.startswith("test") else 1
     performances = [
         perform(sounds, contours, frames, frame_rate, member.habits, clip.mood, np.random.default_rng([*key, draw]))

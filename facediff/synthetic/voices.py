@@ -65,6 +65,16 @@ class Synthesiser(ABC):
     def voices(cls) -> list[str]:
         """Names of the voices that are installed; none where the program is missing."""
 
+    @classmethod
+    def open(cls, voice: str, name: str) -> Synthesiser:
+        """One of the voices that are installed; ``name`` is its whole name, for errors."""
+        program, installed = name.partition(":")[0], cls.voices()
+        if not installed:
+            raise FaceDiffError(f'voice "{name}": {program} is not installed; {cls.install}')
+        if voice.split("+")[0] not in installed:
+            raise FaceDiffError(f'voice "{name}": {program} has no voice "{voice}"; {choices(voice, installed)}')
+        return cls(voice)
+
     @abstractmethod
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
         """Speak a sentence; the same arguments give the same samples.
@@ -80,12 +90,7 @@ def open_voice(name: str) -> Synthesiser:
     synthesiser = puppet_voice.get(program)
     if not colon or not voice:
         raise FaceDiffError(f'voice "{name}": names no voice; expected SYNTHESISER:VOICE, such as flite:slt')
-    installed = synthesiser.voices()
-    if not installed:
-        raise FaceDiffError(f'voice "{name}": {program} is not installed; {synthesiser.install}')
-    if voice.split("+")[0] not in installed:
-        raise FaceDiffError(f'voice "{name}": {program} has no voice "{voice}"; {choices(voice, installed)}')
-    return synthesiser(voice)
+    return synthesiser.open(voice, name)
 
 
 def installed_voices() -> dict[str, list[str]]:
@@ -117,7 +122,7 @@ class Espeak(Synthesiser):
 
 
 # The phones of CMU's dictionary, as flite and Festival name them, in the International Phonetic Alphabet.
-_CMU_PHONES = {
+CMU_PHONES = {
     **{"aa": "ɑ", "ae": "æ", "ah": "ʌ", "ao": "ɔ", "aw": "aʊ", "ax": "ə", "axr": "ɚ", "ay": "aɪ", "eh": "ɛ", "er": "ɝ"},
     **{"ey": "eɪ", "ih": "ɪ", "iy": "i", "ow": "oʊ", "oy": "ɔɪ", "uh": "ʊ", "uw": "u", "el": "əl", "em": "əm"},
     **{"en": "ən", "b": "b", "ch": "tʃ", "d": "d", "dh": "ð", "dx": "ɾ", "f": "f", "g": "ɡ", "hh": "h", "hv": "ɦ"},
@@ -244,7 +249,7 @@ def _utterance(sound: Path, ends: Iterable[tuple[str, float]], voice: str) -> Ut
     phonemes, start = [], 0.0
     for name, end in ends:
         if end > start:
-            phonemes.append(SpokenPhoneme(start, end, _CMU_PHONES.get(name, name)))
+            phonemes.append(SpokenPhoneme(start, end, CMU_PHONES.get(name, name)))
         start = max(start, end)
     if not any(phoneme.ipa for phoneme in phonemes):
         raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')

@@ -1,0 +1,138 @@
+"""Aligned recordings as voices: both formats of TextGrids, both alphabets, and a corpus that speaks with them."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from facediff.data import Puppet
+from facediff.errors import FaceDiffError
+from facediff.synthetic.recordings import phones_of, read_text_grid, recordings_of, speakers_of
+from facediff.synthetic.second_edition import generate_second, performed_clips
+from facediff.synthetic.voices import Delivery, installed_voices, open_voice
+
+PHONES = [(0.0, 0.3, "sil"), (0.3, 0.45, "M"), (0.45, 0.8, "AA1"), (0.8, 0.9, "M"), (0.9, 1.1, "AH0"), (1.1, 1.4, "")]
+IN_IPA = [(start, end, ipa) for (start, end, _), ipa in zip(PHONES, ["", "m", "ɑ", "m", "ʌ", ""], strict=True)]
+WORDS = [(0.0, 0.3, ""), (0.3, 1.1, 'ma"ma'), (1.1, 1.4, "")]
+Tier = tuple[str, list[tuple[float, float, str]]]
+
+
+def short_format(*tiers: Tier) -> str:
+    lines = ['File type = "ooTextFile"', 'Object class = "TextGrid"', "", "0", "1.4", "<exists>", str(len(tiers))]
+    for name, intervals in tiers:
+        lines += ['"IntervalTier"', f'"{name}"', "0", "1.4", str(len(intervals))]
+        for start, end, text in intervals:
+            lines += [f"{start}", f"{end}", '"' + text.replace('"', '""') + '"']
+    return "\n".join(lines) + "\n"
+
+
+def long_format(*tiers: Tier) -> str:
+    lines = [
+        'File type = "ooTextFile"',
+        'Object class = "TextGrid"',
+        "",
+        "xmin = 0 ",
+        "xmax = 1.4 ",
+        "tiers? <exists> ",
+    ]
+    lines += [f"size = {len(tiers)} ", "item []: "]
+    for number, (name, intervals) in enumerate(tiers, 1):
+        lines += [f"    item [{number}]:", '        class = "IntervalTier" ', f'        name = "{name}" ']
+        lines += ["        xmin = 0 ", "        xmax = 1.4 ", f"        intervals: size = {len(intervals)} "]
+        for place, (start, end, text) in enumerate(intervals, 1):
+            quoted = '"' + text.replace('"', '""') + '"'
+            lines += [f"        intervals [{place}]:", f"            xmin = {start} "]
+            lines += [f"            xmax = {end} ", f"            text = {quoted} "]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture
+def people(tmp_path: Path) -> Path:
+    """Two speakers with two recordings each; one of them in a chapter's folder, as LibriSpeech has it."""
+    random = np.random.default_rng(0)
+    for speaker in ("84/121123", "174"):
+        folder = tmp_path / "people" / speaker
+        folder.mkdir(parents=True)
+        for number in (1, 2):
+            noise = 0.1 * random.standard_normal(round(1.4 * 22_050))
+            soundfile.write(folder / f"a-{number}.{'flac' if number == 1 else 'wav'}", noise, 22_050)
+            (folder / f"a-{number}.TextGrid").write_text(short_format(("words", WORDS), ("phones", PHONES)))
+    return tmp_path / "people"
+
+
+@pytest.mark.parametrize("form", [short_format, long_format])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_both_formats_and_encodings_are_read_alike(form: object, encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.TextGrid"
+    path.write_text(form(("words", WORDS), ("phones", PHONES)), encoding=encoding)  # type: ignore[operator]
+    assert read_text_grid(path) == {"words": WORDS, "phones": PHONES}
+    assert [(p.start, p.end, p.ipa) for p in phones_of(path)] == IN_IPA
+
+
+def test_ipa_is_taken_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.TextGrid"
+    path.write_text(
+        short_format(("84 - phones", [(0.0, 0.2, "spn"), (0.2, 0.4, "y"), (0.4, 1.4, "tʃ")])), encoding="utf-8"
+    )
+    assert [p.ipa for p in phones_of(path)] == ["", "y", "tʃ"]  # the ARPAbet's y would be j
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (short_format(("words", WORDS)), "no tier of phones .its tiers: words"),
+        (short_format(("phones", [*PHONES[:3], (0.7, 1.4, "M")])), "tier phones goes back in time at 0.7"),
+        (short_format(("phones", [*PHONES[:5], (1.1, 1.4, "QX")])), '"QX"'),
+        (short_format(("phones", PHONES))[:-30], "tier phones is cut short"),
+        (short_format(("phones", [(0.0, 1.4, "")])), "pauses only"),
+        ('File type = "ooTextFile"\nObject class = "PitchTier"\n', "no TextGrid"),
+    ],
+)
+def test_errors_name_file_and_tier(content: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "spoilt.TextGrid"
+    path.write_text(content)
+    with pytest.raises(FaceDiffError, match=named) as caught:
+        phones_of(path)
+    assert "spoilt.TextGrid" in str(caught.value)
+
+
+def test_a_recording_is_a_voice(people: Path) -> None:
+    voice = open_voice(f"aligned:{people / '174' / 'a-1'}")
+    spoken = voice.speak("whatever", Delivery(rate=2.0))
+    assert len(spoken.samples) == round(1.4 * 16_000)
+    assert [p.ipa for p in spoken.phonemes] == [ipa for _, _, ipa in IN_IPA]
+    assert "aligned" not in installed_voices()
+    assert [said.text for said in recordings_of(str(people / "84"), 9)] == ['ma"ma', 'ma"ma']
+    soundfile.write(people / "174" / "a-1.flac", np.zeros(8000), 16_000)
+    with pytest.raises(FaceDiffError, match=r"a-1.TextGrid: .*ends at 1.40 s and a-1.flac at 0.50"):
+        voice.speak()
+    with pytest.raises(FaceDiffError, match="no such recording"):
+        open_voice(f"aligned:{people / 'nobody'}").speak()
+    (people / "empty").mkdir()
+    with pytest.raises(FaceDiffError, match="no aligned recording"):
+        speakers_of(people / "174")
+
+
+def test_drawn_speakers_speak_with_the_recordings_of_people(people: Path, tmp_path: Path) -> None:
+    data = Puppet(root=str(tmp_path / "corpus"), drawn_speakers=3, recordings=str(people))
+    voices = data.edition.people
+    assert [Path(voice).name for voice in voices] == ["174", "84"]
+    clips = [clip for clip in performed_clips(3, voices) if clip.identity.startswith("X")]
+    assert [(clip.identity, Path(clip.voice).name) for clip in clips][:3] == [
+        ("X01", "a-1"),
+        ("X01", "a-2"),
+        ("X02", "a-1"),
+    ]
+    generate_second(tmp_path / "corpus", drawn=3, people=voices, only=[clips[0].name], progress=False)
+    with (tmp_path / "corpus" / "phonemes" / "X01_e01.csv").open(encoding="utf-8") as stream:
+        phonemes = list(csv.DictReader(stream))
+    assert "".join(row["ipa"] for row in phonemes) == "mɑmʌ"
+    speech, rate = soundfile.read(tmp_path / "corpus" / "wav" / "X01_e01.wav")
+    assert rate == 16_000
+    assert len(np.load(tmp_path / "corpus" / "weights_npy" / "X01_e01.npy")) == len(speech) / 640
+    with pytest.raises(FaceDiffError, match="one of them"):
+        Puppet(people_voices=True, recordings=str(people))
