@@ -152,7 +152,7 @@ def _targets(
     accessor = attributes(primitive).get("NORMAL")
     if accessor is not None:
         local = glb.numbers(accessor, "VEC3", ("f4", "i1", "i2"), len(part.local)).astype(np.float64)
-        shown = _unit(local @ np.linalg.inv(part.turn))  # normals turn by the inverse transpose
+        shown = _unit((local[:, None] @ np.linalg.inv(part.turn))[:, 0])  # normals turn by the inverse transpose
         local_turns = (_unit((turns.at(offset, rows, shown)[:, None] @ part.turn)[:, 0]) for offset in offsets)
         normals = (normal.astype(np.float32) for normal in local_turns)
         shapes = normal_shapes(morphs.weights, local.astype(np.float32), normals)

@@ -166,6 +166,7 @@ def write_avatar(
     unit: float = 100.0,
     z_up: bool = True,
     skinned: bool = True,
+    posed: bool = False,
     sparse: bool = True,
     animated: bool = True,
     names: dict[str, str] | None = None,
@@ -179,6 +180,8 @@ def write_avatar(
         unit: how many of the units of the file's vertices are a metre; the armature's scale undoes it.
         z_up: whether the vertices have z up; the armature's rotation undoes it.
         skinned: whether a skin puts the parts into place; else the armature does.
+        posed: whether the head is stored nodding and the skin blends it into the spine, so that each vertex is placed
+            by a matrix of its own.
         sparse: whether the targets are sparse accessors.
         animated: whether the file has an animation of joints and of the head's weights.
         names: other names of the targets.
@@ -196,6 +199,8 @@ def write_avatar(
         {"name": "Spine", "children": [2]},
         {"name": "HeadJoint", "translation": (unit * turn @ [0, 1.5, 0]).tolist()},
     ]
+    if posed:
+        nodes[2]["rotation"] = [np.sin(0.2), 0.0, 0.0, np.cos(0.2)]
     placed = np.eye(4)
     placed[:3, :3] = turn.T / unit
     joint = placed.copy()
@@ -234,9 +239,11 @@ def write_avatar(
         }
         if skinned:
             slots = np.zeros((len(points), 4), np.uint8)
-            slots[:, 0] = part.joint
+            slots[:, :2] = part.joint, 0
             weights = np.zeros((len(points), 4), np.float32)
-            weights[:, 0] = 1
+            height = part.vertices[:, 1] - part.vertices[:, 1].min()
+            weights[:, 0] = 0.5 + 0.5 * height / height.max() if posed else 1
+            weights[:, 1] = 1 - weights[:, 0]
             attributes |= {
                 "JOINTS_0": file.add(slots, "VEC4", target=34962),
                 "WEIGHTS_0": file.add(weights, "VEC4", target=34962),

@@ -30,7 +30,7 @@ def opened(path: Path) -> Glb:
     return Glb(path.read_bytes(), path)
 
 
-def talk(path: Path, parts: dict[str, AvatarPart]) -> Animation:
+def talk(path: Path, parts: dict[str, AvatarPart], *, posed: bool = False) -> Animation:
     """The avatar opens its jaw and smiles on one side, as its own targets do."""
     mesh = read_mesh(path)
     rest = mesh.vertices.astype(np.float32)
@@ -40,7 +40,7 @@ def talk(path: Path, parts: dict[str, AvatarPart]) -> Animation:
     for names in shown:
         part = next(parts[name] for name in parts if f"{name}Material" in names)
         count = len(part.vertices)
-        assert rest[before : before + count] == pytest.approx(part.vertices, abs=2e-6)
+        assert posed or rest[before : before + count] == pytest.approx(part.vertices, abs=2e-6)
         for name, peak in (("jawOpen", 4), ("mouthSmileLeft", 6)):
             weights = np.clip(1 - np.abs(np.arange(FRAMES) - peak) / 4, 0, 1)
             delta = part.targets.get(name, np.zeros((count, 3)))
@@ -68,9 +68,9 @@ def evaluated(glb: Glb, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
         made.append(values)
     points, normals = made
     matrix = np.eye(4) if part.matrix is None else part.matrix
-    assert matrix.shape == (4, 4)
-    placed = points @ matrix[:3, :3].T + matrix[:3, 3]
-    turned = normals @ np.linalg.inv(matrix[:3, :3])
+    matrix = np.broadcast_to(matrix, (len(points), 4, 4))
+    placed = np.einsum("vij,vj->vi", matrix[:, :3, :3], points) + matrix[:, :3, 3]
+    turned = np.einsum("vi,vij->vj", normals, np.linalg.inv(matrix[:, :3, :3]))
     return placed, turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
@@ -96,6 +96,7 @@ def without_additions(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any
 
 LAYOUTS: dict[str, dict[str, Any]] = {
     "skinned, centimetres, z up": {},
+    "skinned, stored in a pose": {"posed": True},
     "one mesh, metres": {"joined": True, "unit": 1.0, "z_up": False, "skinned": False, "sparse": False},
 }
 
@@ -103,7 +104,7 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_an_avatar_keeps_all_it_has(tmp_path: Path, parts: dict[str, AvatarPart], layout: str) -> None:
     write_avatar(tmp_path / "avatar.glb", parts, **LAYOUTS[layout])
-    animation = talk(tmp_path / "avatar.glb", parts)
+    animation = talk(tmp_path / "avatar.glb", parts, posed=LAYOUTS[layout].get("posed", False))
     add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.01)
     old, new = opened(tmp_path / "avatar.glb"), opened(tmp_path / "out.glb")
     assert new.binary.startswith(old.binary)
@@ -140,7 +141,7 @@ def test_vertices_and_normals_move_as_the_animation_has_it(
     tmp_path: Path, parts: dict[str, AvatarPart], layout: str
 ) -> None:
     write_avatar(tmp_path / "avatar.glb", parts, **LAYOUTS[layout])
-    animation = talk(tmp_path / "avatar.glb", parts)
+    animation = talk(tmp_path / "avatar.glb", parts, posed=LAYOUTS[layout].get("posed", False))
     add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.01)
     new = opened(tmp_path / "out.glb")
     starts = np.cumsum([0, *(len(part.local) for part in placed_parts(new))])
@@ -159,7 +160,9 @@ def test_vertices_and_normals_move_as_the_animation_has_it(
             cosine = (normals * expected).sum(axis=1)
             stays = (normals_of(truth[0], part.faces) * expected).sum(axis=1)
             # The file's normals weigh triangles by angle, and seams are turned as one.
-            assert np.rad2deg(np.arccos(np.clip(np.median(cosine), -1, 1))) < 1
+            # A skin turns normals by its weights and not by how these change from vertex to vertex.
+            limit = 3 if LAYOUTS[layout].get("posed") else 1
+            assert np.rad2deg(np.arccos(np.clip(np.median(cosine), -1, 1))) < limit
             assert np.mean(cosine > np.cos(np.deg2rad(8))) > 0.95
             if frame == 4:
                 assert np.mean(stays < np.cos(np.deg2rad(8))) > 0.1
