@@ -168,6 +168,21 @@ class ComponentMotion(MotionSpace):
         """Sizes squared, of as many components as there are."""
         return self._sizes(variances.sqrt()).square()
 
+    def modes(
+        self, covariance: Float[Tensor, "components window window"]
+    ) -> tuple[Float[Tensor, " modes"], Float[Tensor, " modes"]]:
+        """Variances of the movements over a window, as the noise sees them, and their shares of the middle frame's.
+
+        Args:
+            covariance: of the components, each of unit variance, over the frames of a window.
+        """
+        deviations = self.components.deviations.cpu().double()[:, None]
+        variances, vectors = torch.linalg.eigh(covariance.double())
+        variances = variances.clamp_min(0)
+        shown = vectors[:, self.prior_frames // 2].square() * variances
+        sizes = self._sizes(deviations[:, 0])[:, None]
+        return (variances * sizes.square()).flatten(), (shown * deviations.square()).flatten()
+
     def _sizes(self, deviations: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         # In proportion to the largest, so that the unit of the corpus drops out; floored, since a corpus with fewer
         # components than ``count`` leaves deviations of 0, by which decoding would divide.

@@ -341,7 +341,7 @@ def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion
 
 
 def test_training_measures_the_covariance_over_time(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:
-    model = make_model(motion_space=partial(SPACE, prior_frames=5), noise_scale=0.1)
+    model = make_model(motion_space=partial(SPACE, prior_frames=5), noise_scale="auto")
     make_trainer(max_epochs=1).fit(model, datamodule=tiny)
     space = model.motion_space
     assert isinstance(space.preconditioning, TemporalPreconditioning)
@@ -356,6 +356,12 @@ def test_training_measures_the_covariance_over_time(make_model: Make, make_train
     scales = space.preconditioning
     measured = scales.vectors * scales.variances[:, None] @ scales.vectors.transpose(1, 2)
     np.testing.assert_allclose(measured[:3].detach(), expected[:3], rtol=1e-3, atol=1e-3 * float(expected[:3].max()))
+    # Half of a frame's variance shows where the schedule has as much signal as noise, given the frames around it.
+    measured = measured.detach().double().numpy() * model.process.scale**2
+    shown = [own[2] @ np.linalg.solve(own + np.eye(5), own[:, 2]) for own in measured]
+    weight = (space.components.deviations / space.sizes).square().double().numpy()
+    total = measured[:, 2, 2] @ weight
+    assert float(np.array(shown) @ weight / total) == pytest.approx(0.5, abs=0.02)
     with pytest.raises(FaceDiffError, match="prior_frames"):
         ComponentMotion(n_vertices=6, steps=10, prior_frames=4)
     with pytest.raises(FaceDiffError, match="prior_frames"):

@@ -222,15 +222,18 @@ class DualPathDiffusion(AnimationModel):
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Besides principal components, how much noise hides of the training motion."""
         shapes = super().measure(data, PRINCIPAL if self.noise_scale == "auto" else at_least)
-        if self.noise_scale == "auto" and shapes is not None:
-            # Shapes are as long as their standard deviations, so their squared lengths are the components' variances.
-            variances = shapes[:PRINCIPAL].square().sum(1)
-            self.rescale_noise(half_hidden(self.motion_space.noised_variances(variances), variances))
-        space = self.motion_space
-        covariance = None
+        space, covariance = self.motion_space, None
         if space.prior_frames > 1 and isinstance(space, ComponentMotion):
             project = space.components.project
             covariance = data.covariance_over_time(lambda motion: project(motion * self.scale), space.prior_frames)
+        if self.noise_scale == "auto" and shapes is not None:
+            # Shapes are as long as their standard deviations, so their squared lengths are the components' variances.
+            variances = shapes[:PRINCIPAL].square().sum(1)
+            noised = space.noised_variances(variances)
+            if covariance is not None and isinstance(space, ComponentMotion):
+                # What a frame hides is less when its neighbours tell it.
+                noised, variances = space.modes(covariance)
+            self.rescale_noise(half_hidden(noised, variances))
         space.fit(self.process.signal, covariance)
         return shapes
 
