@@ -270,12 +270,12 @@ class PreconditionedDenoiser(ConditionalDenoiser):
 
     def denoise(self, state: State, step: Step) -> State:
         """M̂⁰."""
-        steps = step_of_rows(step, state)
+        scales, steps = self.preconditioning, step_of_rows(step, state)
         # The state stays as it is and only the network's input is scaled: samplers know nothing of preconditioning.
-        scaled = self.preconditioning.into[steps][:, None] * state
-        features = self.features(self.network.embed(scaled), step)
+        mean = scales.posterior_mean(state, steps, self.mask)
+        features = self.features(self.network.embed(scales.inputs(state, mean, steps)), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
-        return self.blend(self.preconditioning.clean(state, self.network.clean_motion(features), steps, self.mask))
+        return self.blend(scales.clean(mean, self.network.clean_motion(features), steps, self.mask))
 
 
 # The products of the two maps.

@@ -51,6 +51,11 @@ class MotionSpace(nn.Module, ABC):
     prior_frames: int = 1
 
     @property
+    def inputs(self) -> int:
+        """Noisy coordinates, and smoothed ones where the preconditioning knows motion over time."""
+        return self.coordinates * (1 if self.prior_frames == 1 else 2)
+
+    @property
     def region_weights(self) -> Mapping[str, float]:
         """What motion is multiplied by before its principal components are taken, by the region's name."""
         return {}
@@ -268,17 +273,35 @@ class Preconditioning(nn.Module):
         # such steps would otherwise not be trained.
         self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
 
-    def clean(
+    def posterior_mean(
         self,
         noisy: Coordinates,
-        features: Coordinates,
         step: Int[Tensor, " batch"],
         mask: Bool[Tensor, "batch frames"],  # noqa: ARG002 - every frame by itself
     ) -> Coordinates:
-        """The prediction of clean motion from the noisy one and the network's output; ``mask`` is True on frames."""
+        """The prediction without any network; ``mask`` is True on valid frames."""
+        return self.skip[step][:, None] * noisy
+
+    def inputs(
+        self,
+        noisy: Coordinates,
+        mean: Coordinates,  # noqa: ARG002 - the noisy motion in another size
+        step: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch frames inputs"]:
+        """What the network sees, given the noisy motion and its posterior mean; of unit variance."""
+        return self.into[step][:, None] * noisy
+
+    def clean(
+        self,
+        mean: Coordinates,
+        features: Coordinates,
+        step: Int[Tensor, " batch"],
+        mask: Bool[Tensor, "batch frames"],  # noqa: ARG002
+    ) -> Coordinates:
+        """The prediction of clean motion from the posterior mean and the network's output."""
         # c_skip and c_out of Karras et al. (2022, eq. 7), one for each component and step. At the clean end skip is 1
         # and out 0, so that a network's errors no longer reach the sample.
-        return self.skip[step][:, None] * noisy + self.out[step][:, None] * features
+        return mean + self.out[step][:, None] * features
 
 
 class TemporalPreconditioning(Preconditioning):
@@ -301,15 +324,18 @@ class TemporalPreconditioning(Preconditioning):
         vectors: V of every coordinate, (coordinates, W, W).
         variances: Λ, (coordinates, W).
         signal: ᾱ of every step.
+        into_mean: one over the deviation of the posterior mean, (steps, coordinates).
     """
 
     vectors: Tensor
     variances: Tensor
     signal: Tensor
+    into_mean: Tensor
 
     def __init__(self, steps: int, coordinates: int, frames: int) -> None:
         super().__init__(steps, coordinates)
         self.frames = frames
+        self.register_buffer("into_mean", torch.zeros(steps, coordinates))
         self.register_buffer("vectors", torch.zeros(coordinates, frames, frames))
         self.register_buffer("variances", torch.zeros(coordinates, frames))
         self.register_buffer("signal", torch.zeros(steps))
@@ -336,22 +362,38 @@ class TemporalPreconditioning(Preconditioning):
         self.variances.copy_(variances)
         self.signal.copy_(signal)
         kept, counted = signal.cpu().double()[:, None, None], importance.cpu().double()
-        left = variances * (1 - kept) / (kept * variances + 1 - kept)
-        left = (vectors[:, middle].square() * left).sum(2)
+        total, shares = kept * variances + 1 - kept, vectors[:, middle].square()
+        left = (shares * variances * (1 - kept) / total).sum(2)
+        self.into_mean.copy_((shares * kept * variances.square() / total).sum(2).clamp_min(1e-30).rsqrt())
         self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
+
+    def posterior_mean(
+        self, noisy: Coordinates, step: Int[Tensor, " batch"], mask: Bool[Tensor, "batch frames"]
+    ) -> Coordinates:
+        """The smoothed motion; ``mask`` is True on valid frames."""
+        kept = self.signal[step][:, None, None]
+        return self._filtered(noisy, kept.sqrt() * self.variances / (kept * self.variances + 1 - kept), mask)
+
+    def inputs(
+        self, noisy: Coordinates, mean: Coordinates, step: Int[Tensor, " batch"]
+    ) -> Float[Tensor, "batch frames inputs"]:
+        """The noisy motion and the smoothed one, both of unit variance."""
+        # A Gaussian prior takes a blink for drift and draws neither: what the smoothed motion shows there is to be made
+        # sharp, and smaller everywhere else. That depends on its value, which a network would have to compute from the
+        # noise of many frames.
+        return torch.cat([super().inputs(noisy, mean, step), self.into_mean[step][:, None] * mean], -1)
 
     def clean(
         self,
-        noisy: Coordinates,
+        mean: Coordinates,
         features: Coordinates,
         step: Int[Tensor, " batch"],
         mask: Bool[Tensor, "batch frames"],
     ) -> Coordinates:
-        """The prediction of clean motion from the noisy one and the network's output."""
-        kept, own = self.signal[step][:, None, None], self.variances
-        total = kept * own + 1 - kept
-        mean = self._filtered(noisy, kept.sqrt() * own / total, mask)
-        return mean + self._filtered(features, (own * (1 - kept) / total).sqrt(), mask)
+        """The prediction of clean motion from the posterior mean and the network's output."""
+        kept = self.signal[step][:, None, None]
+        left = self.variances * (1 - kept) / (kept * self.variances + 1 - kept)
+        return mean + self._filtered(features, left.sqrt(), mask)
 
     def _filtered(
         self,

@@ -44,6 +44,8 @@ def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
                 basis_size=4,
             )
         model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        if "motion_space" in options:
+            model.measure(tiny)
         model.windows = PLAN
         return model.eval()
 
@@ -78,6 +80,7 @@ SAMPLERS = {
         *(("dual_path", {"sampler": partial(getattr(registry.sampler, s), **o)}) for s, o in SAMPLERS.items()),
         ("dual_path", {"sampling_space": "vertices"}),
         ("dual_path", {"style_encoder": registry.style_encoder.none}),
+        ("dual_path", {"motion_space": partial(registry.motion_space.components, count=6, prior_frames=7)}),
         ("style_content", {}),
     ],
 )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
+from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.model import DualPathDiffusion
 from facediff.models.inference import SpeechStream, WindowNoise
@@ -77,10 +79,18 @@ def test_windows_with_a_past_share_its_noise(plan: WindowPlan) -> None:
     assert float((every @ every.T / 32 - torch.eye(len(every))).abs().max()) < 6.5 * (2 / 32) ** 0.5
 
 
-@pytest.fixture
-def model(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> DualPathDiffusion:
-    made = make_model()
+@pytest.fixture(params=["frames by themselves", "prior over time"])
+def model(
+    make_model: Callable[..., DualPathDiffusion], tiny: Tiny, request: pytest.FixtureRequest
+) -> DualPathDiffusion:
+    if request.param == "frames by themselves":
+        made = make_model()
+        made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        return made.eval()
+    made = make_model(motion_space=partial(registry.motion_space.components, count=6, prior_frames=7))
     made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    made.measure(tiny)
+    torch.nn.init.normal_(made.network.unembed.weight)
     return made.eval()
 
 

@@ -121,6 +121,10 @@ def test_motion_that_never_changes_has_no_components() -> None:
         components(torch.zeros(1, 5, 6, 3), count=3)
 
 
+def predicted(scales: Preconditioning, noisy: Tensor, features: Tensor, step: Tensor, mask: Tensor) -> Tensor:
+    return scales.clean(scales.posterior_mean(noisy, step, mask), features, step, mask)
+
+
 def gaussian(process: NoiseProcess) -> Preconditioning:
     made = Preconditioning(process.steps, len(VARIANCES))
     made.fit(process.signal, VARIANCES, torch.ones(3))
@@ -135,7 +139,7 @@ def test_a_silent_network_gives_the_posterior_mean_of_gaussian_motion(step: int)
     # Regression of x on y = √ᾱ x + √(1 − ᾱ) ε: cov(x, y) / var(y); what is left is var(x) − cov² / var(y).
     covariance, variance = np.sqrt(kept) * own, kept * own + 1 - kept
     scales = gaussian(process)
-    found = scales.clean(torch.from_numpy(noisy).float(), torch.zeros(1, 1, 3), torch.tensor([step]), ALL[:, :1])
+    found = predicted(scales, torch.from_numpy(noisy).float(), torch.zeros(1, 1, 3), torch.tensor([step]), ALL[:, :1])
     np.testing.assert_allclose(found.numpy(), covariance / variance * noisy, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(scales.out[step].numpy() ** 2, own - covariance**2 / variance, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(scales.into[step].numpy() ** 2 * variance, 1, rtol=1e-4)
@@ -162,7 +166,9 @@ def test_sampling_with_a_silent_network_gives_gaussian_motion(
         return torch.randn(like.shape, generator=random)
 
     def denoise(noisy: Tensor, step: int) -> Tensor:
-        return scales.clean(noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step), ALL.expand(len(noisy), -1))
+        return predicted(
+            scales, noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step), ALL.expand(len(noisy), -1)
+        )
 
     sample = sampler(process).run(denoise, noise(torch.empty(20, 1000, 3)), noise=noise)
     deviations = sample.flatten(0, 1).std(0) / VARIANCES.sqrt()
@@ -193,7 +199,7 @@ def test_a_silent_network_smooths_by_the_frames_of_its_window(step: int) -> None
     noisy = torch.from_numpy(random.standard_normal((2, 15, 3))).float()
     mask = torch.arange(15) < torch.tensor([[15], [9]])
     steps, silence = torch.tensor([step, step]), torch.zeros(2, 15, 3)
-    clean = scales.clean(noisy, silence, steps, mask)
+    clean = predicted(scales, noisy, silence, steps, mask)
     places = torch.arange(7)
     covariance = over_time(places[:, None] - places).numpy()
     for clip, length in enumerate((15, 9)):
@@ -203,15 +209,17 @@ def test_a_silent_network_smooths_by_the_frames_of_its_window(step: int) -> None
                 gain = np.linalg.solve(kept * own + (1 - kept) * np.eye(7), np.sqrt(kept) * own[frame - start])
                 assert float(clean[clip, frame, k]) == pytest.approx(gain @ window[:, k], rel=1e-3, abs=1e-5)
     features = torch.randn(2, 15, 3)
-    alone = scales.clean(noisy[1:, :9], features[1:, :9], steps[1:], mask[1:, :9])
-    torch.testing.assert_close(scales.clean(noisy, features, steps, mask)[1:, :9], alone)
+    alone = predicted(scales, noisy[1:, :9], features[1:, :9], steps[1:], mask[1:, :9])
+    torch.testing.assert_close(predicted(scales, noisy, features, steps, mask)[1:, :9], alone)
     # White features leave what the posterior leaves open.
-    many = scales.clean(torch.zeros(1, 100_000, 3), torch.randn(1, 100_000, 3), steps[:1], torch.ones(1, 100_000) > 0)
+    many = predicted(
+        scales, torch.zeros(1, 100_000, 3), torch.randn(1, 100_000, 3), steps[:1], torch.ones(1, 100_000) > 0
+    )
     for k, own in enumerate(covariance):
         total = kept * own + (1 - kept) * np.eye(7)
         left = own[3, 3] - kept * own[3] @ np.linalg.solve(total, own[3])
         assert float(many[0, :, k].var()) == pytest.approx(left, rel=0.03, abs=1e-6)
-    assert scales.clean(noisy[:, :3], silence[:, :3], steps, mask[:, :3]).isfinite().all()
+    assert predicted(scales, noisy[:, :3], silence[:, :3], steps, mask[:, :3]).isfinite().all()
 
 
 @pytest.mark.parametrize(
@@ -228,9 +236,14 @@ def test_sampling_with_a_silent_network_gives_motion_of_the_covariance_over_time
 
     def denoise(noisy: Tensor, step: int) -> Tensor:
         mask = ALL[:, : noisy.shape[1]].expand(len(noisy), -1)
-        return scales.clean(noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step), mask)
+        return predicted(scales, noisy, torch.zeros_like(noisy), torch.full((len(noisy),), step), mask)
 
     sample = sampler(process).run(denoise, noise(torch.empty(120, 60, 3)), noise=noise)
+    # The network sees both in unit variance.
+    mask, steps = ALL[:, :60].expand(120, -1), torch.full((120,), 400)
+    noisy = process.add_noise(sample, torch.randn(sample.shape, generator=random), steps)
+    seen = scales.inputs(noisy, scales.posterior_mean(noisy, steps, mask), steps)[:, 12:-12]
+    assert ((seen.square().mean((0, 1)) - 1).abs() < 0.15).all()
     for lag in (0, 1, 2, 4, 8):
         expected = over_time(torch.tensor(lag)).float()
         found = (sample[:, lag:] * sample[:, : 60 - lag]).mean((0, 1))

@@ -129,7 +129,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
         quick = model.sampler
     preconditioned = model.motion_space.preconditioning is not None
     folded = model.sampling_space == "folded" and not preconditioned
-    batch, frames, width = 2, 50, network.embed.in_features
+    batch, frames, width = 2, 50, network.coordinates
     dim = network.embed.out_features
     state = dim if folded else width
     kept = width if preconditioned else dim

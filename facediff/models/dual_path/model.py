@@ -191,6 +191,7 @@ class DualPathDiffusion(AnimationModel):
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
             coordinates=self.motion_space.coordinates,
+            inputs=self.motion_space.inputs,
             dim=dim,
             audio_encoder=audio_encoder(dim=dim),
             identity_encoder=identity_encoder(dim=dim, n_identities=len(self.identities)),
@@ -436,9 +437,10 @@ class DualPathDiffusion(AnimationModel):
     ) -> dict[str, Tensor]:
         """The losses in a space of known variances."""
         noisy = self.process.add_noise(clean, noise, step)
-        embedded = self.network.embed(scales.into[step][:, None] * noisy)
+        mean = scales.posterior_mean(noisy, step, mask)
+        embedded = self.network.embed(scales.inputs(noisy, mean, step))
         features = self.network.clean_motion(self.network.core(embedded, step, conditions))
-        predicted = scales.clean(noisy, features, step, mask)
+        predicted = scales.clean(mean, features, step, mask)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
 
     def _with_style_losses(self, losses: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:

@@ -97,7 +97,8 @@ class DualPathNetwork(nn.Module):
     ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
 
     Args:
-        coordinates: numbers in a frame of noisy motion.
+        coordinates: numbers in a frame of motion.
+        inputs: numbers in a frame that the network sees; as many if None.
         dim: channels C.
         audio_encoder: speech to F_a.
         identity_encoder: identity to F_id.
@@ -114,6 +115,7 @@ class DualPathNetwork(nn.Module):
         self,
         *,
         coordinates: int,
+        inputs: int | None = None,
         dim: int,
         audio_encoder: AudioEncoder,
         identity_encoder: IdentityEncoder,
@@ -131,7 +133,7 @@ class DualPathNetwork(nn.Module):
         self.identity_encoder = identity_encoder
         self.style_encoder = style_encoder
         self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
-        self.embed = nn.Linear(coordinates, dim)
+        self.embed = nn.Linear(coordinates if inputs is None else inputs, dim)
         self.mesh_encoder = mesh_encoder
         self.step_embedding = StepEmbedding(dim)
         self.fusion = fusion
