@@ -302,7 +302,8 @@ def load_pickle(path: Path, *, stand_ins: tuple[str, ...] = ()) -> Any:  # noqa:
     token = _COPIED.set([0])
     try:
         with path.open("rb") as stream:
-            check_program(stream.fileno(), path)
+            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as program:
+                check_program(program, path)
             unpickler = PlainUnpickler(stream, encoding="latin1")
             unpickler.stand_ins = stand_ins
             loaded = unpickler.load()
@@ -322,16 +323,18 @@ def _held(value: object) -> Collection[object] | None:
     return (value.arguments, value.state) if isinstance(value, StandIn) else None
 
 
-def check_program(file: int, source: object) -> None:
+def check_program(data: bytes | mmap.mmap, source: object, *, long_bytes: int = LONG_BYTES) -> None:
     """Walk through a pickle without running it, and refuse what only bombs have.
 
     Refused are arguments that reach beyond the end of the file, of which the reader would allocate the declared length;
-    memo indices far beyond the number of opcodes, up to which it would fill a table; numbers of more than 64 bits; and
-    more opcodes than the budget has entries for.
+    memo indices far beyond the number of opcodes, up to which it would fill a table; numbers of too many bits; and more
+    opcodes than the budget has entries for. The opcodes are those that :mod:`pickletools` knows, so that a new one is
+    walked over, or refused, like the others.
 
     Args:
-        file: descriptor of the open file.
+        data: the pickle.
         source: the file, for the message.
+        long_bytes: of the longest whole number.
 
     Raises:
         UnpicklingError: if it is no pickle, or one of these.
@@ -341,38 +344,37 @@ def check_program(file: int, source: object) -> None:
     opcodes = {ord(opcode.code): opcode for opcode in pickletools.opcodes}
     lengths = {-2: 1, -3: 4, -4: 4, -5: 8}  # bytes of the length that precedes an argument
     most = OPCODES_PER_ENTRY * LIMITS.entries
-    with mmap.mmap(file, 0, access=mmap.ACCESS_READ) as data:
-        at = count = 0
-        while True:
-            opcode = opcodes.get(data[at]) if at < len(data) else None
-            if opcode is None:
-                raise pickle.UnpicklingError("it ends too early, or holds an unknown opcode")
-            if opcode.code == ".":
-                return
-            at, count = at + 1, count + 1
-            if count > most:
-                LIMITS.check("entries", count // OPCODES_PER_ENTRY, source)
-            argument = opcode.arg
-            if argument is None:
-                continue
-            start = at
-            if argument.n >= 0:
-                at += argument.n
-            elif argument.n == -1:
-                for _ in range(2 if argument.name.endswith("_pair") else 1):
-                    at = data.find(b"\n", at) + 1 or len(data) + 1
-            else:
-                start = at + lengths[argument.n]
-                at = start + int.from_bytes(data[at:start], "little")
-            if at > len(data):
-                raise pickle.UnpicklingError("it is cut short, or declares more bytes than it has")
-            if opcode.name == "FRAME" and int.from_bytes(data[start:at], "little") > len(data) - at:
-                raise pickle.UnpicklingError("it is cut short, or declares more bytes than it has")
-            if opcode.name in ("LONG1", "LONG4") and at - start > LONG_BYTES:
-                raise pickle.UnpicklingError("it holds a whole number of more than 64 bits")
-            if opcode.name in ("INT", "LONG", "FLOAT", "PUT", "GET") and at - start > LINE:
-                raise pickle.UnpicklingError(f"it holds the number {quoted(data[start : start + LINE])}")
-            if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT"):
-                index = int(data[start:at]) if opcode.name == "PUT" else int.from_bytes(data[start:at], "little")
-                if index > 2 * count + 256:
-                    raise pickle.UnpicklingError("it remembers under numbers that no pickle reaches")
+    at = count = 0
+    while True:
+        opcode = opcodes.get(data[at]) if at < len(data) else None
+        if opcode is None:
+            raise pickle.UnpicklingError("it ends too early, or holds an unknown opcode")
+        if opcode.code == ".":
+            return
+        at, count = at + 1, count + 1
+        if count > most:
+            LIMITS.check("entries", count // OPCODES_PER_ENTRY, source)
+        argument = opcode.arg
+        if argument is None:
+            continue
+        start = at
+        if argument.n >= 0:
+            at += argument.n
+        elif argument.n == -1:
+            for _ in range(2 if argument.name.endswith("_pair") else 1):
+                at = data.find(b"\n", at) + 1 or len(data) + 1
+        else:
+            start = at + lengths[argument.n]
+            at = start + int.from_bytes(data[at:start], "little")
+        if at > len(data):
+            raise pickle.UnpicklingError("it is cut short, or declares more bytes than it has")
+        if opcode.name == "FRAME" and int.from_bytes(data[start:at], "little") > len(data) - at:
+            raise pickle.UnpicklingError("it is cut short, or declares more bytes than it has")
+        if opcode.name in ("LONG1", "LONG4") and at - start > long_bytes:
+            raise pickle.UnpicklingError(f"it holds a whole number of more than {8 * (long_bytes - 1)} bits")
+        if opcode.name in ("INT", "LONG", "FLOAT", "PUT", "GET") and at - start > LINE:
+            raise pickle.UnpicklingError(f"it holds the number {quoted(data[start : start + LINE])}")
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            index = int(data[start:at]) if opcode.name == "PUT" else int.from_bytes(data[start:at], "little")
+            if index > 2 * count + 256:
+                raise pickle.UnpicklingError("it remembers under numbers that no pickle reaches")

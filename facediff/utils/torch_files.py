@@ -24,6 +24,10 @@ from typing import IO, Any, ClassVar
 
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import LIMITS, check_nesting, quoted
+from facediff.utils.pickles import check_program
+
+STATE_BYTES = 17
+"""Bytes of the longest whole number: 128 bits and a sign, as the states of random numbers have them."""
 
 PICKLE_BYTES = 64 * 2**20
 """Most bytes of ``data.pkl``: names, numbers and the outlines of tensors, not their values."""
@@ -243,8 +247,11 @@ def read_outline(stream: IO[bytes], source: object, kind: type[OutlineReader] | 
         name = f"{folder}/data.pkl"
         if sizes.get(name, PICKLE_BYTES) >= PICKLE_BYTES:
             raise pickle.UnpicklingError("its plain values are missing or too long")
+        program = archive.read(name)
+        # An opcode may declare any length, which the reader reserves before it finds that the file is shorter.
+        check_program(program, source, long_bytes=STATE_BYTES)
         reader = (kind or OutlineReader)(
-            io.BytesIO(archive.read(name)),
+            io.BytesIO(program),
             {name.removeprefix(f"{folder}/data/"): size for name, size in sizes.items() if "/data/" in name},
         )
         reader.folder = folder

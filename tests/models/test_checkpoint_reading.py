@@ -9,10 +9,13 @@ from __future__ import annotations
 import copy
 import io
 import itertools
+import pickletools
 import random
 import resource
+import struct
 import sys
 import time
+import tracemalloc
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -274,6 +277,24 @@ def test_an_archive_that_pytorch_does_not_write_is_refused(name: str, tmp_path: 
     path.write_bytes(ARCHIVES[name])
     assert str(path) in law(lambda: load_model(path))
     assert str(path) in law(lambda: read_assets(path))
+
+
+def test_no_opcode_of_a_checkpoint_reserves_what_it_declares() -> None:
+    """Of every opcode that says how long its argument is, also those that future versions of Python add."""
+    lengths = {-2: "<B", -3: "<i", -4: "<I", -5: "<Q"}
+    declaring = [opcode for opcode in pickletools.opcodes if opcode.arg is not None and opcode.arg.n in lengths]
+    assert {"BYTEARRAY8", "BINBYTES8", "LONG4", "BINUNICODE"} <= {opcode.name for opcode in declaring}
+    for opcode in declaring:
+        form = lengths[opcode.arg.n]
+        length = {"<B": 255, "<i": 2**31 - 1, "<I": 2**32 - 1, "<Q": 2**31}[form]
+        program = b"\x80\x05" + opcode.code.encode("latin1") + struct.pack(form, length) + b"a."
+        bomb = repacked(VALID, lambda name, data, body=program: body if name.endswith("data.pkl") else data)
+        tracemalloc.start()
+        with pytest.raises(FaceDiffError, match="declares more bytes"):
+            load_tensors(io.BytesIO(bomb), opcode.name)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2**22, opcode.name
 
 
 def test_a_plain_file_of_pytorch_is_read() -> None:
