@@ -36,7 +36,7 @@ from facediff.metrics.base import align
 from facediff.models import AnimationModel
 from facediff.models.evaluation import regions_of
 from facediff.registry import checks_arguments
-from facediff.render import VIEWS, Renderer, comparison, contact_sheet, save_image, write_video
+from facediff.render import VIEWS, Camera, Renderer, comparison, contact_sheet, portrait, save_image, write_video
 from facediff.speech.audio import fit_length, samples_for
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
@@ -339,11 +339,13 @@ def draw_clip(
         raise FaceDiffError(f"{assets.corpus} has no mesh to draw")
     clip_scores = scores(model, sample, motion)
     corpus = f"{assets.corpus}, synthetic corpus" if assets.synthetic else assets.corpus
+    template, width = sample.template.numpy(), round(ASPECT * size)
+    framed = portrait(template, {name: indices.numpy() for name, indices in assets.regions.items()})
     renderer = Renderer(
         assets.faces.numpy(),
-        template=sample.template.numpy(),
-        view=view,
-        size=(size, round(ASPECT * size)),
+        template=template,
+        size=(size, width),
+        camera=Camera.framing(framed, view=view, aspect=width / size),
         colours=None if (colours := assets.colours_of(sample.identity_name)) is None else colours.numpy(),
     )
     frames = comparison(

@@ -56,7 +56,7 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
 
     Faces of one unit are seen by one camera, so that their sizes compare.
     """
-    from facediff.render import Camera, Renderer, side_by_side
+    from facediff.render import Camera, Renderer, portrait, side_by_side
 
     if len({animation.frame_rate for animation in animations}) > 1:
         rates = ", ".join(f"{animation.name} {animation.frame_rate:g}" for animation in animations)
@@ -65,7 +65,7 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
         )
     camera = None
     if len({metres_per_unit(animation.unit) for animation in animations}) == 1:
-        camera = Camera.framing([animation.template for animation in animations], view=options.view)
+        camera = Camera.framing([portrait(each.template, each.regions) for each in animations], view=options.view)
     renderers = [
         Renderer(
             animation.triangles,

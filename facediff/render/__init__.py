@@ -10,7 +10,7 @@ Example:
 """
 
 from facediff.render.panels import check_motion, comparison, contact_sheet, heat_colours, save_image, side_by_side
-from facediff.render.rasteriser import EVEN, STUDIO, VIEWS, Camera, Light, Look, Renderer
+from facediff.render.rasteriser import EVEN, STUDIO, VIEWS, Camera, Light, Look, Renderer, portrait
 from facediff.render.video import write_video
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "comparison",
     "contact_sheet",
     "heat_colours",
+    "portrait",
     "save_image",
     "side_by_side",
     "write_video",

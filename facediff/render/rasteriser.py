@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -304,6 +304,17 @@ class Camera:
         turned = (vertices - np.asarray(self.centre)) @ np.asarray(self.rotation).T
         turned[:, 2] -= self.distance
         return np.asarray(turned, dtype=np.float64)
+
+
+def portrait(template: Floats, regions: Mapping[str, npt.ArrayLike]) -> Floats:
+    """The vertices (n, 3) that a picture is framed on: without shoulders, where the regions of the face are known.
+
+    What is left out lies further below the ``lips`` than the ``upper_face`` lies above them, and a tenth.
+    """
+    if not {"lips", "upper_face"} <= regions.keys():
+        return template
+    lips, upper = (float(template[np.asarray(regions[name]), 1].mean()) for name in ("lips", "upper_face"))
+    return template[template[:, 1] > lips - 1.1 * (upper - lips)] if upper > lips else template
 
 
 # The look: material, lights and background.

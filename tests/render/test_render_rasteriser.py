@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.render import EVEN, VIEWS, Camera, Light, Look, Renderer
+from facediff.render import EVEN, VIEWS, Camera, Light, Look, Renderer, portrait
 from facediff.render.rasteriser import TABLE_SIZE, light_table, to_linear, to_srgb
 
 MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
@@ -184,3 +184,12 @@ def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, sphe
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(FaceDiffError, match=r"facediff\[render\]"):
         renderer.render(vertices)
+
+
+def test_a_portrait_leaves_out_shoulders_but_no_chin() -> None:
+    heights = np.array([0.12, 0.05, 0.0, -0.04, -0.06, -0.095, -0.12, -0.3])  # crown to chest; lips at -0.04
+    bust = np.stack([np.zeros_like(heights), heights, np.zeros_like(heights)], axis=1)
+    kept = portrait(bust, {"lips": [3], "upper_face": [1, 2]})
+    assert kept[:, 1].tolist() == heights[:6].tolist()
+    assert portrait(bust, {"lips": [3]}) is bust
+    assert portrait(bust, {"lips": [0], "upper_face": [3]}) is bust  # upside down: not a face that we know
