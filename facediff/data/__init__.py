@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from facediff.data.datamodule import SpeechMotionDataModule as SpeechMotionDataModule
     from facediff.data.mead3d import Mead3D as Mead3D
     from facediff.data.puppet import Puppet as Puppet
+    from facediff.data.puppet import PuppetMask as PuppetMask
     from facediff.data.vocaset import Vocaset as Vocaset
 
 __getattr__, __dir__, __all__ = lazy_names(
@@ -26,7 +27,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "corpus": "Clip Corpus",
         "datamodule": "SpeechMotionDataModule",
         "mead3d": "Mead3D",
-        "puppet": "Puppet",
+        "puppet": "Puppet PuppetMask",
         "vocaset": "Vocaset",
     },
 )

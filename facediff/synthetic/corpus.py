@@ -206,9 +206,9 @@ def _chosen(only: Sequence[str] | None, drawn: int) -> tuple[SyntheticClip, ...]
     return tuple(clips_by_name[name] for name in only)
 
 
-def refuse_foreign(root: Path) -> None:
+def refuse_foreign(root: Path, corpus: str = CORPUS) -> None:
     """Never replace a folder that this generator did not write."""
-    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != CORPUS:
+    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != corpus:
         raise FaceDiffError(
             f"{root}: is not empty and holds no manifest of the built-in corpus; choose another folder, or remove it"
         )

@@ -22,6 +22,7 @@ from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
 from facediff.synthetic.corpus import CORPUS, MANIFEST, in_quiet, refuse_foreign, write_ply
 from facediff.synthetic.further_speech import WORDS
+from facediff.synthetic.head.mask import build_mask
 from facediff.synthetic.head.parts import AROUND_EYE, build_head
 from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
@@ -29,7 +30,7 @@ from facediff.synthetic.motion import analyse
 from facediff.synthetic.performance import MOODS, FaceMotion, perform
 from facediff.synthetic.recordings import ALIGNED, recordings_of
 from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION, turn
-from facediff.synthetic.speech import SpokenPhoneme, Utterance
+from facediff.synthetic.speech import SENTENCES, SpokenPhoneme, Utterance
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes
@@ -112,6 +113,74 @@ def performed_clips(drawn: int = 0, people: Sequence[str] = ()) -> tuple[Perform
     )
 
 
+def mask_clips() -> tuple[PerformedClip, ...]:
+    """All clips of the second corpus, which has sentences and speakers of its own."""
+    plan = [(name, "train", range(24)) for name in MASK_SEEN]
+    plan += [(name, "val", range(24, 27)) for name in MASK_SEEN]
+    plan += [(name, "test_a", range(27, 32)) for name in MASK_SEEN]
+    plan += [(name, "references", range(12)) for name in MASK_UNSEEN]
+    plan += [(name, "test_b", range(27, 32)) for name in MASK_UNSEEN]
+    moods = tuple(MOODS)
+    return tuple(
+        PerformedClip(identity, split, number + 1, SENTENCES[number], moods[(number + place) % len(moods)])
+        for place, (identity, split, numbers) in enumerate(plan)
+        for number in numbers
+    )
+
+
+@dataclass(frozen=True)
+class Production:
+    """What differs between the corpora that are made here.
+
+    Attributes:
+        corpus: name in ``manifest.json``.
+        mesh_file: file with the faces.
+        frame_rate: motion frames a second.
+        mask: whether the motion is that of the mask instead of the whole head.
+    """
+
+    corpus: str = CORPUS
+    mesh_file: str = "PUPPET.ply"
+    frame_rate: int = FRAME_RATE
+    mask: bool = False
+
+    @property
+    def speakers(self) -> tuple[str, ...]:
+        """Who speaks, drawn speakers of the first corpus aside."""
+        return (*MASK_SEEN, *MASK_UNSEEN) if self.mask else tuple(CAST)
+
+    def clips(self, drawn: int, people: Sequence[str]) -> tuple[PerformedClip, ...]:
+        """All clips."""
+        return mask_clips() if self.mask else performed_clips(drawn, people)
+
+    def carry(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Values (V, …) of the head's vertices at those of this corpus's mesh."""
+        precise = np.asarray(values, np.float64)
+        return build_mask().carry(precise) if self.mask else precise
+
+    def colours(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colours (V, 3) of the head at this corpus's mesh."""
+        return np.rint(self.carry(colours.astype(np.float64))).astype(np.uint8)
+
+    def vertices(self, index: NDArray[np.int64], *, region: bool = False) -> NDArray[np.int64]:
+        """Vertices of this corpus's mesh at vertices of the head; those between them too if it is a region."""
+        if not self.mask:
+            return index
+        return build_mask().region(index) if region else build_mask().vertex_of[index]
+
+    def rig(self, identity: str) -> NDArray[np.float32]:
+        """A speaker's face at rest and the displacements of :data:`SHAPES`, in metres, (55, V, 3)."""
+        rig = rig_of(identity)
+        return self.carry(rig.transpose(1, 0, 2)).transpose(1, 0, 2).astype(np.float32) if self.mask else rig
+
+
+PUPPET = Production()
+MASK_SEEN = tuple(f"{DRAWN}{number}" for number in range(5001, 5009))
+MASK_UNSEEN = tuple(f"{DRAWN}{number}" for number in range(5009, 5013))
+"""Speakers of the second corpus: drawn ones that the first does not have."""
+MASK = Production(f"{CORPUS}_mask", "MASK.ply", 30, mask=True)
+
+
 def _voices_of_test_c() -> tuple[str, ...]:
     """Voices kept out of training: a variant of espeak-ng, a language, and one of people where it is installed."""
     people = [name for name in KEPT_OUT_PEOPLE if name.partition(":")[2] in Flite.voices()]
@@ -136,6 +205,7 @@ def generate_second(
     scheduler: str | None = "",
     progress: bool = True,
     only: Sequence[str] | None = None,
+    production: Production = PUPPET,
 ) -> None:
     """Write the second edition, unless the folder holds it already; it appears whole or not at all.
 
@@ -148,15 +218,17 @@ def generate_second(
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
         only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
+        production: the corpus itself, or the second one with the mask.
     """
-    if only is None and is_second_complete(root, seed=seed, drawn=drawn, people=people):
+    facts = _facts(seed, drawn, people, production)
+    if only is None and _is_complete(root, facts):
         return
-    refuse_foreign(root)
-    clips = [clip for clip in performed_clips(drawn, people) if only is None or clip.name in only]
+    refuse_foreign(root, production.corpus)
+    clips = [clip for clip in production.clips(drawn, people) if only is None or clip.name in only]
     with atomic_folder(root, replace=True) as folder:
-        _write_common(folder, clips, people)
+        _write_common(folder, clips, people, production)
         tasks = run_tasks(
-            partial(_write_clip, folder, seed=seed, people=tuple(people)),
+            partial(_write_clip, folder, seed=seed, people=tuple(people), production=production),
             clips,
             workers=workers or 1,
             scheduler=scheduler,
@@ -169,22 +241,22 @@ def generate_second(
                 if isinstance(count, WorkerDied):
                     raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
                 frames += count
-        counts = {"subjects": len(CAST) + drawn, "vertices": len(build_head().vertices), "frames": frames}
-        facts = {**_facts(seed, drawn, people), "whole": only is None, "clips": len(clips), **counts}
-        write_json(folder / MANIFEST, {**facts, "files": describe_files(folder)})
+        counts = {"subjects": len(production.speakers) + drawn, "vertices": vertex_count(production), "frames": frames}
+        more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": production.frame_rate}
+        write_json(folder / MANIFEST, {**facts, **more, "files": describe_files(folder)})
 
 
-def is_second_complete(root: Path, *, seed: int = 0, drawn: int = 0, people: Sequence[str] = ()) -> bool:
+def _is_complete(root: Path, facts: dict[str, object]) -> bool:
     """Whether a folder holds the whole corpus of this version, seed and voices; compares sizes, not contents."""
     manifest = read_json(Path(root) / MANIFEST) or {}
-    facts, files = {**_facts(seed, drawn, people), "whole": True}, manifest.get("files")
-    same = all(manifest.get(key) == value for key, value in facts.items())
+    files = manifest.get("files")
+    same = all(manifest.get(key) == value for key, value in {**facts, "whole": True}.items())
     return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
-def _facts(seed: int, drawn: int, people: Sequence[str]) -> dict[str, object]:
+def _facts(seed: int, drawn: int, people: Sequence[str], production: Production) -> dict[str, object]:
     # Without what test C is spoken with: a folder stays whole where flite is installed later, or is missing.
-    facts = {"corpus": CORPUS, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
+    facts = {"corpus": production.corpus, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
     return {**facts, "people": list(people)}
 
 
@@ -211,9 +283,9 @@ def rig_of(identity: str) -> NDArray[np.float32]:
     return rig
 
 
-def vertex_count() -> int:
-    """Vertices of a head."""
-    return len(build_head().vertices)
+def vertex_count(production: Production = PUPPET) -> int:
+    """Vertices of a corpus's mesh."""
+    return build_mask().operator.shape[0] if production.mask else len(build_head().vertices)
 
 
 def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] = ()) -> NDArray[np.float32]:
@@ -283,7 +355,7 @@ def perform_clip(
     return performances[middle], performances[0 if middle else 1]
 
 
-def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str]) -> None:
+def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str], production: Production) -> None:
     """Write everything that is not a clip."""
     for name in (
         "wav",
@@ -299,20 +371,22 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
         (folder / name).mkdir()
     mesh = build_head()
     templates = {}
-    for identity in dict.fromkeys((*CAST, *(clip.identity for clip in clips))):
-        rig = rig_of(identity)
+    for identity in dict.fromkeys(clip.identity for clip in clips):
+        rig = production.rig(identity)
         np.save(folder / "rigs" / f"{identity}.npy", rig)
         templates[identity] = rig[0].astype(np.float64)
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
-    complexions = {name: coloured(mesh, member_of(name, people).complexion) for name in templates}
+    complexions = {name: production.colours(coloured(mesh, member_of(name, people).complexion)) for name in templates}
     np.savez(folder / "colours.npz", **complexions)
-    mean = np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0
-    write_ply(folder / "PUPPET.ply", mean, mesh.faces, coloured(mesh, Complexion()))
+    mean = production.carry(np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0)
+    faces = build_mask().faces if production.mask else mesh.faces
+    write_ply(folder / production.mesh_file, mean, faces, production.colours(coloured(mesh, Complexion())))
     for name, index in region_vertices().items():
-        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, index.tolist())) + "\n")
+        own = production.vertices(index, region=True)
+        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, own.tolist())) + "\n")
     for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
-        pairs = zip(*(side.tolist() for side in sides), strict=True)
+        pairs = zip(*(production.vertices(side).tolist() for side in sides), strict=True)
         (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
     write_table(folder / "shapes.csv", [["shape"], *([name] for name in SHAPES)])
     table = [["clip", "subject", "sentence", "split", "mood", "voice", "text"]]
@@ -322,18 +396,18 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
     write_table(folder / "clips.csv", table)
 
 
-def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str]) -> int:
+def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str], production: Production) -> int:
     """Write sound, motion and phonemes of a clip and return its number of frames."""
     import soundfile
 
     spoken = speak_clip(clip, people)
-    performance, another = perform_clip(clip, spoken, seed)
+    performance, another = perform_clip(clip, spoken, seed, production.frame_rate)
     soundfile.write(
         folder / "wav" / f"{clip.name}.wav", np.rint(spoken.samples * 32767.0).astype(np.int16), SAMPLE_RATE
     )
     for name, track in (("weights", performance.weights), ("gaze", performance.gaze), ("head", performance.head)):
         np.save(folder / f"{name}_npy" / f"{clip.name}.npy", track.astype(np.float32))
-    if clip.split.startswith("test"):
+    if clip.split.startswith("test") and not production.mask:  # those of the mask would take a gigabyte
         rig = rig_of(clip.identity)
         vertices = rig[0] + np.einsum("tk,kvc->tvc", performance.weights.astype(np.float32), rig[1:])
         np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))

@@ -11,12 +11,14 @@ import pytest
 
 from facediff.data import Puppet
 from facediff.data.check import check, text, truth
+from facediff.data.puppet import PuppetMask
 from facediff.data.storage import ClipFolder, WeightFile
 from facediff.errors import FaceDiffError
 from facediff.synthetic.cast import KEPT_OUT, SEEN, UNSEEN, drawn_names, member_of
+from facediff.synthetic.head.mask import build_mask
 from facediff.synthetic.head.parts import build_head
-from facediff.synthetic.head.rig import SHAPES, lip_pairs
-from facediff.synthetic.second_edition import generate_second, perform_clip, performed_clips, rig_of, speak_clip
+from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, lip_pairs
+from facediff.synthetic.second_edition import MASK, generate_second, perform_clip, performed_clips, rig_of, speak_clip
 from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION
 
 ONLY = ("F1_e01", "F1_t01", "M5_t14")
@@ -138,3 +140,38 @@ def test_truth_closes_its_lips_and_another_truth_differs() -> None:
     assert np.abs(truth.weights - another.weights).max() > 0.1
     jaw = SHAPES.index("jawOpen")  # which speech decides
     assert np.abs(truth.weights[:, jaw] - another.weights[:, jaw]).max() < 0.1
+
+
+def test_the_mask_is_the_heads_front_in_the_number_of_vertices_of_scans() -> None:
+    mask, head = build_mask(), build_head()
+    assert mask.operator.shape == (PuppetMask.n_vertices, len(head.vertices))
+    assert np.allclose(mask.operator.sum(axis=1), 1.0)  # the rule moves with whatever it is applied to
+    vertices = mask.carry(head.vertices)
+    corners = vertices[mask.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(normals, axis=1).min() > 0
+    edges = np.sort(np.concatenate([mask.faces[:, [0, 1]], mask.faces[:, [1, 2]], mask.faces[:, [2, 0]]]), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2
+    for side in (*lip_pairs(head), *eyelid_pairs(head)):
+        assert np.linalg.norm(vertices[mask.vertex_of[side]] - head.vertices[side], axis=1).max() < 2.0
+
+
+def test_the_corpus_of_masks_moves_as_the_heads_do(tmp_path: Path) -> None:
+    generate_second(tmp_path / "masks", only=["X5001_e01", "X5009_t28"], production=MASK, progress=False)
+    data = PuppetMask(root=str(tmp_path / "masks"))
+    assert {split: [clip.name for clip in data.clips(split)] for split in ("train", "test_a", "test_b")} == {
+        "train": ["X5001_e01"],
+        "test_a": [],
+        "test_b": ["X5009_t28"],
+    }
+    assert data.assets().faces.shape[1] == 3
+    clip = data.clips("train")[0]
+    motion, speech = data.corpus.read_motion(clip), data.corpus.read_audio(clip, 0, data.corpus.frames(clip))
+    assert abs(len(speech) / 16_000 - len(motion) / 30) < 0.04
+    weights, head = np.load(tmp_path / "masks" / "weights_npy" / "X5001_e01.npy"), rig_of("X5001")
+    mask, place = build_mask(), np.flatnonzero(build_mask().vertex_of >= 0)
+    own = np.einsum("tk,kvc->tvc", weights, head[1:, place])
+    assert np.abs(motion.numpy()[:, mask.vertex_of[place]] - own).max() < 0.003
+    report = check(tmp_path / "masks")
+    assert report.sound, text(report)
+    assert report.corpus == "puppet_mask"
