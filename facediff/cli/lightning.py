@@ -6,6 +6,7 @@ within a second; :mod:`facediff.cli.lightning_cli` is what runs then.
 
 from __future__ import annotations
 
+import ctypes
 import difflib
 import json
 import os
@@ -73,12 +74,28 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
 
     from facediff.cli.lightning_cli import run_lightning_cli
 
+    if name == "fit":
+        keep_freed_memory()
     for kind in registry.KINDS.values():
         kind.load()
     if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
         sys.path.append(os.getcwd())
     with exit_statuses():
         return run_lightning_cli(name, options, experiment_name(options) or name)
+
+
+def keep_freed_memory() -> bool:
+    """Have glibc reuse the memory of freed tensors; returns whether it could be told.
+
+    By default it returns large blocks to the system, which hands them out again page by page: at 6 000 vertices a
+    quarter of a training step on a processor (0.24 of 0.91 processor seconds).
+    """
+    mmap_max, trim_threshold = -4, -1  # of malloc.h
+    try:
+        tell_malloc = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):  # another system, or another C library
+        return False
+    return bool(tell_malloc(mmap_max, 0) and tell_malloc(trim_threshold, 2**31 - 1))
 
 
 def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
