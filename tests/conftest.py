@@ -15,6 +15,9 @@ os.environ["WANDB_SILENT"] = "true"
 os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what they are
 
 import gc
+
+gc.disable()  # what is imported and collected stays; it comes back below
+
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -59,8 +62,8 @@ TypeCheckingVisitor.update_aliases = update_aliases_once
 
 def pytest_collection_finish() -> None:
     """Thousands of tests and all modules stay until the end: the garbage collector need not look at them each time."""
-    gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import json
 import subprocess
@@ -68,13 +69,26 @@ def package_of(file: Path) -> str:
     return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+@functools.cache
+def imports_in(text: str) -> tuple[list[ast.Import | ast.ImportFrom], set[int]]:
+    """The statements that import, at the top of a file or inside functions, and the lines for type checkers only."""
+    statements: list[ast.Import | ast.ImportFrom] = []
+    typed: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            statements.append(node)
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            typed.update(range(node.lineno, (node.body[-1].end_lineno or 0) + 1))
+    return statements, typed
+
+
 def imported(file: Path) -> Iterator[tuple[int, str]]:
-    """Line and full name of everything a file imports, at its top or inside functions."""
+    """Line and full name of everything a file imports."""
     package = ["facediff", *file.relative_to(PACKAGE).parent.parts]
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in imports_in(file.read_text(encoding="utf-8"))[0]:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             base = package[: len(package) - node.level + 1] if node.level else []
             source = ".".join([*base, *([node.module] if node.module else [])])
             # `from facediff import registry` names a module; `from facediff.data import Batch`, a package and a class.
@@ -109,9 +123,7 @@ def circle_of_files(*, types: bool) -> list[str]:
     modules = {module_of(file): file for file in FILES}
     graph: dict[str, set[str]] = {}
     for module, file in modules.items():
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        checks = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n.test)]
-        typed = {line for check in checks for line in range(check.lineno, (check.body[-1].end_lineno or 0) + 1)}
+        typed = imports_in(file.read_text(encoding="utf-8"))[1]
         names = [name for line, name in imported(file) if types or line not in typed]
         # A name is a module, or stands in one.
         targets = {name if name in modules else name.rpartition(".")[0] for name in names}

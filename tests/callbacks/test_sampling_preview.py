@@ -161,7 +161,7 @@ def test_preview_with_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path)
             assert shown(folder / "B_e05.png", model, "B_e05", tiny) is averaged
 
 
-@pytest.mark.parametrize("preview", [SamplingPreview, Broken])
+@pytest.mark.parametrize("preview", [SamplingPreview, pytest.param(Broken, marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore:the preview of:UserWarning")
 def test_preview_leaves_training_the_same_digit_for_digit(
     preview: type[SamplingPreview], make_model: MakeModel, make_trainer: MakeTrainer, tiny_root: Path
@@ -213,7 +213,7 @@ def test_preview_is_drawn_when_it_is_due(
         trainer.fit(make_model(), datamodule=tiny)
         return sorted(int(path.name[-4:]) for path in (tmp_path / folder).glob("previews/*"))
 
-    often = {"max_epochs": 7, "check_val_every_n_epoch": 3, "limit_train_batches": 1}
+    often = {"max_epochs": 7, "check_val_every_n_epoch": 3, "limit_train_batches": 1, "limit_val_batches": 1}
     assert epochs("a", often, every_n_epochs=2) == [3, 6, 7]
     assert epochs("b", often, every_n_epochs=4, at_end=False) == [6]
     assert epochs("c", often, every_n_epochs=None) == [7]

@@ -59,7 +59,9 @@ def losses(
     return train
 
 
-@pytest.mark.parametrize("frozen", [0, 2, -1])
+@pytest.mark.parametrize(
+    "frozen", [pytest.param(0, marks=pytest.mark.slow), 2, pytest.param(-1, marks=pytest.mark.slow)]
+)
 def test_speech_feature_cache_gives_the_same_losses(
     losses: Callable[..., tuple[list[float], int]], tmp_path: Path, frozen: int
 ) -> None:

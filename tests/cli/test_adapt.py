@@ -126,7 +126,7 @@ def test_the_second_system_adapts_too(second: Path, tmp_path: Path) -> None:
     assert load_model(path).identities[0] == "C"
 
 
-@pytest.mark.parametrize("which", ["checkpoint", "second"])
+@pytest.mark.parametrize("which", ["checkpoint", pytest.param("second", marks=pytest.mark.slow)])
 def test_a_style_vector_does_what_its_clip_does(
     which: str, request: pytest.FixtureRequest, tmp_path: Path, fit: Callable[..., int]
 ) -> None:
@@ -144,9 +144,9 @@ def test_a_style_vector_does_what_its_clip_does(
     np.testing.assert_allclose(made[0], made[1], atol=1e-5)
 
 
-def test_the_mean_of_several_clips(second: Path, tmp_path: Path) -> None:
+def test_the_mean_of_several_clips(checkpoint: Path, tmp_path: Path) -> None:
     for name, clips in (("a", ["B_e01"]), ("b", ["B_e02"]), ("both", ["B_e01", "B_e02"])):
-        words = ["--checkpoint", str(second), "-o", str(tmp_path / f"{name}.npy")]
+        words = ["--checkpoint", str(checkpoint), "-o", str(tmp_path / f"{name}.npy")]
         assert main(["style", "extract", *clips, *words]) == 0
     one, two, both = (np.load(tmp_path / f"{name}.npy") for name in ("a", "b", "both"))
     np.testing.assert_allclose(both, (one + two) / 2, rtol=1e-5, atol=1e-6)

@@ -78,6 +78,7 @@ class Forked:
 
     def kill(self) -> None:
         """End it, if it has not ended."""
+        self.stdin.close()
         if self.poll() is None:
             os.kill(self.pid, signal.SIGKILL)
             self.returncode = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])

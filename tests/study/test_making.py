@@ -5,9 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,6 +22,7 @@ from facediff.study import StudyOptions, plan_study, read_study
 from facediff.study.definition import DATABASE, Trial
 from facediff.study.page import page_of
 from facediff.study.store import AnswerStore
+from tests.fakes.processes import Forked, program
 from tests.fakes.study import write_methods
 from tests.fakes.tiny import write_tiny
 
@@ -247,12 +245,11 @@ def test_killed_and_started_again_it_is_the_same_study(place: Path) -> None:
     options = StudyOptions(clips=["A_one"], still=1, same=0, repeats=0, size=32, languages=["en"])
     whole = plan_study({name: place / name for name in ("ours", "theirs")}, options, truth=place / "truth").study
     words = ["study", "make", "ours=ours", "theirs=theirs", "--truth", "truth", "-o", "study", *SMALL, *FEW]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    with subprocess.Popen([sys.executable, "-m", "facediff", *words], cwd=place, env=environment) as process:
-        end = time.monotonic() + 60
-        while not list((place / "study").rglob("*.mp4")) and process.poll() is None and time.monotonic() < end:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
+    process = Forked(program("facediff", *words), cwd=place)
+    end = time.monotonic() + 60
+    while not list((place / "study").rglob("*.mp4")) and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.01)
+    process.kill()
     assert make(*FEW) == 0
     assert read_study(place / "study").id == whole.id
     assert {path.name for path in (place / "study").rglob("*.mp4")} == set(whole.videos())
