@@ -244,18 +244,6 @@ def test_the_light_parts_load_nothing_heavy(program: str) -> None:
     assert time.perf_counter() - start < 5
 
 
-def test_metrics_need_torch_and_torchmetrics_only() -> None:
-    # tests/metrics/test_metric_import.py has what is loaded beyond torchmetrics, and how long that takes.
-    after = modules_after("import facediff.metrics")
-    # torchmetrics itself takes transformers, matplotlib and others along where they are installed, but not these.
-    assert not {name.split(".")[0] for name in after} & {"lightning", "jsonargparse", "diffusers", "jaxtyping"}
-    ours = {name for name in after if name.startswith("facediff.")}
-    assert ours
-    light = {"facediff.registry", "facediff.errors", "facediff.utils", "facediff.utils.limits", "facediff.utils.ranges"}
-    light |= {"facediff.version", "facediff.utils.lazy"}
-    assert {name for name in ours if not name.startswith("facediff.metrics")} == light
-
-
 def test_components_and_samplers_import_their_libraries_late() -> None:
     program = "from facediff import registry\nprint([kind.names() for kind in registry.COMPONENTS.values()])"
     assert not {name.split(".")[0] for name in modules_after(program)} & HEAVY
