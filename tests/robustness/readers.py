@@ -587,6 +587,16 @@ def corpus_pairs(path: Path) -> object:
     return data.assets
 
 
+def colours(path: Path) -> None:
+    np.savez(path, A=np.full((24, 3), 200, np.uint8), B=np.zeros((24, 3), np.uint8))
+
+
+def corpus_colours(path: Path) -> object:
+    from facediff.data.corpus import Corpus
+
+    return Corpus(in_a_corpus(path, "colours.npz"), 24, 25).read_colours()
+
+
 def phonemes(path: Path) -> None:
     path.write_text("start,end,ipa\n0.0,0.1,b\n0.1,0.3,a\n")
 
@@ -931,6 +941,7 @@ READERS = {
     "masks": Reader(".pkl", masks, read_the_masks),
     "clip table": Reader(".csv", clip_table, read_the_clip_table),
     "a corpus's lip pairs": Reader(".txt", pairs, corpus_pairs),
+    "a corpus's colours": Reader(".npz", colours, corpus_colours, 0.5),
     "phonemes": Reader(".csv", phonemes, read_the_phonemes),
     "alignment": Reader(".TextGrid", textgrid, read_the_textgrid),
     "manifest": Reader(".json", manifest, read_the_manifest),
