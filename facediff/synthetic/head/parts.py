@@ -139,7 +139,9 @@ def _add_eye(half: HalfQuadMesh, layout: Layout) -> None:
             points[2:11, 2] -= 1.6 * np.sin(np.pi * np.linspace(0.05, 0.95, 9))
         if name == "eye_far":  # skin of the upper lid hangs a little over the crease
             points[1:12, 2] += 1.2 * np.sin(np.pi * np.linspace(0.0, 1.0, 11))
-        loops.append(half.add(name, points, SKIN))
+        # Between the lashes the upper lid lies in their shadow.
+        shadow = {"eye_edge": 0.6, "eye_near": 0.3}.get(name, 0.0) * np.isin(np.arange(EYE_POINTS), np.arange(1, 12))
+        loops.append(half.add(name, points, SKIN + shadow[:, None] * (np.array(_LASH) - SKIN)))
     edge = half.at("eye_edge")
     middle = 0.5 * (INNER_CANTHUS + OUTER_CANTHUS)
     inner = edge.copy()
