@@ -279,3 +279,12 @@ def test_page_of_a_minute_of_flames_size_stays_below_the_limit(tmp_path: Path) -
     assert len(animation.vertices) == 180
     write_page(tmp_path / "a.html", [animation])
     assert 10 * (tmp_path / "a.html").stat().st_size < 30e6
+
+
+def test_the_page_has_each_faces_own_colours(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    faces = [replace(clicks(name=name), colours=random.integers(0, 256, (12, 3)).astype(np.uint8)) for name in "ab"]
+    write_page(tmp_path / "a.html", faces)
+    page = Written(tmp_path / "a.html")
+    for face, animation in zip(faces, page.facts["animations"], strict=True):
+        assert page.blob(animation["colours"]) == face.colours.tobytes()  # type: ignore[union-attr]
