@@ -273,7 +273,7 @@ class PreconditionedDenoiser(ConditionalDenoiser):
         scales, steps = self.preconditioning, step_of_rows(step, state)
         # The state stays as it is and only the network's input is scaled: samplers know nothing of preconditioning.
         mean = scales.posterior_mean(state, steps, self.mask)
-        features = self.features(self.network.embed(scales.inputs(state, mean, steps)), step)
+        features = self.features(self.network.embed(scales.inputs(state, mean, steps, self.mask)), step)
         # The prediction is blended, not the features: the noisy motion is a part of it.
         return self.blend(scales.clean(mean, self.network.clean_motion(features), steps, self.mask))
 

@@ -36,6 +36,9 @@ Coordinates = Float[Tensor, "batch frames coordinates"]
 RegionWeight = Annotated[float, Range(1e-3, 1e3)]
 PriorFrames = Annotated[int, Range(1, 99)]
 
+SEEN_AROUND = (-4, -2, -1, 0, 1, 2, 4)
+"""Frames, counted from its own, of which a network sees the smoothed motion."""
+
 
 class MotionSpace(nn.Module, ABC):
     """A linear image of motion, in which it is noised and denoised.
@@ -52,8 +55,8 @@ class MotionSpace(nn.Module, ABC):
 
     @property
     def inputs(self) -> int:
-        """Noisy coordinates, and smoothed ones where the preconditioning knows motion over time."""
-        return self.coordinates * (1 if self.prior_frames == 1 else 2)
+        """Noisy coordinates, and smoothed ones of some frames where the preconditioning knows motion over time."""
+        return self.coordinates * (1 if self.prior_frames == 1 else 1 + len(SEEN_AROUND))
 
     @property
     def region_weights(self) -> Mapping[str, float]:
@@ -287,6 +290,7 @@ class Preconditioning(nn.Module):
         noisy: Coordinates,
         mean: Coordinates,  # noqa: ARG002 - the noisy motion in another size
         step: Int[Tensor, " batch"],
+        mask: Bool[Tensor, "batch frames"],  # noqa: ARG002
     ) -> Float[Tensor, "batch frames inputs"]:
         """What the network sees, given the noisy motion and its posterior mean; of unit variance."""
         return self.into[step][:, None] * noisy
@@ -375,13 +379,19 @@ class TemporalPreconditioning(Preconditioning):
         return self._filtered(noisy, kept.sqrt() * self.variances / (kept * self.variances + 1 - kept), mask)
 
     def inputs(
-        self, noisy: Coordinates, mean: Coordinates, step: Int[Tensor, " batch"]
+        self,
+        noisy: Coordinates,
+        mean: Coordinates,
+        step: Int[Tensor, " batch"],
+        mask: Bool[Tensor, "batch frames"],
     ) -> Float[Tensor, "batch frames inputs"]:
-        """The noisy motion and the smoothed one, both of unit variance."""
-        # A Gaussian prior takes a blink for drift and draws neither: what the smoothed motion shows there is to be made
-        # sharp, and smaller everywhere else. That depends on its value, which a network would have to compute from the
-        # noise of many frames.
-        return torch.cat([super().inputs(noisy, mean, step), self.into_mean[step][:, None] * mean], -1)
+        """The noisy motion, and the smoothed one of the frame and of some around it, of unit variance."""
+        # A Gaussian prior takes blinks for drift: the smoothed motion is to be made sharp where it has the course of a
+        # blink, and smaller everywhere else. A short training does not find that course in the noise of many frames.
+        count, most = noisy.shape[1], max(SEEN_AROUND)
+        around = nn.functional.pad(self.into_mean[step][:, None] * mean * mask[..., None], (0, 0, most, most))
+        seen = [around[:, most + offset : most + offset + count] for offset in SEEN_AROUND]
+        return torch.cat([super().inputs(noisy, mean, step, mask), *seen], -1)
 
     def clean(
         self,

@@ -242,8 +242,10 @@ def test_sampling_with_a_silent_network_gives_motion_of_the_covariance_over_time
     # The network sees both in unit variance.
     mask, steps = ALL[:, :60].expand(120, -1), torch.full((120,), 400)
     noisy = process.add_noise(sample, torch.randn(sample.shape, generator=random), steps)
-    seen = scales.inputs(noisy, scales.posterior_mean(noisy, steps, mask), steps)[:, 12:-12]
+    seen = scales.inputs(noisy, scales.posterior_mean(noisy, steps, mask), steps, mask)[:, 12:-12]
+    assert seen.shape[2] == 3 * 8
     assert ((seen.square().mean((0, 1)) - 1).abs() < 0.15).all()
+    torch.testing.assert_close(seen[:, 4:, 3:6], seen[:, :-4, 12:15])  # of four frames earlier, and of its own
     for lag in (0, 1, 2, 4, 8):
         expected = over_time(torch.tensor(lag)).float()
         found = (sample[:, lag:] * sample[:, : 60 - lag]).mean((0, 1))

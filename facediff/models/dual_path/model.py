@@ -438,7 +438,7 @@ class DualPathDiffusion(AnimationModel):
         """The losses in a space of known variances."""
         noisy = self.process.add_noise(clean, noise, step)
         mean = scales.posterior_mean(noisy, step, mask)
-        embedded = self.network.embed(scales.inputs(noisy, mean, step))
+        embedded = self.network.embed(scales.inputs(noisy, mean, step, mask))
         features = self.network.clean_motion(self.network.core(embedded, step, conditions))
         predicted = scales.clean(mean, features, step, mask)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
