@@ -619,6 +619,33 @@ def read_the_textgrid(path: Path) -> object:
     return read_alignment(path)
 
 
+def read_the_text_grid_of_a_recording(path: Path) -> object:
+    from facediff.synthetic.recordings import read_text_grid
+
+    return read_text_grid(path)
+
+
+def truth_shapes(path: Path) -> None:
+    path.write_text("shape\neyeBlinkLeft\njawOpen\n")
+
+
+def read_the_truth(path: Path) -> object:
+    """The stored truth of one clip of the built-in corpus, in which the names of shapes may be damaged."""
+    from facediff.data.check.truth import measure_truth
+
+    root, rng = path.parent / "truth", np.random.default_rng(0)
+    for folder in ("weights_npy", "gaze_npy", "head_npy", "rigs", "regions", "phonemes"):
+        (root / folder).mkdir(parents=True)
+    shutil.copy(path, root / "shapes.csv")
+    for name, width in (("weights", 2), ("gaze", 2), ("head", 3)):
+        np.save(root / f"{name}_npy" / "A_e01.npy", rng.uniform(0, 20, (60, width)))
+    np.save(root / "rigs" / "A.npy", rng.normal(size=(3, VERTICES, 3)))
+    for name, text in (("lve", "0,1,2"), ("fdd", "3,4"), ("inner_lip_pairs", "0, 1\n1, 2")):
+        (root / "regions" / f"{name}.txt").write_text(text)
+    phonemes(root / "phonemes" / "A_e01.csv")
+    return measure_truth(root, ["A_e01"], 25.0)
+
+
 def manifest(path: Path) -> None:
     path.write_text(json.dumps({"frame_rate": 25, "unit": "m", "files": {"a": {"bytes": 1, "sha256": "b"}}}))
 
@@ -944,6 +971,8 @@ READERS = {
     "a corpus's colours": Reader(".npz", colours, corpus_colours, 0.5),
     "phonemes": Reader(".csv", phonemes, read_the_phonemes),
     "alignment": Reader(".TextGrid", textgrid, read_the_textgrid),
+    "alignment of a recording": Reader(".TextGrid", textgrid, read_the_text_grid_of_a_recording),
+    "truth of the built-in corpus": Reader(".csv", truth_shapes, read_the_truth, 0.5),
     "manifest": Reader(".json", manifest, read_the_manifest),
     **{
         f"check, {name}": Reader(Path(name).suffix, of_tiny(name), checking(name), 0.3)

@@ -15,7 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER
+from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array
+from facediff.utils.limits import brief
 from facediff.utils.plain_files import read_rows
 
 Array = npt.NDArray[np.float64]
@@ -54,10 +56,21 @@ def measure_truth(root: Path, names: Iterable[str], rate: float) -> list[dict[st
         root: the corpus folder.
         names: its clips.
         rate: motion frames a second.
+
+    Raises:
+        FaceDiffError: if the files do not fit together.
     """
     if not all((root / f"{part}_npy").is_dir() for part in ("weights", "gaze", "head")):
         return []
-    every = sorted(names)
+    try:
+        return _measures(root, sorted(names), rate)
+    except FaceDiffError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
+        raise FaceDiffError(f"{root}: the stored truth is damaged ({brief(error)}); {REMEDY}") from error
+
+
+def _measures(root: Path, every: list[str], rate: float) -> list[dict[str, Any]]:
     clips = list(_read(root, every[:: max(1, len(every) // ENOUGH)], rate))
     minutes = sum(len(clip.gaze) for clip in clips) / rate / 60.0
     if not minutes:
