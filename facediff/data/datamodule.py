@@ -136,7 +136,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     region_help: ClassVar[str] = ""
     reference_attributes: ClassVar[tuple[str, ...]] = ()
     score_attributes: ClassVar[tuple[str, ...]] = ()
-    compared_speakers: ClassVar[tuple[str, ...] | None] = None
+    compared_speakers: tuple[str, ...] | None = None
     licence: ClassVar[str] = "unknown"
     commercial_use: ClassVar[Commercial] = "unknown"
     licence_source: ClassVar[str] = ""

@@ -112,7 +112,7 @@ class SecondEdition:
         return None
 
 
-EDITIONS = {1: FirstEdition, 2: SecondEdition}
+EDITIONS: dict[int, type[FirstEdition] | type[SecondEdition]] = {1: FirstEdition, 2: SecondEdition}
 
 
 def cache_root(edition: FirstEdition | SecondEdition) -> Path:

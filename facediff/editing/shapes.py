@@ -320,7 +320,8 @@ def _built_in(template: Array | None) -> ShapeFiles:
 
     edition, nearest = None if template is None else edition_of_mesh(len(template)), None
     if template is not None and edition is not None:
-        at_rest: dict[str | None, Array] = {None: built_in_shapes(None, edition)[0], **resting_faces(edition)}
+        at_rest: dict[str | None, Array] = {None: built_in_shapes(None, edition)[0]}
+        at_rest.update(resting_faces(edition).items())
         centred = template - template.mean(0)
         nearest = min(at_rest, key=lambda name: np.square(at_rest[name] - at_rest[name].mean(0) - centred).sum())
     neutral, faces, shapes = built_in_shapes(nearest, edition or 2)

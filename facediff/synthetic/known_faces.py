@@ -58,8 +58,10 @@ def known_face(template: NDArray[np.floating], faces: NDArray[np.integer] | None
     # Templates pass through float32, and through files that round them, hence a distance instead of equality.
     distances = {name: float(np.abs(rest - template).max()) for name, rest in resting_faces(edition).items()}
     speaker = min(distances, key=lambda name: distances[name])
+    mesh: HeadMesh | QuadMesh
+    prefixes: tuple[str, ...]
     if edition == 1:
-        mesh: HeadMesh | QuadMesh = build_face()
+        mesh = build_face()
         prefixes, edge = ("eyeball", "pupil"), "eye_0"
         fields = dict(zip(LINEAR_FIELDS, corpus.rig_of(speaker).fields, strict=True))
         ways = [["lids_close"], ["inner_brow_up", "outer_brow_up"], ["brow_frown"]]

@@ -13,6 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -377,7 +378,9 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
         templates[identity] = rig[0].astype(np.float64)
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
-    complexions = {name: production.colours(coloured(mesh, member_of(name, people).complexion)) for name in templates}
+    complexions: dict[str, Any] = {
+        name: production.colours(coloured(mesh, member_of(name, people).complexion)) for name in templates
+    }
     np.savez(folder / "colours.npz", **complexions)
     mean = production.carry(np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0)
     faces = build_mask().faces if production.mask else mesh.faces

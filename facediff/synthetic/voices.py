@@ -90,7 +90,8 @@ def open_voice(name: str) -> Synthesiser:
     synthesiser = puppet_voice.get(program)
     if not colon or not voice:
         raise FaceDiffError(f'voice "{name}": names no voice; expected SYNTHESISER:VOICE, such as flite:slt')
-    return synthesiser.open(voice, name)
+    opened: Synthesiser = synthesiser.open(voice, name)
+    return opened
 
 
 def installed_voices() -> dict[str, list[str]]:

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from facediff.data import Puppet
+from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.data.check import check, text, truth
+from facediff.data.packed.packing import pack
 from facediff.data.puppet import PuppetMask
 from facediff.data.storage import ClipFolder, WeightFile
 from facediff.errors import FaceDiffError
+from facediff.models.checkpoint import corpus_of
 from facediff.synthetic.cast import KEPT_OUT, SEEN, UNSEEN, drawn_names, member_of
 from facediff.synthetic.head.mask import build_mask
 from facediff.synthetic.head.parts import build_head
@@ -175,3 +178,23 @@ def test_the_corpus_of_masks_moves_as_the_heads_do(tmp_path: Path) -> None:
     report = check(tmp_path / "masks")
     assert report.sound, text(report)
     assert report.corpus == "puppet_mask"
+
+
+@pytest.mark.slow
+def test_weights_are_packed_as_the_vertices_that_they_decode_to(corpus: Path, tmp_path: Path) -> None:
+    pytest.importorskip("zarr")
+    pack(corpus, tmp_path / "packed.zarr", lossless=True, workers=1)
+    folder, packed = Puppet(root=str(corpus)), Puppet(root=str(tmp_path / "packed.zarr"))
+    assert packed.n_vertices == folder.n_vertices
+    for name in ("F1_e01", "F1_t01"):  # weights, and vertices
+        own, other = (data.corpus.read_motion(data.corpus.clips[name]) for data in (folder, packed))
+        assert np.array_equal(own, other)
+
+
+def test_checkpoints_from_before_the_second_edition_are_of_the_first(tmp_path: Path) -> None:
+    source = {"class_path": "facediff.data.puppet.Puppet", "corpus": "puppet"}
+    saved = {"data_source": source, "datamodule_hyper_parameters": {"seed": 3}}
+    _, options = corpus_of(tmp_path / "old.ckpt", {DATA_SOURCE_KEY: source, **saved})
+    assert options == {"seed": 3, "edition": 1}
+    saved["datamodule_hyper_parameters"] = {"seed": 3, "edition": None}
+    assert corpus_of(tmp_path / "new.ckpt", {DATA_SOURCE_KEY: source, **saved})[1]["edition"] is None

@@ -160,7 +160,8 @@ def _spectrum(track: Array, rate: float) -> tuple[Array, Array]:
     """Power of a track (T, …) by frequency, summed over all but time, its mean left out; and the frequencies in Hz."""
     moving = track.reshape(len(track), -1)
     moving = (moving - moving.mean(axis=0)) * np.hanning(len(track))[:, None]
-    return np.square(np.abs(np.fft.rfft(moving, axis=0))).sum(axis=1), np.fft.rfftfreq(len(track), 1.0 / rate)
+    power: Array = np.square(np.abs(np.fft.rfft(moving, axis=0))).sum(axis=1)
+    return power, np.asarray(np.fft.rfftfreq(len(track), 1.0 / rate), np.float64)
 
 
 def _share_above(tracks: Iterable[Array], rate: float, limit: float) -> float:
