@@ -36,8 +36,8 @@ class LipLag(LipMetric):
         return gap.norm(dim=-1).mean() ** self.power
 
 
-def test_there_are_twenty_five_each_with_a_function_of_its_name() -> None:
-    assert len(NAMES) == 25
+def test_every_metric_has_a_function_of_its_name() -> None:
+    assert len(NAMES) >= 25
     for name in NAMES:
         function, implementation = getattr(fm, name), registry.metric.get(name)
         assert (function.__name__, function.__module__) == (name, implementation.__module__)
