@@ -123,7 +123,7 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPho
     Raises:
         MissingExtraError: if espeak-ng is not installed.
     """
-    from facediff.synthetic.speech import EspeakVoice, speak
+    from facediff.speech.espeak import EspeakVoice, speak
 
     utterance = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
     return utterance.samples, [

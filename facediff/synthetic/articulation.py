@@ -15,10 +15,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.geometry import Array
 from facediff.synthetic.head.rig import LEFT_AND_RIGHT
 from facediff.synthetic.motion import UNHURRIED, rounded, shut_lips
-from facediff.synthetic.speech import SpokenPhoneme
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.
 _VOWELS: dict[str, tuple[float, float, float]] = {

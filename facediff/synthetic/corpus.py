@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
+from facediff.speech.espeak import SpokenPhoneme, speak
 from facediff.synthetic.face import build_face
 from facediff.synthetic.geometry import Array
 from facediff.synthetic.motion import FRAME_RATE, analyse, generate_weights, segments_of, visemes_of
 from facediff.synthetic.rig import Rig, build_rig, eyelid_pairs, lip_pairs
+from facediff.synthetic.sentences import SENTENCES
 from facediff.synthetic.speakers import MOST_DRAWN, SPEAKERS, drawn_names, speaker_of
-from facediff.synthetic.speech import SENTENCES, SpokenPhoneme, speak
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder

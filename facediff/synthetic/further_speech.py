@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from facediff.speech.espeak import speak
 from facediff.synthetic.speakers import speaker_of
-from facediff.synthetic.speech import speak
 from facediff.utils import SAMPLE_RATE
 
 # Chosen for this corpus, so that every English sound occurs in several places of a word; no content word is in the test

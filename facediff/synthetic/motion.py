@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.rig import CONTROLS
-from facediff.synthetic.speech import SpokenPhoneme
 
 #: Rig controls that speech drives, in the order used by `facediff.synthetic.motion`.
 SPEECH_CONTROLS = (

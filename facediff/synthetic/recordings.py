@@ -15,7 +15,7 @@ from pathlib import Path
 from facediff.errors import FaceDiffError
 from facediff.registry import puppet_voice
 from facediff.speech.audio import read_speech
-from facediff.synthetic.speech import SpokenPhoneme, Utterance
+from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.synthetic.voices import CMU_PHONES, Delivery, Synthesiser
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import LIMITS

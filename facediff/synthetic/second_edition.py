@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
+from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
 from facediff.synthetic.corpus import CORPUS, MANIFEST, in_quiet, refuse_foreign, write_ply
@@ -30,8 +31,7 @@ from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_p
 from facediff.synthetic.motion import analyse
 from facediff.synthetic.performance import MOODS, FaceMotion, perform
 from facediff.synthetic.recordings import ALIGNED, recordings_of
-from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION, turn
-from facediff.synthetic.speech import SENTENCES, SpokenPhoneme, Utterance
+from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, turn
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes

@@ -8,7 +8,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from facediff.synthetic.speech import SENTENCES
+# The 32 sentences were written for this corpus and are rich in p, b, m, rounded and open vowels.
+
+SENTENCES: tuple[str, ...] = (
+    "Mama bought a map of Bombay for papa.",
+    "Bob put both pumps above the purple boat.",
+    "My mother may move home before May.",
+    "Who would choose blue shoes in the fog?",
+    "Father parked far from the large palm.",
+    "Pam baked apple pie for five happy boys.",
+    "Two wolves went west over warm wet woods.",
+    "Please bring me some more ripe plums.",
+    "Five brave fishermen found a big cave.",
+    "Sheep always jump when they hear my whip.",
+    "The moon rose above a smooth, warm pool.",
+    "Barbara mopped the bottom of the bathtub.",
+    "We saw a small paw print by the wall.",
+    "Emma and Ben hum the same bold hymn.",
+    "Open your mouth and show me that tooth.",
+    "A bumpy bus brought Mabel back to Rome.",
+    "Every evening my uncle waters his maple.",
+    "Put the soup spoon into the blue bowl.",
+    "Tom and Pip climb up the mossy bank.",
+    "Maybe Wanda will marry a famous baker.",
+    "Oh no, the robot dropped my umbrella.",
+    "Farm boys always feed five plump piglets.",
+    "You may borrow my best woollen cap for now.",
+    "Calm palms make a lovely soft lamp.",
+    "Bees hum and buzz above the poppy meadow.",
+    "Why would a wombat want a white van?",
+    "Mum popped a balloon, and papa jumped.",
+    "Our boat moves up the broad brown river.",
+    "Phoebe wrote four poems about a mole.",
+    "The bad lamb hopped over my plum jam.",
+    "Wow, what an awful amount of pepper!",
+    "Beth above all hoped for a warm room.",
+)
 
 TRAIN: tuple[str, ...] = (
     *SENTENCES,

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from facediff.speech.espeak import EspeakVoice
 from facediff.synthetic.motion import SpeakingStyle
 from facediff.synthetic.rig import Shape
-from facediff.synthetic.speech import EspeakVoice
 
 
 @dataclass(frozen=True)

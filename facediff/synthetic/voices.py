@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError, choices
 from facediff.registry import puppet_voice
-from facediff.synthetic.speech import EspeakVoice, SpokenPhoneme, Utterance, speak
+from facediff.speech.espeak import EspeakVoice, SpokenPhoneme, Utterance, speak
 from facediff.utils import SAMPLE_RATE
 
 _SECONDS = 120.0  # After which a synthesiser is taken to hang

@@ -12,7 +12,7 @@ from facediff.editing.closures import close_lips
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import closed_times, read_phonemes
-from facediff.synthetic.speech import SENTENCES
+from facediff.synthetic.sentences import SENTENCES
 
 SENTENCE = SENTENCES[27]
 

@@ -44,7 +44,7 @@ NOT_FROM_ELSEWHERE = {
     "facediff/study/page.py": "part of the package",
     "facediff/study/store.py": "what the server has checked and stored itself",
     "facediff/utils/server.py": "hands bodies over to the reader of answers",
-    "facediff/synthetic/speech.py": "the answer of a process of our own",
+    "facediff/speech/espeak.py": "the answer of a process of our own",
     "facediff/synthetic/voices.py": "the answer of a synthesiser that was started for it",
     "facediff/export/viewer/page.py": "part of the package",
     "facediff/registry.py": "part of the package",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.articulation import (
     PAUSE,
     SPEECH_SHAPES,
@@ -13,7 +14,6 @@ from facediff.synthetic.articulation import (
     lip_closure,
     speech_sounds,
 )
-from facediff.synthetic.speech import SpokenPhoneme
 from facediff.synthetic.voices import open_voice
 
 SENTENCES = {

@@ -6,7 +6,7 @@ import numpy as np
 
 from facediff.data import Puppet
 from facediff.synthetic.further_speech import WORDS, further_speech
-from facediff.synthetic.speech import SENTENCES
+from facediff.synthetic.sentences import SENTENCES
 
 
 def test_a_number_is_a_piece_of_speech() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.corpus import MOODS, SyntheticClip, generate_clip, rig_of
 from facediff.synthetic.motion import FRAME_RATE, SPEECH_CONTROLS, articulate, close_lips, segments_of
 from facediff.synthetic.rig import CONTROLS
-from facediff.synthetic.speech import SpokenPhoneme
 
 pytest.importorskip("espeakng_loader")
 

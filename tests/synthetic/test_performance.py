@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.motion import ProsodyContours
 from facediff.synthetic.performance import MOODS, FaceMotion, SpeakingHabits, perform
-from facediff.synthetic.speech import SpokenPhoneme
 
 RATE = 100.0
 

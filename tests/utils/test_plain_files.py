@@ -71,7 +71,7 @@ def test_json_of_what_is_no_file_is_refused(tmp_path: Path) -> None:
 def test_json_is_parsed_in_one_place() -> None:
     """A second parser would have its own ideas of NaN, nesting and encodings."""
     # These read what another part of the same process, or a process that it has started, wrote.
-    own = {"facediff/utils/plain_files.py", "facediff/synthetic/speech.py"}
+    own = {"facediff/utils/plain_files.py", "facediff/speech/espeak.py"}
     found = {
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "facediff").rglob("*.py")

@@ -8,8 +8,8 @@ import numpy.typing as npt
 from facediff.data.augmentation import SpeechAugmentation
 from facediff.editing.acting import Acting, Performer
 from facediff.live import Address, LiveFrame, Performance, Receiver
+from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.speech.voice_activity import Listener, VoiceGate
-from facediff.synthetic.speech import SpokenPhoneme, Utterance
 from facediff.synthetic.voices import Delivery, Synthesiser
 
 

@@ -24,44 +24,6 @@ from numpy.typing import NDArray
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils import SAMPLE_RATE
 
-# The 32 sentences were written for this corpus and are rich in p, b, m, rounded and open vowels.
-
-SENTENCES: tuple[str, ...] = (
-    "Mama bought a map of Bombay for papa.",
-    "Bob put both pumps above the purple boat.",
-    "My mother may move home before May.",
-    "Who would choose blue shoes in the fog?",
-    "Father parked far from the large palm.",
-    "Pam baked apple pie for five happy boys.",
-    "Two wolves went west over warm wet woods.",
-    "Please bring me some more ripe plums.",
-    "Five brave fishermen found a big cave.",
-    "Sheep always jump when they hear my whip.",
-    "The moon rose above a smooth, warm pool.",
-    "Barbara mopped the bottom of the bathtub.",
-    "We saw a small paw print by the wall.",
-    "Emma and Ben hum the same bold hymn.",
-    "Open your mouth and show me that tooth.",
-    "A bumpy bus brought Mabel back to Rome.",
-    "Every evening my uncle waters his maple.",
-    "Put the soup spoon into the blue bowl.",
-    "Tom and Pip climb up the mossy bank.",
-    "Maybe Wanda will marry a famous baker.",
-    "Oh no, the robot dropped my umbrella.",
-    "Farm boys always feed five plump piglets.",
-    "You may borrow my best woollen cap for now.",
-    "Calm palms make a lovely soft lamp.",
-    "Bees hum and buzz above the poppy meadow.",
-    "Why would a wombat want a white van?",
-    "Mum popped a balloon, and papa jumped.",
-    "Our boat moves up the broad brown river.",
-    "Phoebe wrote four poems about a mole.",
-    "The bad lamb hopped over my plum jam.",
-    "Wow, what an awful amount of pepper!",
-    "Beth above all hoped for a warm room.",
-)
-
-
 _SYNCHRONOUS = 2
 _PHONEME_EVENTS_AS_IPA = 0x0001 | 0x0002
 _DONT_EXIT = 0x8000
@@ -212,7 +174,7 @@ def _speak_elsewhere(text: str, voice: EspeakVoice) -> tuple[int, bytes, list[tu
     """Speak in a new interpreter."""
     request = json.dumps([text, voice.name, voice.rate, voice.pitch, voice.pitch_range])
     done = subprocess.run(  # noqa: S603 - this very interpreter, no outside input
-        [sys.executable, "-m", "facediff.synthetic.speech"],
+        [sys.executable, "-m", "facediff.speech.espeak"],
         input=request.encode(),
         capture_output=True,
         check=False,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.synthetic import speech
+from facediff.speech import espeak
 from facediff.synthetic.motion import SPEECH_CONTROLS, VISEMES, visemes_of
 from facediff.synthetic.rig import CONTROLS
+from facediff.synthetic.sentences import SENTENCES
 from facediff.synthetic.speakers import SPEAKERS
-from facediff.synthetic.speech import SENTENCES
 from facediff.utils import SAMPLE_RATE
 
 pytest.importorskip("espeakng_loader")
@@ -18,30 +18,30 @@ VOICE = SPEAKERS["F1"].voice
 
 
 def test_same_text_same_samples_in_this_process_and_in_a_fresh_one() -> None:
-    first, other, again = (speech.speak(text, VOICE) for text in ("Bob mops.", "Pam hums.", "Bob mops."))
+    first, other, again = (espeak.speak(text, VOICE) for text in ("Bob mops.", "Pam hums.", "Bob mops."))
     assert np.array_equal(first.samples, again.samples)
     assert first.phonemes == again.phonemes
     assert not np.array_equal(first.samples[:4000], other.samples[:4000])
-    fresh = speech._finish(*speech._speak_elsewhere("Bob mops.", VOICE))
+    fresh = espeak._finish(*espeak._speak_elsewhere("Bob mops.", VOICE))
     assert np.array_equal(first.samples, fresh.samples)
     assert first.phonemes == fresh.phonemes
 
 
 def test_noise_does_not_start_from_the_clock() -> None:
     breathy = SPEAKERS["F2"].voice
-    before = speech.speak("Bob mops.", breathy)
+    before = espeak.speak("Bob mops.", breathy)
     time.sleep(1.1)
-    assert np.array_equal(before.samples, speech.speak("Bob mops.", breathy).samples)
+    assert np.array_equal(before.samples, espeak.speak("Bob mops.", breathy).samples)
 
 
 def test_a_library_that_is_loaded_already_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = speech.speak("Bob mops.", VOICE)
-    monkeypatch.setattr(speech, "_is_loaded", lambda library: True)
-    assert np.array_equal(speech.speak("Bob mops.", VOICE).samples, expected.samples)
+    expected = espeak.speak("Bob mops.", VOICE)
+    monkeypatch.setattr(espeak, "_is_loaded", lambda library: True)
+    assert np.array_equal(espeak.speak("Bob mops.", VOICE).samples, expected.samples)
 
 
 def test_phonemes_follow_one_another_and_the_sound() -> None:
-    said = speech.speak(SENTENCES[0], VOICE)
+    said = espeak.speak(SENTENCES[0], VOICE)
     length = said.samples.size / SAMPLE_RATE
     for before, after in zip(said.phonemes[:-1], said.phonemes[1:], strict=True):
         assert before.end == after.start
@@ -78,13 +78,13 @@ def test_visemes_of(ipa: str, names: tuple[str, ...]) -> None:
 
 def test_sentences_use_every_mouth_shape_and_are_all_different() -> None:
     assert len(set(SENTENCES)) == 32
-    used = {name for text in SENTENCES for p in speech.speak(text, VOICE).phonemes for name in visemes_of(p.ipa)}
+    used = {name for text in SENTENCES for p in espeak.speak(text, VOICE).phonemes for name in visemes_of(p.ipa)}
     assert used == set(VISEMES)
 
 
 def test_unknown_voice_and_missing_package_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FaceDiffError, match="no voice 'nobody'"):
-        speech.speak("Hello.", speech.EspeakVoice("nobody", 150, 50, 50))
+        espeak.speak("Hello.", espeak.EspeakVoice("nobody", 150, 50, 50))
     monkeypatch.setitem(__import__("sys").modules, "espeakng_loader", None)
     with pytest.raises(FaceDiffError, match=r"facediff\[puppet\]"):
-        speech.speak("Hello.", VOICE)
+        espeak.speak("Hello.", VOICE)
