@@ -59,11 +59,11 @@ def measure(name: str, config: str, epochs: int, args: argparse.Namespace) -> Ro
     path = args.output / f"{name.replace(' ', '_')}.ckpt"
     started = time.monotonic()
     if not path.is_file():
-        options = [f"--trainer.max_epochs={epochs}", "--data.drawn_speakers=0"]
+        options = [f"--trainer.max_epochs={epochs}", "--data.edition=1", "--data.drawn_speakers=0"]
         options += [f"--trainer.logger.save_dir={args.output}", "--trainer.logger.name=training"]
         run_cli("fit", ["--config", config, *options]).trainer.save_checkpoint(path)
     row: Row = {"model": name, "training seconds": round(time.monotonic() - started)}
-    model, data = load_model(path), Puppet()
+    model, data = load_model(path), Puppet(edition=1)
     data.prepare_data()
     row["parameters"] = sum(p.numel() for p in model.parameters())
     row |= scores(path)

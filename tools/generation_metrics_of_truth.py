@@ -69,7 +69,7 @@ def measured(root: Path | None = None, samples: int = 10, most_clips: int | None
         samples: of each clip.
         most_clips: clips of a split; all if None.
     """
-    data = Puppet(root=root) if root is not None else Puppet()
+    data = Puppet(root=root, edition=1)
     data.prepare_data()
     data.setup("fit")
     data.setup("test")

@@ -180,7 +180,6 @@ def test_the_corpus_of_masks_moves_as_the_heads_do(tmp_path: Path) -> None:
     assert report.corpus == "puppet_mask"
 
 
-@pytest.mark.slow
 def test_weights_are_packed_as_the_vertices_that_they_decode_to(corpus: Path, tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     pack(corpus, tmp_path / "packed.zarr", lossless=True, workers=1)
