@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import LIMITS
+from facediff.speech.text_grids import SILENCES, phones_in
 from facediff.utils.plain_files import read_rows
 
 if TYPE_CHECKING:
@@ -131,15 +130,6 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPho
     ]
 
 
-# Alignments from elsewhere: Praat's TextGrid, which the usual aligners write.
-
-SILENCES = ("", "sil", "sp", "spn", "pau", "<eps>", "<sil>", "_", "#", "silence")
-"""Labels of pauses."""
-
-TIERS = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment")
-"""Names of the tier that has the phonemes, in order of preference."""
-
-
 def read_alignment(path: Path) -> list[TimedPhoneme]:
     """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
 
@@ -148,7 +138,10 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
     Raises:
         FaceDiffError: if the file is neither, or holds no phonemes.
     """
-    phonemes = _read_textgrid(path) if path.suffix.lower() == ".textgrid" else read_phonemes(path)
+    if path.suffix.lower() == ".textgrid":
+        phonemes = [TimedPhoneme(start, end, label) for start, end, label in phones_in(path)]
+    else:
+        phonemes = read_phonemes(path)
     return [replace(phoneme, ipa=_plain_label(phoneme.ipa)) for phoneme in phonemes]
 
 
@@ -159,58 +152,3 @@ def _plain_label(label: str) -> str:
         return ""
     bare = label.strip(STRESS).rstrip("ʰʲʷˠ̩̚ːˑ0123456789")
     return bare.lower() if bare.lower() in BILABIALS else label
-
-
-def _read_textgrid(path: Path) -> list[TimedPhoneme]:
-    expected = "expected a TextGrid with an interval tier named phones, as Praat or an aligner writes it"
-    try:
-        LIMITS.check("bytes", 40 * path.stat().st_size, path)
-        content = path.read_bytes()
-        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); {expected}") from error
-    except UnicodeDecodeError as error:
-        raise FaceDiffError(f"{path}: is no text; {expected}") from error
-    # Long and short form hold the same values in the same order: texts in quotes, numbers that stand alone, and flags.
-    # What the long form has around them, such as `xmin =` or `intervals [3]:`, is left out.
-    tokens: list[str] = []
-    for quoted_text, number in _TEXTGRID.findall(text):
-        tokens.append(number or f'"{quoted_text.replace(chr(34) * 2, chr(34))}')
-    try:
-        if tokens[:2] != ['"ooTextFile', '"TextGrid']:
-            raise ValueError("its head is another one")
-        tiers = _tiers(tokens[4:])
-    except (ValueError, IndexError) as error:
-        raise FaceDiffError(f"{path}: not readable as a TextGrid ({error}); {expected}") from error
-    for tier in TIERS:
-        for name, intervals in tiers:
-            # Several speakers have a tier each: "Anna - phones".
-            if intervals and name.lower().split(" - ")[-1].strip() == tier:
-                return intervals
-    raise FaceDiffError(
-        f"{path}: has no tier of phonemes but {', '.join(name for name, _ in tiers) or 'none'}; {expected}"
-    )
-
-
-def _tiers(tokens: list[str]) -> list[tuple[str, list[TimedPhoneme]]]:
-    """The interval tiers of a TextGrid, from its values behind its times."""
-    rest = iter(tokens)
-    tiers = []
-    for _ in range(int(float(next(rest, "0")))):
-        kind, name = next(rest, ""), next(rest, "")
-        next(rest, ""), next(rest, "")
-        intervals = []
-        for _ in range(int(float(next(rest, "0")))):
-            start = float(next(rest, ""))
-            if kind != '"IntervalTier':
-                next(rest, "")
-                continue
-            end, label = float(next(rest, "")), next(rest, "")
-            if not (0 <= start <= end < math.inf) or not label.startswith('"'):
-                raise ValueError(f"an interval from {start:g} to {end:g} s")
-            intervals.append(TimedPhoneme(start, end, label[1:]))
-        tiers.append((name.removeprefix('"'), intervals))
-    return tiers
-
-
-_TEXTGRID = re.compile(r'"((?:[^"]|"")*)"|(?<![\w\[.-])(-?[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?)(?![\w\].])')

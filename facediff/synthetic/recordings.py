@@ -7,7 +7,6 @@ WebMAUS write. The recordings are used as they are; the motion's truth is made f
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,20 +15,13 @@ from facediff.errors import FaceDiffError
 from facediff.registry import puppet_voice
 from facediff.speech.audio import read_speech
 from facediff.speech.espeak import SpokenPhoneme, Utterance
+from facediff.speech.text_grids import REMEDY, SILENCES, WORDS, find_tier, phones_in, read_text_grid
 from facediff.synthetic.voices import CMU_PHONES, Delivery, Synthesiser
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.limits import LIMITS
 
 ALIGNED = "aligned"
 SOUNDS = (".wav", ".flac")
-PHONES, WORDS = ("phones", "phone", "phonemes", "mau", "segments"), ("words", "word", "ort", "ort-mau")
-"""How tiers of phones and of words are called, alone or after the speaker's name (``84 - phones``)."""
-SILENCES = {"", "sil", "sp", "spn", "pau", "<eps>", "<p>", "<p:>", "<p>:", "<sil>", "#"}
 LONGEST = 12.0  # Seconds of a recording that a corpus takes
-REMEDY = "align the recording again, with Praat or the Montreal Forced Aligner"
-_TOKEN = re.compile(r'"((?:[^"]|"")*)"|(<exists>|<absent>)|(?<![^\s=])([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?!\S)')
-
-Interval = tuple[float, float, str]
 
 
 @puppet_voice.register(ALIGNED)
@@ -117,11 +109,7 @@ def phones_of(path: Path) -> tuple[SpokenPhoneme, ...]:
 
     Phones of the ARPAbet are recognised by their names, with or without stress (``AA1``); all others are taken as IPA.
     """
-    tiers = read_text_grid(path)
-    intervals = find_tier(tiers, PHONES)
-    if not intervals:
-        names = ", ".join(tiers) or "none"
-        raise FaceDiffError(f"{path}: has no tier of phones (its tiers: {names}); name it phones, or {REMEDY}")
+    intervals = phones_in(path)
     labels = [re.sub(r"[012]$", "", text) for _, _, text in intervals]
     sounding = {label for label in labels if label.lower() not in SILENCES}
     # Single letters are in both alphabets: a tier is in the ARPAbet if all its phones are, and one of two letters.
@@ -137,65 +125,3 @@ def phones_of(path: Path) -> tuple[SpokenPhoneme, ...]:
         ipa = "" if label.lower() in SILENCES else CMU_PHONES[label.lower()] if is_arpabet else label
         phonemes.append(SpokenPhoneme(start, end, ipa))
     return tuple(phonemes)
-
-
-def find_tier(tiers: Mapping[str, list[Interval]], kinds: tuple[str, ...]) -> list[Interval] | None:
-    """The first tier that is called as one of these, alone or after a speaker's name."""
-    return next((tier for name, tier in tiers.items() if name.rpartition(" - ")[2].strip().lower() in kinds), None)
-
-
-def read_text_grid(path: Path) -> dict[str, list[Interval]]:
-    """Interval tiers of a TextGrid by name, in Praat's long or short text format: start and end in seconds, and text.
-
-    Tiers of points are left out. The format is that of Praat's manual, "TextGrid file formats".
-    """
-    try:
-        LIMITS.check("bytes", path.stat().st_size, path)
-        content = path.read_bytes()
-        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from error
-    except UnicodeDecodeError as error:
-        raise FaceDiffError(f"{path}: is no text in UTF-8 or UTF-16; save it in Praat as a text file") from error
-    # Both formats hold the same texts and numbers in the same order; the long one names each of them.
-    tokens = iter(_TOKEN.finditer(text))
-    tier = "its header"
-    try:
-        if (_text(tokens), _text(tokens)) != ("ooTextFile", "TextGrid"):
-            raise FaceDiffError(f"{path}: is no TextGrid; expected a text file that Praat or an aligner has written")
-        _number(tokens), _number(tokens), next(tokens)
-        tiers: dict[str, list[Interval]] = {}
-        for _ in range(int(_number(tokens))):
-            kind, tier = _text(tokens), f"tier {_text(tokens)}"
-            _number(tokens), _number(tokens)
-            intervals = [_interval(tokens, kind) for _ in range(int(_number(tokens)))]
-            if kind != "IntervalTier":
-                continue
-            edges = [edge for start, end, _ in intervals for edge in (start, end)]
-            backwards = next((i for i in range(1, len(edges)) if edges[i] < edges[i - 1] - 1e-6), None)
-            if backwards is not None or (edges and edges[0] < 0.0):
-                where = edges[backwards or 0]
-                raise FaceDiffError(f"{path}: {tier} goes back in time at {where:g} s; {REMEDY}")
-            tiers.setdefault(tier.removeprefix("tier "), intervals)
-    except (StopIteration, ValueError) as error:
-        raise FaceDiffError(f"{path}: {tier} is cut short or damaged; {REMEDY}") from error
-    return tiers
-
-
-def _interval(tokens: Iterator[re.Match[str]], kind: str) -> Interval:
-    start = _number(tokens)
-    return start, _number(tokens) if kind == "IntervalTier" else start, _text(tokens).strip()
-
-
-def _text(tokens: Iterator[re.Match[str]]) -> str:
-    match = next(tokens)
-    if match[1] is None:
-        raise ValueError(match[0])
-    return match[1].replace('""', '"')
-
-
-def _number(tokens: Iterator[re.Match[str]]) -> float:
-    match = next(tokens)
-    if match[3] is None:
-        raise ValueError(match[0])
-    return float(match[3])
