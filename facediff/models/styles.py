@@ -208,7 +208,7 @@ def read_style(
         for reference in model.assets.references.values():
             if reference.clip == style:
                 return reference
-    opened = open_style(Path(style) if is_file else corpus_clip(style, model))
+    opened = open_style(Path(style)) if is_file else corpus_clip(style, model)
     return style_of(opened, identity, model, template=template if is_file else None)
 
 
@@ -242,14 +242,20 @@ def style_of(
     return Reference(path.stem, offsets)
 
 
-def corpus_clip(name: str, model: AnimationModel) -> Path:
-    """The motion file of a clip of the training corpus, if the corpus is on this machine."""
+def corpus_clip(name: str, model: AnimationModel) -> StyleFile:
+    """The motion of a clip of the training corpus, if the corpus is on this machine."""
+    import numpy as np
+
+    from facediff.data.storage import MOTION_FOLDERS, motion_path, open_motion
+
     root = model.data_source.get("root")
-    path = Path(root) / "vertices_npy" / f"{name}.npy" if root else None
+    path = motion_path(Path(root), name) if root else None
     if path is None or not path.is_file():
         where = f"in the checkpoint nor at {path}" if path else "in the checkpoint, and its corpus is not known"
         raise OptionError.naming(f"{{style}} {name}: no clip of that name {where}; give a .npy file or another clip")
-    return path
+    motion = open_motion(path, model.n_vertices)
+    # Vertices also where the corpus keeps weights of shapes: its templates and frame rate belong to them.
+    return StyleFile(path.parent.parent / MOTION_FOLDERS[0] / path.name, np.asarray(motion.read(range(motion.frames))))
 
 
 def read_vector(opened: StyleFile, model: AnimationModel) -> Tensor:

@@ -254,7 +254,7 @@ def test_a_component_chosen_by_name_starts_from_its_own_defaults(
 
 EXPERIMENTS = sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml"))
 QUICK = ("biwi", "biwi_paper", "mead3d", "vocaset", "vocaset_style_content_paper", "puppet_hubert", "biwi_faceformer")
-QUICK += ("vocaset_diffspeaker", "puppet_codetalker_prior")
+QUICK += ("vocaset_diffspeaker", "puppet_codetalker_prior", "puppet_mask")
 """Those that are parsed in the quick suite: every corpus, trainer and kind of model; others differ by their sizes."""
 
 

@@ -35,6 +35,8 @@ OF_A_MODEL = {
 NO_CLIP_VALUES = {
     "clip_speech_lip_correlation",
     "motion_liveliness",
+    "difference_ratio",
+    "frame_step",
     "spectrum_distance",
     "blink_rate",
     "blink_rate_ratio",

@@ -34,7 +34,18 @@ for kind in registry.KINDS.values():
 
 WILD = (math.nan, math.inf, -math.inf, -1, -0.5, 0, 1.5, 2**40, 1e-320, 1e300, 2**2000, "", "x", None, [], [-1], 1j)
 NAMED_OTHERWISE = (
-    *("root", "people", "lips", "upper_face", "extra_identities", "protocol", "metrics", "identities", "source"),
+    *(
+        "root",
+        "people",
+        "recordings",
+        "lips",
+        "upper_face",
+        "extra_identities",
+        "protocol",
+        "metrics",
+        "identities",
+        "source",
+    ),
     *("sampler", "frame_rate", "n_vertices"),
 )
 """Arguments that stand for files, folders or names: the sentence names these."""

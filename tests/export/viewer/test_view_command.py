@@ -60,7 +60,7 @@ def test_checkpoint_completes_a_bare_array_and_leaves_an_archive_as_it_is(
         faces=own.triangles,
         frame_rate=50.0,
         unit="cm",
-        colours=None,
+        colours_of=lambda name: None,
         regions={},
         inner_lip_pairs=None,
     )
