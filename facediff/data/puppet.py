@@ -258,7 +258,7 @@ class PuppetMask(SpeechMotionDataModule):
     synthetic: ClassVar[bool] = True
     unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(second_edition.MASK.frame_rate)
-    n_vertices = 23_550
+    n_vertices = second_edition.vertex_count(second_edition.MASK)
     identities = list(second_edition.MASK_SEEN)
     mesh_files: ClassVar[tuple[str, ...]] = (second_edition.MASK.mesh_file,)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)

@@ -20,7 +20,7 @@ from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.face import N_VERTICES, build_face
 from facediff.synthetic.geometry import HeadMesh
 from facediff.synthetic.head.mesh import QuadMesh
-from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
 from facediff.utils.limits import check_format
 from facediff.utils.plain_files import load_json, read_table, write_json
 
@@ -159,7 +159,7 @@ def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
     points = np.asarray(vertices, np.float64)
     for topology, count, table in (
         ("puppet", N_VERTICES, puppet_landmarks),
-        ("puppet", len(build_head().vertices), partial(puppet_landmarks, 2)),
+        ("puppet", N_HEAD_VERTICES, partial(puppet_landmarks, 2)),
         ("FLAME", FLAME_VERTICES, FLAME.copy),
     ):
         if len(points) == count and _lie_as_on_a_face(points, landmarks := table()):

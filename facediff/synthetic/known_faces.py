@@ -19,7 +19,7 @@ from facediff.synthetic.cast import CAST
 from facediff.synthetic.face import N_VERTICES, build_face
 from facediff.synthetic.geometry import Array, HeadMesh
 from facediff.synthetic.head.mesh import QuadMesh
-from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
 from facediff.synthetic.head.rig import ARKIT, SHAPES, head_shapes
 from facediff.synthetic.rig import LINEAR_FIELDS
 from facediff.synthetic.speakers import SPEAKERS
@@ -88,7 +88,7 @@ def edition_of_mesh(vertices: int, faces: NDArray[np.integer] | None = None) -> 
     """The edition whose topology a mesh has, by its triangles too where they are known."""
     if vertices == N_VERTICES:
         own, edition = build_face().faces, 1
-    elif vertices == len(build_head().vertices):
+    elif vertices == N_HEAD_VERTICES:
         own, edition = build_head().faces, 2
     else:
         return None

@@ -24,8 +24,8 @@ from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
 from facediff.synthetic.corpus import CORPUS, MANIFEST, in_quiet, refuse_foreign, write_ply
 from facediff.synthetic.further_speech import WORDS
-from facediff.synthetic.head.mask import build_mask
-from facediff.synthetic.head.parts import AROUND_EYE, build_head
+from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
+from facediff.synthetic.head.parts import AROUND_EYE, N_HEAD_VERTICES, build_head
 from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
 from facediff.synthetic.motion import analyse
@@ -286,7 +286,7 @@ def rig_of(identity: str) -> NDArray[np.float32]:
 
 def vertex_count(production: Production = PUPPET) -> int:
     """Vertices of a corpus's mesh."""
-    return build_mask().operator.shape[0] if production.mask else len(build_head().vertices)
+    return N_MASK_VERTICES if production.mask else N_HEAD_VERTICES
 
 
 def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] = ()) -> NDArray[np.float32]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from facediff.synthetic.head.layout import EYE_POINTS, MOUTH_POINTS, eye_ring, lay_out, mouth_ring
+from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
+from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
 from facediff.synthetic.head.surface import plane_of, skin, skin_at
 
 
@@ -41,3 +43,8 @@ def test_the_front_is_found_again() -> None:
     plane = plane_of(places)
     assert np.allclose(skin(*plane.T)[[0, 3], :2], places[[0, 3]], atol=0.6)
     assert np.allclose(skin_at(places)[0, 0], 0.0)
+
+
+def test_the_counts_that_are_known_without_building_are_those_of_the_meshes() -> None:
+    assert len(build_head().vertices) == N_HEAD_VERTICES
+    assert build_mask().operator.shape[0] == N_MASK_VERTICES

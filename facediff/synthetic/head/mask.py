@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 _SKIN = ("skin", "mouth_far", "mouth_near", "lip_", "mouth_front", "eye_", "nostril")
 _FRONT, _LOWEST = 30.0, -100.0  # Depth and height in mm from which on skin belongs to the mask
 _LEVELS = 2
+N_MASK_VERTICES = 23_550
+"""Vertices of the mask, known without building it."""
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ AROUND_MOUTH = {"mouth_far": 5.6, "mouth_near": 2.6, "lip_border": 0.0}
 AROUND_EYE = {"eye_far": 5.4, "eye_crease": 3.3, "eye_near": 1.6, "eye_edge": 0.0}
 """Loops of skin round the eye, and their distance from the edge of the lids in mm."""
 LASHES, BROW_COLUMNS = 15, 15
+N_HEAD_VERTICES = 5875
+"""Vertices of the head, known without building it."""
 
 
 @lru_cache(maxsize=1)
