@@ -78,10 +78,10 @@ class PrincipalComponents(nn.Module):
         """Components of scaled offsets from the template, each of unit variance over the training frames."""
         with torch.autocast(motion.device.type, enabled=False):
             # Not in mixed precision: a sum over 70 000 products in 16 bits would be off by more than the small
-            # components' size.
-            # In place: at 6 000 vertices allocating another tensor of this size takes longer than the product.
-            centred = (motion.flatten(2) - self.mean).mul_(self.weights)
-            return centred @ self.basis.T / self.deviations
+            # components' size. Mean and weights are folded into the map: at 6 000 vertices centring a copy of the
+            # motion takes longer than the product.
+            into = (self.basis * self.weights).T / self.deviations
+            return motion.flatten(2) @ into - self.mean @ into
 
     def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames vertices 3"]:
         """The scaled offsets with these components; all other components are those of the mean."""
