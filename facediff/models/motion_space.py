@@ -276,6 +276,11 @@ class Preconditioning(nn.Module):
         # such steps would otherwise not be trained.
         self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
 
+    def hidden(self) -> Float[Tensor, " steps"]:
+        """The share of the motion that noise leaves open in each step, counted as the losses count."""
+        # The weights of a step are those of the last one, over what is left open relative to it.
+        return self.loss[-1, 0] / self.loss[:, 0]
+
     def posterior_mean(
         self,
         noisy: Coordinates,

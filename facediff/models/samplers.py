@@ -119,6 +119,7 @@ class NoiseProcess:
         generator: torch.Generator | None = None,
         *,
         min_snr: float | None = None,
+        weights: Float[Tensor, " steps"] | None = None,
     ) -> Int[Tensor, " batch"]:
         """Random step numbers (algorithm 1, line 3).
 
@@ -129,7 +130,10 @@ class NoiseProcess:
             min_snr: γ, with which steps are drawn in proportion to min(SNR, γ): in expectation, that weights their
                 losses as min-SNR-γ does for a network that predicts clean motion (Hang et al. 2023). None draws them
                 uniformly.
+            weights: probabilities of the steps, such as those of :meth:`even_in_log_snr`, instead.
         """
+        if weights is not None:
+            return torch.multinomial(weights.to(device), batch, replacement=True, generator=generator)
         if min_snr is None:
             return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
         # Drawing in proportion to the weight replaces multiplying the loss by it: the expectation is the same, and no
@@ -137,6 +141,32 @@ class NoiseProcess:
         signal = self.signal.to(device)
         weights = (signal / (1 - signal)).clamp_max(min_snr)
         return torch.multinomial(weights, batch, replacement=True, generator=generator)
+
+    def even_in_log_snr(self, hidden: Float[Tensor, " steps"]) -> Float[Tensor, " steps"]:
+        """Probabilities of the steps that spread a training over the levels of noise at which motion is decided.
+
+        Where neighbouring frames tell a noisy one, speech is needed in the noisiest few per cent of the steps alone,
+        and there a sampler takes half of its steps. Three quarters of the draws are uniform in ln SNR, from where noise
+        leaves a thousandth of the motion open to where it leaves nine tenths; one quarter is uniform over all steps.
+
+        Args:
+            hidden: the share of the motion that noise leaves open in each step, rising.
+        """
+        signal = self.signal.cpu().double()
+        level = (signal / (1 - signal)).log()
+        # A step stands for the levels up to half way to its neighbours.
+        middle = (level[:-1] + level[1:]) / 2
+        borders = torch.cat([level[:1], middle, level[-1:]])
+        first, last = (int((hidden < share).sum()) for share in SPREAD)
+        top, bottom = level[min(first, self.steps - 1)], level[min(last, self.steps - 1)]
+        width = (borders[:-1].clamp(bottom, top) - borders[1:].clamp(bottom, top)).clamp_min(0)
+        even = torch.full_like(width, 1 / self.steps)
+        total = width.sum()
+        return (even if total == 0 else 0.75 * width / total + 0.25 * even).float()
+
+
+SPREAD = (0.001, 0.9)
+"""Shares of the motion that noise leaves open, between which training steps are uniform in ln SNR."""
 
 
 def half_hidden(

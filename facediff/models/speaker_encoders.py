@@ -175,6 +175,9 @@ class TcnGruTransformer(StyleEncoder):
         num_heads: attention heads.
         n_positions: rows of the position embedding.
         dropout: dropout everywhere.
+        statistics: add a linear map of the features' means and deviations over the reference (not in the paper). How
+            far and about what rest someone moves is in them; the other layers, each behind a normalisation, learn it
+            late.
     """
 
     def __init__(
@@ -188,6 +191,7 @@ class TcnGruTransformer(StyleEncoder):
         num_heads: Heads = 4,
         n_positions: Annotated[int, Range(1, 16_384)] = 64,
         dropout: Share = 0.1,
+        statistics: bool = False,
     ) -> None:
         super().__init__()
         if dim % 2:
@@ -202,11 +206,13 @@ class TcnGruTransformer(StyleEncoder):
         self.norm = nn.LayerNorm(dim)
         self.pooling = AttentionPooling(dim)
         self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU(), nn.Linear(dim, dim))
+        self.statistics = nn.Linear(2 * dim, dim) if statistics else None
         self.token_dims = (dim,)
 
     def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """F_dyn of each clip (eq. 9)."""
-        return self.mlp(self.pooling(self.features(reference, mask), mask))
+        style = self.mlp(self.pooling(self.features(reference, mask), mask))
+        return style if self.statistics is None else style + self.statistics(mean_and_deviation(reference, mask))
 
     def features(self, reference: Tensor, mask: Tensor) -> Tensor:
         """F_attn (batch, frames, dim)."""
@@ -228,6 +234,18 @@ class TcnGruTransformer(StyleEncoder):
         for layer in self.layers:
             x = layer(x, mask)
         return self.norm(x)
+
+
+def mean_and_deviation(
+    features: Frames, mask: FrameMask, epsilon: float = 1e-4
+) -> Float[Tensor, "batch twice_the_channels"]:
+    """Mean and standard deviation of features over each clip's valid frames; ``epsilon`` is added to the variance."""
+    column = mask[..., None].to(features.dtype)
+    count = column.sum(1).clamp_min(1)
+    mean = (features * column).sum(1) / count
+    variance = ((features - mean[:, None]) * column).square().sum(1) / count
+    # Without it the gradient of the root is infinite at a reference that stands still.
+    return torch.cat([mean, (variance + epsilon).sqrt()], -1)
 
 
 class TemporalBlock(nn.Module):

@@ -146,6 +146,40 @@ def test_a_silent_network_gives_the_posterior_mean_of_gaussian_motion(step: int)
     assert float((scales.loss[step] * scales.out[step] ** 2).sum()) == pytest.approx(1, rel=1e-4)
 
 
+@pytest.mark.parametrize("over_windows", [False, True])
+def test_what_noise_hides_is_counted_as_the_losses_count(over_windows: bool) -> None:
+    process, counted = NoiseProcess(), torch.tensor([2.0, 1.0, 5.0])
+    if over_windows:
+        scales: Preconditioning = TemporalPreconditioning(process.steps, len(VARIANCES), 1)
+        assert isinstance(scales, TemporalPreconditioning)
+        scales.fit_covariance(process.signal, VARIANCES.view(-1, 1, 1), counted)
+    else:
+        scales = Preconditioning(process.steps, len(VARIANCES))
+        scales.fit(process.signal, VARIANCES, counted)
+    kept, own = process.signal.double().numpy()[:, None], VARIANCES.double().numpy()
+    left = (counted.double().numpy() * own * (1 - kept) / (kept * own + 1 - kept)).sum(1)
+    np.testing.assert_allclose(scales.hidden().numpy(), left / left[-1], rtol=1e-4)
+
+
+def test_training_steps_follow_from_what_noise_hides(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:
+    model = make_model(motion_space=partial(ComponentMotion, count=4), timestep_sampling="log_snr")
+    make_trainer(max_steps=1).fit(model, tiny)
+    drawn: list[Tensor] = []
+    model.process.draw_steps = lambda count, device, *_, weights, **__: (  # type: ignore[method-assign]
+        drawn.append(weights) or torch.zeros(count, dtype=torch.long)
+    )
+    model.losses(next(iter(tiny.val_dataloader())))
+    assert model.motion_space.preconditioning is not None
+    expected = model.process.even_in_log_snr(model.motion_space.preconditioning.hidden())
+    torch.testing.assert_close(drawn[0], expected)
+
+
+@pytest.mark.parametrize("options", [{}, {"motion_space": partial(ComponentMotion, count=4), "min_snr": 5.0}])
+def test_steps_by_what_noise_hides_need_a_space_that_knows_it(options: dict[str, object], make_model: Make) -> None:
+    with pytest.raises(FaceDiffError, match=r"model\.timestep_sampling log_snr: .*motion_space=components"):
+        make_model(timestep_sampling="log_snr", **options)
+
+
 @pytest.mark.parametrize(
     ("sampler", "tolerance"),
     [

@@ -70,6 +70,25 @@ def test_pooling_against_numpy() -> None:
         np.testing.assert_allclose(pooled[row], gamma @ f, atol=1e-12)
 
 
+def test_statistics_against_numpy() -> None:
+    """With the other layers silent, F_dyn is the map of means and deviations of each clip's own frames."""
+    torch.manual_seed(0)
+    encoder = TcnGruTransformer(dim=DIM, num_heads=2, statistics=True).eval()
+    for parameter in encoder.mlp.parameters():
+        nn.init.zeros_(parameter)
+    lengths = (7, 1)
+    reference = torch.randn(2, 7, DIM)
+    style = encoder(reference, torch.arange(7)[None] < torch.tensor(lengths)[:, None]).detach().numpy()
+    last = encoder.statistics
+    assert last is not None
+    for row, length in enumerate(lengths):
+        own = reference[row, :length].numpy()
+        facts = np.concatenate([own.mean(0), np.sqrt(own.var(0) + 1e-4)])
+        np.testing.assert_allclose(
+            style[row], last.weight.detach().numpy() @ facts + last.bias.detach().numpy(), atol=1e-5
+        )
+
+
 @pytest.mark.parametrize("frames", [1, 5, 64, 300])
 def test_positions_serve_any_length(frames: int) -> None:
     """With a silent GRU and no layers only the positions are left."""

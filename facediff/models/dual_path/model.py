@@ -59,6 +59,8 @@ from facediff.utils.ranges import Range, mismatch
 NumericScale = Annotated[float, Range(1e-6, 1e6)]
 NoiseScale = NumericScale | Literal["auto"]
 
+TimestepSampling = Literal["uniform", "log_snr"]
+
 NOISE_SCALE_KEY = "facediff_noise_scale"
 PRINCIPAL = 64
 """Components by which the noise scale is measured."""
@@ -94,6 +96,9 @@ class DualPathDiffusion(AnimationModel):
             and style are encoded once for all of them.
         min_snr: γ of min-SNR weighting: steps are drawn in proportion to min(SNR, γ), which leaves out the noisiest, in
             which a sampler begins; uniformly if None.
+        timestep_sampling: draw training steps ``uniform``, as in the paper, or by ``log_snr``: mostly evenly over the
+            logarithm of the signal-to-noise ratio, where noise hides part of the motion. For a motion space with a
+            preconditioned network.
         noise_scale: what motion is multiplied by before it is noised; ``auto`` measures on the training split at which
             scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
@@ -143,6 +148,7 @@ class DualPathDiffusion(AnimationModel):
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
         noise_draws: Annotated[int, Range(1, 64)] = 1,
         min_snr: Annotated[float, Range(1e-3, 1e6)] | None = None,
+        timestep_sampling: TimestepSampling = "uniform",
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         identity_dropout: Share = 0.1,
@@ -179,6 +185,8 @@ class DualPathDiffusion(AnimationModel):
         self.face_weight_unit = face_weight_unit
         self.noise_draws = noise_draws
         self.min_snr = min_snr
+        self.timestep_sampling = timestep_sampling
+        self._step_weights: Tensor | None = None  # follow from the motion space, known when training begins
         self.style_weights = {"style_identity": style_identity_weight, "style_contrast": style_contrast_weight}
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
@@ -188,6 +196,11 @@ class DualPathDiffusion(AnimationModel):
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
         self.motion_space = motion_space(n_vertices=self.n_vertices, steps=diffusion_steps)
+        if timestep_sampling == "log_snr" and (self.motion_space.preconditioning is None or min_snr is not None):
+            raise ArgumentError(
+                {"timestep_sampling": timestep_sampling},
+                "needs motion_space=components, which knows what noise hides, and no min_snr",
+            )
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
             coordinates=self.motion_space.coordinates,
@@ -236,6 +249,7 @@ class DualPathDiffusion(AnimationModel):
                 noised, variances = space.modes(covariance)
             self.rescale_noise(half_hidden(noised, variances))
         space.fit(self.process.signal, covariance)
+        self._step_weights = None
         return shapes
 
     def motion_weights(self) -> Float[Tensor, "vertices 3"]:
@@ -366,7 +380,10 @@ class DualPathDiffusion(AnimationModel):
         if self.training and self.invented_speakers is not None:
             batch = self.invented_speakers(batch, self.scale)
         device, count = batch.motion.device, len(batch) * self.noise_draws
-        step = self.process.draw_steps(count, device, generator, min_snr=self.min_snr)
+        space = self.motion_space.preconditioning
+        if self.timestep_sampling == "log_snr" and space is not None and self._step_weights is None:
+            self._step_weights = self.process.even_in_log_snr(space.hidden().cpu()).to(device)
+        step = self.process.draw_steps(count, device, generator, min_snr=self.min_snr, weights=self._step_weights)
         shape = (count, batch.motion.shape[1], self.motion_space.coordinates)
         return self.losses_at(batch, step, unit_noise(shape, device, generator))
 
