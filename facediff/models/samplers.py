@@ -194,10 +194,16 @@ def half_hidden(
 
 
 Spacing = Literal["steps", "log_snr"]
-LastNoise = Annotated[float, Range(1e-6, 1e6)]
+NoiseLevel = Annotated[float, Range(1e-6, 1e6)]
 
 
-def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: float | None) -> list[int]:
+def visited(
+    process: NoiseProcess,
+    steps: int,
+    spacing: Spacing,
+    last_noise: float | None,
+    first_noise: float | None = None,
+) -> list[int]:
     """Which steps of the process a sampler visits, counted from 0, from pure noise downwards.
 
     Args:
@@ -207,16 +213,24 @@ def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: flo
             ratio, the time of the solvers, so that few steps go to as little noise as many do.
         last_noise: noise left at the last of them, as a deviation in the unit of the motion, √((1 − ᾱ) / ᾱ); None for
             where the spacing itself ends.
+        first_noise: noise from which ``log_snr`` is spread; the process's last step stays the first visited. A process
+            ends where motion has long been hidden, and half of the steps would be spent on the way from there.
 
     Raises:
         FaceDiffError: if fewer steps than that have as much noise as the last one is to have.
     """
-    if spacing == "steps" and last_noise is None:
+    if spacing == "steps" and last_noise is None and first_noise is None:
         # From the end of the process, since sampling starts from pure noise; the clean end itself is no step.
         return [round(process.steps * (steps - i) / steps) - 1 for i in range(steps)]
     kept = process.signal.double()
     snr = torch.log(kept / (1 - kept)) / 2  # falls from step to step
     cleanest = 0 if last_noise is None else int((snr + math.log(last_noise)).abs().argmin())
+    start = snr[-1] if first_noise is None else snr[-1].clamp_min(-math.log(first_noise))
+    if first_noise is not None and (spacing == "steps" or float(start) >= float(snr[cleanest])):
+        raise ArgumentError(
+            {"first_noise": first_noise, "last_noise": last_noise, "spacing": spacing},
+            "is for spacing=log_snr, and above the noise at the last step",
+        )
     if process.steps - 1 - cleanest < steps - 1:
         raise ArgumentError(
             {"last_noise": last_noise, "steps": steps, "diffusion_steps": process.steps},
@@ -229,9 +243,9 @@ def visited(process: NoiseProcess, steps: int, spacing: Spacing, last_noise: flo
         if spacing == "steps":
             nearest = round((process.steps - 1) + share * (cleanest - process.steps + 1))
         else:
-            nearest = int((snr - (snr[-1] + share * (snr[cleanest] - snr[-1]))).abs().argmin())
+            nearest = int((snr - (start + share * (snr[cleanest] - start))).abs().argmin())
         # Each step once, and room for those that follow.
-        nearest = min(nearest, chosen[-1] - 1) if chosen else process.steps - 1
+        nearest = min(nearest, chosen[-1] - 1) if chosen else process.steps - 1  # pure noise first
         chosen.append(max(nearest, cleanest + steps - 1 - i))
     return chosen
 
@@ -284,6 +298,7 @@ class Sampler(ABC):
         steps: denoising steps; at most the process's own number.
         spacing: how they are spread over the process, see :func:`visited`.
         last_noise: noise left at the last of them, see :func:`visited`.
+        first_noise: noise from which ``log_snr`` is spread, see :func:`visited`.
 
     Attributes:
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
@@ -304,7 +319,12 @@ class Sampler(ABC):
     memory: ClassVar[int] = 1
 
     def __init__(
-        self, process: NoiseProcess, steps: int, spacing: Spacing = "steps", last_noise: float | None = None
+        self,
+        process: NoiseProcess,
+        steps: int,
+        spacing: Spacing = "steps",
+        last_noise: float | None = None,
+        first_noise: float | None = None,
     ) -> None:
         if not 1 <= steps <= process.steps:
             raise ArgumentError(
@@ -312,7 +332,7 @@ class Sampler(ABC):
             )
         self.process = process
         self.steps = steps
-        self.timesteps = visited(process, steps, spacing, last_noise)
+        self.timesteps = visited(process, steps, spacing, last_noise, first_noise)
         self.signal = [*(float(process.signal[n]) for n in self.timesteps), 1.0]
 
     def run(
@@ -371,6 +391,7 @@ class DdimSampler(Sampler):
         spacing: ``steps`` spreads them evenly over the process, ``log_snr`` over the logarithm of its signal-to-noise
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
+        first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
 
     Raises:
         FaceDiffError: if the number of steps or eta is impossible.
@@ -385,9 +406,10 @@ class DdimSampler(Sampler):
         steps: Steps = 25,
         eta: Share = 0.0,
         spacing: Spacing = "steps",
-        last_noise: LastNoise | None = None,
+        last_noise: NoiseLevel | None = None,
+        first_noise: NoiseLevel | None = None,
     ) -> None:
-        super().__init__(process, steps, spacing, last_noise)
+        super().__init__(process, steps, spacing, last_noise, first_noise)
         self.eta = eta
 
     def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
@@ -416,6 +438,7 @@ class DdpmSampler(DdimSampler):
         steps: denoising steps; all of the process's if None.
         spacing: as for ``ddim``.
         last_noise: as for ``ddim``.
+        first_noise: as for ``ddim``.
     """
 
     def __init__(
@@ -424,10 +447,13 @@ class DdpmSampler(DdimSampler):
         process: NoiseProcess,
         steps: Steps | None = None,
         spacing: Spacing = "steps",
-        last_noise: LastNoise | None = None,
+        last_noise: NoiseLevel | None = None,
+        first_noise: NoiseLevel | None = None,
     ) -> None:
         count = process.steps if steps is None else steps
-        super().__init__(process=process, steps=count, eta=1.0, spacing=spacing, last_noise=last_noise)
+        super().__init__(
+            process=process, steps=count, eta=1.0, spacing=spacing, last_noise=last_noise, first_noise=first_noise
+        )
 
 
 @sampler.register("dpm_solver")
@@ -441,6 +467,7 @@ class DpmSolverSampler(Sampler):
         spacing: ``steps`` spreads them evenly over the process, ``log_snr`` over the logarithm of its signal-to-noise
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
+        first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
 
     Raises:
         FaceDiffError: if the number of steps or the order is impossible.
@@ -456,9 +483,10 @@ class DpmSolverSampler(Sampler):
         steps: Steps = 5,
         order: Literal[1, 2, 3] = 2,
         spacing: Spacing = "steps",
-        last_noise: LastNoise | None = None,
+        last_noise: NoiseLevel | None = None,
+        first_noise: NoiseLevel | None = None,
     ) -> None:
-        super().__init__(process, steps, spacing, last_noise)
+        super().__init__(process, steps, spacing, last_noise, first_noise)
         self.order = order
         # Without the clean end, whose time λ is infinite; the last update returns the prediction and needs none.
         signal = self.signal[:-1]

@@ -153,9 +153,9 @@ DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
     "sampler": {
-        "ddim": {"steps": 25, "eta": 0.0, "spacing": "steps", "last_noise": None},
-        "ddpm": {"steps": None, "spacing": "steps", "last_noise": None},
-        "dpm_solver": {"steps": 5, "order": 2, "spacing": "steps", "last_noise": None},
+        "ddim": {"steps": 25, "eta": 0.0, "spacing": "steps", "last_noise": None, "first_noise": None},
+        "ddpm": {"steps": None, "spacing": "steps", "last_noise": None, "first_noise": None},
+        "dpm_solver": {"steps": 5, "order": 2, "spacing": "steps", "last_noise": None, "first_noise": None},
     },
 }
 

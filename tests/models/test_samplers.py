@@ -452,21 +452,29 @@ def log_snr(process: NoiseProcess, places: Sequence[int]) -> np.ndarray:
     return np.log(kept / (1 - kept)) / 2
 
 
+@pytest.mark.parametrize("first_noise", [None, 40.0])
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 @pytest.mark.parametrize("steps", [2, 5, 10])
-def test_log_snr_spacing_is_even_in_the_solvers_time(scale: float, steps: int) -> None:
+def test_log_snr_spacing_is_even_in_the_solvers_time(scale: float, steps: int, first_noise: float | None) -> None:
     process = NoiseProcess(scale=scale)
-    places = DpmSolverSampler(process=process, steps=steps, spacing="log_snr", last_noise=0.5).timesteps
+    options = {"steps": steps, "spacing": "log_snr", "last_noise": 0.5, "first_noise": first_noise}
+    places = DpmSolverSampler(process=process, **options).timesteps  # type: ignore[arg-type]
     assert places[0] == 999
     assert len(set(places)) == len(places) == steps
     times = log_snr(process, places)
     assert math.exp(-times[-1]) == pytest.approx(0.5, rel=0.05)
     # The noisiest steps of the process lie far apart in this time, so some cannot be met exactly.
-    even = np.linspace(times[0], times[-1], steps)
+    even = np.linspace(times[0] if first_noise is None else -math.log(first_noise), times[-1], steps)
     every = log_snr(process, range(1000))
     nearest = np.abs(every[None] - even[:, None]).min(1)
     # Where steps of the process are rarer than those wanted, each is visited once, and the next ones move on.
-    assert (np.abs(times - even) <= nearest + 0.05)[even > every[990]].all()
+    assert (np.abs(times - even) <= nearest + 0.05)[1:][even[1:] > every[990]].all()
+
+
+@pytest.mark.parametrize("options", [{"spacing": "steps"}, {"spacing": "log_snr", "last_noise": 50.0}])
+def test_the_first_noise_is_for_log_snr_and_above_the_last(options: dict[str, object]) -> None:
+    with pytest.raises(FaceDiffError, match="first_noise"):
+        DdimSampler(process=NoiseProcess(), first_noise=40.0, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["ddim", "dpm_solver", "ddpm"])

@@ -299,7 +299,7 @@ class DualPathDiffusion(AnimationModel):
         options = dict(self.hparams["sampler"]["init_args"])
         more: dict[str, Any] = {} if steps is None else {"steps": steps}
         if name is not None:
-            shared = {"spacing", "last_noise"} & options.keys() & registry.defaults(chosen).keys()
+            shared = {"spacing", "last_noise", "first_noise"} & options.keys() & registry.defaults(chosen).keys()
             options = {key: options[key] for key in sorted(shared)}
         try:
             self.sampler = chosen(process=self.process, **options | more)
