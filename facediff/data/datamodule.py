@@ -287,6 +287,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The clip that gives an identity's style when no other is chosen."""
         return clips[0]
 
+    def stores_reference(self, identity: str) -> bool:
+        """Whether checkpoints keep a clip of an identity, as its style when no other is chosen."""
+        return True
+
     def prepare_data(self) -> None:
         """Report the clips that a complete corpus has and this folder has not; called on one process only."""
         missing = {split: len(names) for split, names in self.missing_clips().items() if names}
@@ -430,7 +434,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             mesh = corpus.read_mesh(self.mesh_files)
             references = {}
             for identity, clips in sorted(self.reference_policy().candidates.items()):
-                if identity in corpus.templates:
+                if identity in corpus.templates and self.stores_reference(identity):
                     clip = self.default_reference(clips)
                     references[identity] = Reference(
                         clip.name, corpus.read_motion(clip, 0, self.reference_frames).half()

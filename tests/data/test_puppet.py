@@ -18,6 +18,7 @@ def test_data_module_trains_on_drawn_speakers_and_compares_the_eight(tmp_path: P
     data.setup("fit")
     assert data.identities == [*puppet.SEEN_IDENTITIES, "X01", "X02"]
     assert len(data.train_dataloader().dataset) == 4  # all but the unseen speaker's clip
+    assert set(data.assets().references) == {"F1", "F4"}  # a checkpoint keeps no clips of drawn speakers
     assert data.compared_speakers == (*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES)
     assert Puppet(drawn_speakers=2).root != Puppet().root
 
