@@ -10,6 +10,7 @@ from facediff.cli.app import main
 SMALL = [
     "--model.dim=16",
     "--model.diffusion_steps=20",
+    "--model.motion_space.prior_frames=5",  # clips of the miniature corpus are short
     "--model.sampler.steps=2",
     "--trainer.max_epochs=1",
     "--trainer.check_val_every_n_epoch=1",
