@@ -47,6 +47,7 @@ from facediff.metrics import (
 )
 from facediff.models.base import AnimationModel
 from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of
+from facediff.models.inference import Style
 from facediff.utils import ranges
 
 REFERENCES = {
@@ -77,6 +78,7 @@ GENERATION_METRICS: dict[str, str] = {
     "fdd_signed_still": "FDD, signed / still face's (0)",
     "lve": "LVE, one sample",
     "lve_still": "LVE / still face's, one sample",
+    "lve_default_still": "LVE / still face's, one sample, with the style that animate takes",
     "lve_mean_still": "LVE / still face's, mean of {samples} samples",
     "lve_best_still": "LVE / still face's, best of {samples} samples",
     "lve_mean_face": "LVE / mean face's, one sample",
@@ -241,6 +243,7 @@ class Measurement:
         self.of_references: dict[str, Metric] = {
             f"{label}_{whose}": MeanVertexError() for label in ("hidden", "known") for whose in REFERENCES
         }
+        self.of_references["lve_default"] = LipVertexError(lips)
         if corpus.gallery is not None:
             self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
             self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
@@ -293,11 +296,27 @@ class Measurement:
         """Score motion with other references, with the label of a trained speaker and without."""
         views = dict(self._views(clip, sample))
         batch = collate(list(views.values())).to(self.model.device)
+        default = self._with_default_style(clip, sample)
         for seed in range(self.sampling.seed, self.sampling.seed + (self.sampling.references if self.drawn > 1 else 1)):
+            if default is not None:
+                motion = self.model.generate(default, seed=seed)[0]
+                self.of_references["lve_default"].update(motion, default.motion[0])
             for name, motion in zip(views, self.model.generate(batch, seed=seed), strict=True):
                 self.of_references[name].update(motion, batch.motion[0])
                 if name == "hidden_own" and "nearest_speaker" in self.of_references:
                     self.of_references["nearest_speaker"].update(motion, self._number(clip))
+
+    def _with_default_style(self, clip: Clip, sample: Sample) -> Batch | None:
+        """A clip with the style that its identity has where none is named; None if it has none."""
+        try:
+            style = self.model.default_style(clip.identity)
+        except FaceDiffError:
+            return None
+        if isinstance(style, Style):
+            styled = replace(sample, style=style.vector.cpu())
+        else:
+            styled = replace(sample, reference=style.motion.float(), reference_name=style.clip)
+        return collate([styled]).to(self.model.device)
 
     def _views(self, clip: Clip, sample: Sample) -> list[tuple[str, Sample]]:
         views = []
@@ -339,6 +358,7 @@ class Measurement:
                 for name in ("lve", "lve_mean", "lve_best")
                 for face in ("still", "mean_face")
             },
+            "lve_default_still": ratio("lve_default", "still_lve"),
             **{
                 f"mve_{label}_{whose}": ratio(f"{label}_{whose}", f"{label}_own")
                 for label in ("hidden", "known")

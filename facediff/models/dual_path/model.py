@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Batch, SpeechMotionDataModule
+from facediff.data import Batch, Reference, SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
@@ -31,7 +31,7 @@ from facediff.models.folding import (
 )
 from facediff.models.fusions import BidirectionalCrossAttention, FusionFactory
 from facediff.models.graphs import Graphs
-from facediff.models.inference import ClipNoise, Expressivity, Progress, WindowNoise, WindowOverlap
+from facediff.models.inference import ClipNoise, Expressivity, Progress, Style, WindowNoise, WindowOverlap
 from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.layers import Share, Weight, Width
 from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss
@@ -106,7 +106,8 @@ class DualPathDiffusion(AnimationModel):
         invented_speakers: share of training clips whose motion and style reference are multiplied by the same random
             gains under a hidden identity, so that the style path learns more speakers than the corpus has.
         invented_gain: standard deviation of the logarithm of these gains.
-        style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide.
+        style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide, and is taken
+            from the speech where none is given.
         speech_dropout: share of training clips whose speech is hidden, together with whatever else may be hidden, so
             that speech can guide.
         speech_guidance: how much more than it has learnt the model follows the speech; 1 or, with ``speech_dropout``,
@@ -516,6 +517,17 @@ class DualPathDiffusion(AnimationModel):
 
     def _in_views(self, name: str, views: Mapping[tuple[str, ...], float], clips: int) -> Tensor:
         return torch.tensor([name in hidden for hidden in views], device=self.device).repeat_interleave(clips)
+
+    def default_style(self, identity: str) -> Reference | Style:
+        """The style that is heard from the speech, for an identity of the training by a model that was trained to.
+
+        With ``style_dropout`` the model knows an identity's motion without a reference. A stored reference would carry
+        its mood into all speech.
+        """
+        learnt = self.network.no_style
+        if learnt is None or identity not in self.assets.identities or identity in self.person_styles:
+            return super().default_style(identity)
+        return Style("speech", learnt.detach())
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
