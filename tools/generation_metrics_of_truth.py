@@ -12,17 +12,21 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from facediff.data import Batch, Puppet
 from facediff.models.base import AnimationModel
 from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, measure
-from facediff.synthetic.corpus import clips, generate_clip, rig_of
+from facediff.speech.espeak import Utterance
+from facediff.synthetic.second_edition import PerformedClip, perform_clip, performed_clips, rig_of, speak_clip
 from facediff.utils.files import atomic
 
 SKIPPED = ("mve_", "nearest", "real_time")
@@ -51,14 +55,26 @@ class OtherTruths(AnimationModel):
         return torch.cat([self.generate_clips(clip, seed=seed) for seed in seeds])
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=64)
 def other_truth(name: str, seed: int) -> Tensor:
     """Offsets from the template (frames, vertices, 3) of a clip, with its random part drawn again."""
-    clip = next(clip for clip in clips() if clip.name == name)
-    rig = rig_of(clip.identity)
-    weights = generate_clip(clip, seed)[1]
-    still = rig.pose(torch.zeros(1, weights.shape[1]).numpy())
-    return torch.from_numpy(rig.pose(weights) - still).float()
+    clip, spoken = said(name)
+    # Of the corpus's own draws, that of middle liveliness is the truth (seed 0); others are taken as they come.
+    performance = perform_clip(clip if seed == 0 else replace(clip, split="train"), spoken, seed)[0]
+    return torch.from_numpy(np.einsum("tk,kvc->tvc", performance.weights.astype(np.float32), shapes(clip.identity)))
+
+
+@lru_cache(maxsize=1024)
+def said(name: str) -> tuple[PerformedClip, Utterance]:
+    """A clip, and what it sounds like."""
+    clip = next(clip for clip in performed_clips() if clip.name == name)
+    return clip, speak_clip(clip)
+
+
+@lru_cache(maxsize=16)
+def shapes(identity: str) -> NDArray[np.float32]:
+    """Displacements of a speaker's shapes (54, vertices, 3)."""
+    return rig_of(identity)[1:]
 
 
 def measured(root: Path | None = None, samples: int = 10, most_clips: int | None = None) -> GenerationScores:
@@ -69,7 +85,7 @@ def measured(root: Path | None = None, samples: int = 10, most_clips: int | None
         samples: of each clip.
         most_clips: clips of a split; all if None.
     """
-    data = Puppet(root=root, edition=1)
+    data = Puppet(root=root, edition=2)
     data.prepare_data()
     data.setup("fit")
     data.setup("test")

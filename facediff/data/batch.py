@@ -29,7 +29,8 @@ class Sample:
 
     Attributes:
         audio: waveform at 16 kHz.
-        motion: offsets from the template.
+        motion: offsets from the template; in training the components (frames, K) of these, where the model asks for
+            them (:meth:`~facediff.models.AnimationModel.training_projection`), and so in ``reference``.
         template: neutral face.
         identity: index into the training identities, −1 for any other.
         reference: motion that carries the speaking style.

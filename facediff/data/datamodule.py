@@ -205,6 +205,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 {"train_identities": unknown[0]}, f"no such identity: {choices(unknown[0], self.identities)}"
             )
         self.features = FeatureSlot()
+        self.projection: Callable[[Tensor], Tensor] | None = None  # a model's choice, see its training_projection
         self.pair_sentences = False
         self.window_context = (0, 0)
         self.aligner: Aligner | None = None
@@ -407,6 +408,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             aligner=self.aligner if training and self.pair_sentences else None,
             augmenter=self.augmenter if training else None,
             mouth=self._mouth() if training and self.augmenter is not None else None,
+            projection=self.projection if training and self.augmenter is None else None,
         )
 
     def _mouth(self) -> npt.NDArray[np.float32]:

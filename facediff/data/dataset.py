@@ -346,6 +346,8 @@ class MotionDataset(Dataset[Sample]):
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
         augmenter: changes training speech; None leaves it as it was recorded.
         mouth: which vertices speech moves (V,), 0 to 1; needed with an augmenter.
+        projection: gives components (T, K) of a clip's motion (T, V, 3), which take its place; those of whole clips are
+            kept in memory.
     """
 
     corpus: Corpus
@@ -362,6 +364,8 @@ class MotionDataset(Dataset[Sample]):
     aligner: Aligner | None = None
     augmenter: Augmenter | None = None
     mouth: npt.NDArray[np.float32] | None = None
+    projection: Callable[[Tensor], Tensor] | None = None
+    _projected: dict[str, Tensor] = field(default_factory=dict)
     _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -389,7 +393,7 @@ class MotionDataset(Dataset[Sample]):
         first, last = max(0, start - self.context[0]), min(frames, stop + self.context[1])
         source = self._reference(clip, random)
         earliest, latest = self._window(self.corpus.frames(source), self.policy.max_frames, random)
-        audio, motion = self.corpus.read_audio(clip, first, last), self.corpus.read_motion(clip, first, last)
+        audio, motion = self.corpus.read_audio(clip, first, last), self._motion(clip, first, last)
         if self.augmenter is not None:
             audio, motion = self._augmented(self.augmenter, clip, audio, motion, pick.seed)
         return Sample(
@@ -397,7 +401,7 @@ class MotionDataset(Dataset[Sample]):
             motion=motion,
             template=self.corpus.template(clip),
             identity=self.identities.index(clip.identity) if clip.identity in self.identities else UNKNOWN_IDENTITY,
-            reference=self.corpus.read_motion(source, earliest, latest),
+            reference=self._motion(source, earliest, latest),
             name=clip.name,
             identity_name=clip.identity,
             sentence=self.says(index),
@@ -407,6 +411,15 @@ class MotionDataset(Dataset[Sample]):
             repeated=pick.repeated,
             window=(start - first, stop - first) if any(self.context) else None,
         )
+
+    def _motion(self, clip: Clip, start: int, stop: int) -> Tensor:
+        """Offsets (T, V, 3) of some frames of a clip, or what the projection makes of them (T, K)."""
+        if self.projection is None:
+            return self.corpus.read_motion(clip, start, stop)
+        if clip.name not in self._projected:
+            # By whole clips, so that a frame's components do not depend on the window in which it was read first.
+            self._projected[clip.name] = self.projection(self.corpus.read_motion(clip))
+        return self._projected[clip.name][start:stop]
 
     def _augmented(
         self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int

@@ -33,7 +33,7 @@ from facediff.models.inference import Prediction
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.person_styles import PersonStyles
 from facediff.models.pretrained import publish
-from facediff.models.principal import PrincipalComponents
+from facediff.models.principal import PrincipalComponents, Projection
 from facediff.registry import keeps_arguments
 from facediff.speech.windows import WindowPlan
 from facediff.utils.licences import merged, network_licences
@@ -402,6 +402,16 @@ class AnimationModel(PersonStyles, ABC):
         template = self.assets.templates[min(self.assets.templates)]
         for encoder in waiting:
             encoder.attach(mesh_hierarchy(template.numpy(), self.assets.faces.numpy(), **encoder.mesh_options))
+
+    def on_fit_start(self) -> None:
+        """Say in which form training motion is wanted, before the first clip is read."""
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if isinstance(data, SpeechMotionDataModule):
+            data.projection = self.training_projection()
+
+    def training_projection(self) -> Projection | None:
+        """What training motion is read as, in place of vertices; validation and tests always have these."""
+        return None
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Take from the training split what a model that was never trained needs: principal components of motion.

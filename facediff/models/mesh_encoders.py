@@ -110,9 +110,10 @@ class ComponentMeshEncoder(MeshEncoder):
         self.components = PrincipalComponents(n_vertices, count)
         self.map = nn.Linear(count, dim)
 
-    def forward(self, motion: Motion) -> Frames:
-        """The feature of each frame."""
-        check_vertices(motion, self.n_vertices)
+    def forward(self, motion: Motion | Float[Tensor, "batch frames all_components"]) -> Frames:
+        """The feature of each frame, of offsets or of their components."""
+        if motion.dim() == 4:
+            check_vertices(motion, self.n_vertices)
         return self.map(self.components.project(motion))
 
 

@@ -30,6 +30,9 @@ from facediff.utils.ranges import Range, Vertices
 Offsets = Float[Tensor, "batch frames vertices 3"]
 """Scaled offsets from the template."""
 
+Components = Float[Tensor, "batch frames all_components"]
+"""Principal components of them, of which the reader of training motion may have taken them."""
+
 Coordinates = Float[Tensor, "batch frames coordinates"]
 """A frame as the numbers that are noised."""
 
@@ -212,7 +215,7 @@ class ComponentMotion(MotionSpace):
         else:
             self.preconditioning.fit(signal, self.sizes.square(), importance)
 
-    def encode(self, motion: Offsets) -> Coordinates:
+    def encode(self, motion: Offsets | Components) -> Coordinates:
         """Components of weighted offsets from the mean, in the sizes that are noised."""
         return self.components.project(motion) * self.sizes
 

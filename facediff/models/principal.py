@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -10,6 +12,23 @@ from facediff.errors import FaceDiffError
 
 SMALLEST = 1e-4
 """Components below this share of the first one's deviation are treated as if they had it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Offsets from the template (T, V, 3), not scaled, to components (T, K).
+
+    Attributes:
+        into: the linear map, (3V, K).
+        offset: what is subtracted, (K,).
+    """
+
+    into: Float[Tensor, "all components"]
+    offset: Float[Tensor, " components"]
+
+    def __call__(self, motion: Float[Tensor, "frames vertices 3"]) -> Float[Tensor, "frames components"]:
+        """The components of each frame."""
+        return motion.flatten(1) @ self.into - self.offset
 
 
 class PrincipalComponents(nn.Module):
@@ -74,14 +93,30 @@ class PrincipalComponents(nn.Module):
         smallest = SMALLEST * float(deviations[0])
         self.deviations.fill_(smallest)[: len(shapes)] = deviations.clamp_min(smallest)
 
-    def project(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames components"]:
-        """Components of scaled offsets from the template, each of unit variance over the training frames."""
+    def project(
+        self, motion: Float[Tensor, "batch frames vertices 3"] | Float[Tensor, "batch frames all_components"]
+    ) -> Float[Tensor, "batch frames components"]:
+        """Components of scaled offsets from the template, each of unit variance over the training frames.
+
+        Training motion may come as components already, of a projection of this or of more components.
+        """
+        if motion.dim() == 3:
+            return motion[..., : self.count]
         with torch.autocast(motion.device.type, enabled=False):
             # Not in mixed precision: a sum over 70 000 products in 16 bits would be off by more than the small
             # components' size. Mean and weights are folded into the map: at 6 000 vertices centring a copy of the
             # motion takes longer than the product.
-            into = (self.basis * self.weights).T / self.deviations
-            return motion.flatten(2) @ into - self.mean @ into
+            into, offset = self._map()
+            return motion.flatten(2) @ into - offset
+
+    def projection(self, scale: float) -> Projection:
+        """The same for a clip's unscaled offsets, by itself, for the processes that read clips."""
+        into, offset = self._map()
+        return Projection((into * scale).cpu(), offset.cpu())
+
+    def _map(self) -> tuple[Tensor, Tensor]:
+        into = (self.basis * self.weights).T / self.deviations
+        return into, self.mean @ into
 
     def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames vertices 3"]:
         """The scaled offsets with these components; all other components are those of the mean."""

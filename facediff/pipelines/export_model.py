@@ -7,7 +7,7 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     import onnx
     import torch
 
+    from facediff.data import Reference
     from facediff.models.base import AnimationModel
     from facediff.models.graphs import Graph, Graphs
+    from facediff.models.inference import Style
     from facediff.speech.frame_clock import FrameClock
 
 Precision = Literal["float32", "float16", "int8"]
@@ -292,8 +294,14 @@ def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDAr
         arrays["noise"] = graphs.sampling.noise.numpy()
     if graphs.style != "reference":
         return arrays, list(assets.identities) if graphs.style == "identity" else [], faces
-    names = model.styled_identities()
-    styles = {name: vector_of(model.default_style(name), model).numpy() for name in names}
+    chosen: dict[str, Reference | Style] = {}
+    for name in dict.fromkeys([*model.styled_identities(), *faces]):
+        with suppress(FaceDiffError):  # a face without a style is given one by name
+            chosen[name] = model.default_style(name)
+    # Where identities do without their stored clips, these are styles by their own names, as in a checkpoint.
+    defaults = {id(style) for style in chosen.values()}
+    chosen |= {reference.clip: reference for reference in assets.references.values() if id(reference) not in defaults}
+    styles = {name: vector_of(style, model).numpy() for name, style in chosen.items()}
     if not styles:
         raise FaceDiffError("styles: the checkpoint holds no reference motion; train with a corpus that gives one")
     arrays["styles"] = np.stack(list(styles.values()))

@@ -135,6 +135,21 @@ def test_a_reference_is_followed_with_the_label_and_without(tiny: Tiny) -> None:
     assert scores.mean("test_b", "nearest_speaker") is not None
 
 
+def test_what_animate_gives_is_scored_with_the_style_that_it_takes(tiny: Tiny) -> None:
+    def script(batch: Batch, seed: int) -> Tensor:
+        return batch.reference.mean(1, keepdim=True).expand_as(batch.motion)
+
+    model = scripted(tiny, script)
+    scores = run(tiny, model, splits=["test_a"], sampling=SamplingOptions(samples=2, references=1))
+    found, still = fm.LipVertexError(LIPS), fm.LipVertexError(LIPS)
+    for sample in tiny.dataset("test_a"):
+        stored = model.assets.references[sample.identity_name].motion.float()
+        found.update(stored.mean(0).expand_as(sample.motion), sample.motion)
+        still.update(torch.zeros_like(sample.motion), sample.motion)
+    expected = float(found.compute()) / float(still.compute())
+    assert scores.mean("test_a", "lve_default_still") == pytest.approx(expected, rel=1e-5)
+
+
 def test_a_model_without_noise_has_no_spread_and_is_scored_by_its_distance(tiny: Tiny) -> None:
     model = scripted(tiny, lambda batch, seed: torch.zeros_like(batch.motion), noise=False)
     scores = run(tiny, model, sampling=SamplingOptions(samples=5))

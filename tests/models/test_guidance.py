@@ -208,6 +208,19 @@ def test_learnt_stand_ins_get_a_gradient_in_every_step(ready: Ready, batch: Batc
             assert bool(learnt.grad.any()) == (share == 1.0)
 
 
+def test_where_no_style_is_given_motion_is_that_of_a_hidden_style(ready: Ready, batch: Batch, tiny: Tiny) -> None:
+    """For identities of the training; others have their reference, as all have without ``style_dropout``."""
+    model = ready()
+    heard = model.default_style("A")
+    given = model.conditions(replace(batch, style=heard.vector.expand(len(batch), -1)))
+    hidden = model.network.conditions(batch, batch.identity, model.style_of(batch), hiding(model, batch, "style"))
+    torch.testing.assert_close(given.style, hidden.style)
+    assert not torch.equal(given.style, model.conditions(batch).style)
+    stranger = next(name for name in model.assets.references if name not in model.assets.identities)
+    assert model.default_style(stranger) is model.assets.references[stranger]
+    assert ready(style_dropout=0).default_style("A").clip == tiny.assets().references["A"].clip
+
+
 @pytest.mark.parametrize(
     ("options", "scales", "named"),
     [

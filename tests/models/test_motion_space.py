@@ -14,6 +14,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from facediff import registry
+from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.losses import preconditioned_losses
@@ -489,3 +490,47 @@ def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[
     upper = model.assets.regions["upper_face"]
     assert (weights[upper] == 3).all()
     assert int((weights == 3).sum()) == 3 * len(upper)
+
+
+def test_training_on_components_is_training_on_vertices(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:
+    """Losses of a batch that was read as components are those of the same clips, windows and references."""
+    made = partial(registry.mesh_encoder.components, count=4)
+    model = make_model(motion_space=SPACE, mesh_encoder=made)
+    make_trainer(max_steps=1).fit(model, datamodule=tiny)
+    projection = tiny.projection
+    assert projection is not None
+    batches = []
+    for chosen in (None, projection):
+        tiny.projection = chosen
+        data = tiny.dataset("train", training=True)
+        torch.manual_seed(3)
+        batches.append(collate([data[index] for index in (0, 2, 5)]))
+    vertices, numbers = batches
+    assert numbers.motion.shape == (*vertices.motion.shape[:2], 6)
+    assert numbers.reference.shape == (*vertices.reference.shape[:2], 6)
+    assert vertices.names == numbers.names
+    assert vertices.reference_names == numbers.reference_names
+    step, noise = torch.tensor([900, 500, 20]) * model.process.steps // 1000, torch.randn(*numbers.motion.shape)
+    found, expected = (model.eval().losses_at(batch, step, noise.clone()) for batch in (numbers, vertices))
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"motion_space": SPACE},  # its reference is encoded on the vertices
+        {
+            "motion_space": SPACE,
+            "mesh_encoder": partial(registry.mesh_encoder.components, count=4),
+            "invented_speakers": 0.5,
+        },
+    ],
+)
+def test_motion_is_read_as_vertices_where_a_part_needs_them(
+    options: dict[str, object], make_model: Make, make_trainer: Make, tiny: Tiny
+) -> None:
+    tiny.projection = lambda motion: motion[:, 0]  # of a model before
+    make_trainer(max_steps=1).fit(make_model(**options), datamodule=tiny)
+    assert tiny.projection is None

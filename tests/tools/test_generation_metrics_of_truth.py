@@ -11,18 +11,18 @@ import pytest
 
 pytest.importorskip("espeakng_loader")
 
-from facediff.synthetic.corpus import generate
+from facediff.synthetic.second_edition import generate_second
 from tools.generation_metrics_of_truth import OtherTruths, other_truth
 
 
 def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_path: Path) -> None:
     root = tmp_path / "corpus"
-    generate(root, only=("F1_e29",), progress=False)
-    vertices = np.load(root / "vertices_npy" / "F1_e29.npy").reshape(-1, 1008, 3)
+    generate_second(root, only=("F1_t03",), progress=False)
+    vertices = np.load(root / "vertices_npy" / "F1_t03.npy").reshape(-1, 5875, 3)
     template = pickle.loads((root / "templates.pkl").read_bytes(), encoding="latin1")["F1"]  # noqa: S301 - made here
     recorded = vertices - template
-    np.testing.assert_allclose(other_truth("F1_e29", 0).numpy(), recorded, atol=2e-6)
-    other = other_truth("F1_e29", 3).numpy()
+    np.testing.assert_allclose(other_truth("F1_t03", 0).numpy(), recorded, atol=2e-6)
+    other = other_truth("F1_t03", 3).numpy()
     assert other.shape == recorded.shape
     lips, upper = (
         np.array(re.findall(r"\d+", (root / "regions" / f"{name}.txt").read_text()), dtype=int)

@@ -183,9 +183,9 @@ class DualPathNetwork(nn.Module):
         return Conditions(audio, self.style_tokens(style), mask, dynamic=encoded)
 
     def dynamic_style(
-        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, reference: Float[Tensor, "batch frames *numbers"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch dynamic_dim"]:
-        """F_dyn of scaled reference motion (eq. 2 to 9); of width 0 without a dynamic style."""
+        """F_dyn of scaled reference motion, or of its components (eq. 2 to 9); of width 0 without a dynamic style."""
         if self.mesh_encoder is None:
             return reference.new_zeros((len(reference), 0))
         return self.style_encoder(self.mesh_encoder(reference), mask)

@@ -218,6 +218,7 @@ class CodeTalker(AutoregressiveModel):
         Raises:
             FaceDiffError: with what to train first.
         """
+        super().on_fit_start()
         if self._lacks_prior:
             raise no_prior()
 
