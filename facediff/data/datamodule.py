@@ -29,6 +29,7 @@ from facediff.data.dataset import (
     ClipBatches,
     FeatureSlot,
     MotionDataset,
+    ProjectionSlot,
     ReferenceChoice,
     ReferencePolicy,
     ResumableLoader,
@@ -205,7 +206,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 {"train_identities": unknown[0]}, f"no such identity: {choices(unknown[0], self.identities)}"
             )
         self.features = FeatureSlot()
-        self.projection: Callable[[Tensor], Tensor] | None = None  # a model's choice, see its training_projection
+        self.projection = ProjectionSlot()  # a model's choice, see its training_projection
         self.pair_sentences = False
         self.window_context = (0, 0)
         self.aligner: Aligner | None = None

@@ -36,6 +36,28 @@ class FeatureSlot:
         return None if self.reader is None else self.reader(clip)
 
 
+class ProjectionSlot:
+    """What a data set makes of training motion, chosen by the model when the loaders have been made already."""
+
+    def __init__(self) -> None:
+        self.project: Callable[[Tensor], Tensor] | None = None
+        self._kept: dict[str, Tensor] = {}
+
+    def choose(self, project: Callable[[Tensor], Tensor] | None) -> None:
+        """Make components (T, K) of a clip's offsets (T, V, 3) from now on; None leaves them as they are."""
+        self.project = project
+        self._kept.clear()
+
+    def read(self, corpus: Corpus, clip: Clip, start: int, stop: int) -> Tensor:
+        """Some frames of a clip in the chosen form."""
+        if self.project is None:
+            return corpus.read_motion(clip, start, stop)
+        if clip.name not in self._kept:
+            # By whole clips, so that a frame's components do not depend on the window in which it was read first.
+            self._kept[clip.name] = self.project(corpus.read_motion(clip))
+        return self._kept[clip.name][start:stop]
+
+
 class CachedFeatures:
     """Reads features of speech that was encoded before training.
 
@@ -346,8 +368,7 @@ class MotionDataset(Dataset[Sample]):
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
         augmenter: changes training speech; None leaves it as it was recorded.
         mouth: which vertices speech moves (V,), 0 to 1; needed with an augmenter.
-        projection: gives components (T, K) of a clip's motion (T, V, 3), which take its place; those of whole clips are
-            kept in memory.
+        projection: may make components (T, K) of motion (T, V, 3), which are kept in memory; None never does.
     """
 
     corpus: Corpus
@@ -364,8 +385,7 @@ class MotionDataset(Dataset[Sample]):
     aligner: Aligner | None = None
     augmenter: Augmenter | None = None
     mouth: npt.NDArray[np.float32] | None = None
-    projection: Callable[[Tensor], Tensor] | None = None
-    _projected: dict[str, Tensor] = field(default_factory=dict)
+    projection: ProjectionSlot | None = None
     _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -413,13 +433,10 @@ class MotionDataset(Dataset[Sample]):
         )
 
     def _motion(self, clip: Clip, start: int, stop: int) -> Tensor:
-        """Offsets (T, V, 3) of some frames of a clip, or what the projection makes of them (T, K)."""
+        """Offsets (T, V, 3) of some frames of a clip, or their components (T, K)."""
         if self.projection is None:
             return self.corpus.read_motion(clip, start, stop)
-        if clip.name not in self._projected:
-            # By whole clips, so that a frame's components do not depend on the window in which it was read first.
-            self._projected[clip.name] = self.projection(self.corpus.read_motion(clip))
-        return self._projected[clip.name][start:stop]
+        return self.projection.read(self.corpus, clip, start, stop)
 
     def _augmented(
         self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int

@@ -407,7 +407,7 @@ class AnimationModel(PersonStyles, ABC):
         """Say in which form training motion is wanted, before the first clip is read."""
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if isinstance(data, SpeechMotionDataModule):
-            data.projection = self.training_projection()
+            data.projection.choose(self.training_projection())
 
     def training_projection(self) -> Projection | None:
         """What training motion is read as, in place of vertices; validation and tests always have these."""

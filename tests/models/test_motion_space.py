@@ -496,12 +496,15 @@ def test_training_on_components_is_training_on_vertices(make_model: Make, make_t
     """Losses of a batch that was read as components are those of the same clips, windows and references."""
     made = partial(registry.mesh_encoder.components, count=4)
     model = make_model(motion_space=SPACE, mesh_encoder=made)
-    make_trainer(max_steps=1).fit(model, datamodule=tiny)
-    projection = tiny.projection
-    assert projection is not None
+    shapes = []
+    own = model.losses_at
+    model.losses_at = lambda batch, *more: (shapes.append(batch.motion.dim()), own(batch, *more))[1]
+    make_trainer(max_steps=1, limit_val_batches=1, num_sanity_val_steps=0).fit(model, datamodule=tiny)
+    assert shapes[0] == 3  # in training
+    projection = tiny.projection.project
     batches = []
     for chosen in (None, projection):
-        tiny.projection = chosen
+        tiny.projection.choose(chosen)
         data = tiny.dataset("train", training=True)
         torch.manual_seed(3)
         batches.append(collate([data[index] for index in (0, 2, 5)]))
@@ -531,6 +534,6 @@ def test_training_on_components_is_training_on_vertices(make_model: Make, make_t
 def test_motion_is_read_as_vertices_where_a_part_needs_them(
     options: dict[str, object], make_model: Make, make_trainer: Make, tiny: Tiny
 ) -> None:
-    tiny.projection = lambda motion: motion[:, 0]  # of a model before
+    tiny.projection.choose(lambda motion: motion[:, 0])  # of a model before
     make_trainer(max_steps=1).fit(make_model(**options), datamodule=tiny)
-    assert tiny.projection is None
+    assert tiny.projection.project is None
