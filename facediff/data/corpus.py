@@ -217,14 +217,24 @@ class Corpus:
         picks = range(numbers.start * stride, numbers.stop * stride, stride)
         return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
 
-    def read_spread(self, clip: Clip, count: int) -> Tensor:
+    def read_spread(self, clip: Clip, count: int, phase: float | None = None) -> Tensor:
         """Offsets from the template (at most ``count``, V, 3), float32, of evenly spread frames.
 
         The clip is opened once.
+
+        Args:
+            clip: the clip.
+            count: frames.
+            phase: the clip is cut into as many equal parts, and this is the place in each of them, from 0 to below 1;
+                None takes the first frame, the last one and those between.
         """
         opened, stride = self._open(clip), self._strides[clip.root]
         frames = self._frames[clip.name]
-        picks = [number * stride for number in torch.linspace(0, frames - 1, min(frames, count)).long().tolist()]
+        count = min(frames, count)
+        places = torch.linspace(0, frames - 1, count)
+        if phase is not None:
+            places = (torch.arange(count) + phase) * (frames / count)
+        picks = [number * stride for number in places.long().tolist()]
         return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
 
     def read_audio(self, clip: Clip, start: int, stop: int) -> Tensor:

@@ -31,7 +31,10 @@ WINDOWS = 4
 PRINCIPAL_NUMBERS = 30_000_000
 """Coordinates from which principal components are computed, about; bounds the memory (8 bytes each, twice)."""
 
-METHOD = 1
+GOLDEN = (5**0.5 - 1) / 2
+"""Multiples of it, without their whole parts, fill the numbers from 0 to 1 evenly."""
+
+METHOD = 2
 """Goes up when the same corpus is measured in another way, so that results cached by an older version are not used."""
 
 
@@ -65,7 +68,14 @@ def measure_components(
 
     def measure() -> npt.NDArray[np.float32]:
         frames_per_clip = min(FRAMES, max(2, PRINCIPAL_NUMBERS // (3 * corpus.n_vertices * max(1, len(clips)))))
-        frames = torch.cat([motion.flatten(1) for motion in _spread_frames(corpus, clips, frames_per_clip)]).double()
+        # Clips begin and end in silence. Of a large mesh only two frames of each are read: in every clip at another
+        # place, so that together they lie everywhere.
+        phases = [(GOLDEN * number) % 1 for number in range(1, len(clips) + 1)]
+        spread = [
+            corpus.read_spread(clip, frames_per_clip, phase).flatten(1)
+            for clip, phase in zip(clips, phases, strict=True)
+        ]
+        frames = torch.cat(spread).double()
         mean = frames.mean(0)
         frames -= mean
         if weights is not None:
