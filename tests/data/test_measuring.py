@@ -42,12 +42,14 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
-def frames_of(data: Tiny) -> np.ndarray:
-    """At most 16 evenly spread frames of every training clip, read with NumPy alone."""
+def frames_of(data: Tiny, *, phased: bool = False) -> np.ndarray:
+    """At most 16 evenly spread frames of every training clip, read with NumPy alone; ``phased`` as for components."""
     rows = []
-    for clip in data.clips("train"):
+    for number, clip in enumerate(data.clips("train"), start=1):
         stored = np.load(data.root / "vertices_npy" / f"{clip.name}.npy").reshape(-1, 24, 3)
-        picks = np.linspace(0, len(stored) - 1, min(16, len(stored))).astype(int)
+        count, phase = min(16, len(stored)), number * (5**0.5 - 1) / 2 % 1
+        places = (np.arange(count) + phase) * len(stored) / count if phased else np.linspace(0, len(stored) - 1, count)
+        picks = places.astype(int)
         rows.append(stored[picks] - data.corpus.template(clip).numpy())
     return np.concatenate(rows).astype(np.float64)
 
@@ -56,6 +58,7 @@ def test_scale_and_components_are_those_of_the_frames(root: Path) -> None:
     data = Tiny(root=str(root))
     frames = frames_of(data)
     assert data.motion_scale() == pytest.approx(float(np.mean(frames**2) ** -0.5), rel=1e-6)
+    frames = frames_of(data, phased=True)
     flat = frames.reshape(len(frames), -1)
     mean, shapes = data.principal_motion(3)
     np.testing.assert_allclose(mean.numpy(), flat.mean(0), atol=1e-7)

@@ -43,6 +43,9 @@ def test_windows_are_those_of_the_folder(corpus: Path, tmp_path: Path, chunk: fl
             assert torch.equal(plain.read_audio(clip, start, stop), other.read_audio(twin, start, stop))
         spread = [corpus.read_spread(c, 5) for corpus, c in ((plain, clip), (other, twin))]
         assert float((spread[0] - spread[1]).abs().max()) <= 0.0101 * MM
+        whole, parts = plain.read_motion(clip), min(frames, 3)
+        places = [int((part + 0.7) / parts * frames) for part in range(parts)]
+        assert torch.equal(plain.read_spread(clip, 3, 0.7), whole[places])
 
 
 def test_only_the_chunks_of_a_window_are_read(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
