@@ -27,7 +27,8 @@ def fit(tiny_root: Path) -> Callable[..., int]:
     def run(*words: str, config: str = "configs/experiment/puppet.yaml") -> int:
         data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
         given = {word.partition("=")[0] for word in words}
-        usual = [word for word in [*data, *SMALL] if word.partition("=")[0] not in given]
+        small = SMALL if config == "configs/experiment/puppet.yaml" else [w for w in SMALL if "motion_space" not in w]
+        usual = [word for word in [*data, *small] if word.partition("=")[0] not in given]
         return main(["fit", "--config", config, *usual, *words])
 
     return run

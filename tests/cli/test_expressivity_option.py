@@ -110,7 +110,7 @@ def test_a_stream_has_the_expressivity_of_the_file(
         (["--guidance", "style=1.5,style=2"], "--guidance"),
         (["--guidance", "identity=-1"], "--guidance identity -1"),
         (["--guidance", "mood=1.5"], "mood"),
-        (["--guidance", "style=1.5"], "style_dropout"),
+        (["--guidance", "speech=1.5"], "speech_dropout"),
     ],
 )
 def test_impossible_values_are_one_sentence(
