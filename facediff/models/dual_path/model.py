@@ -394,10 +394,12 @@ class DualPathDiffusion(AnimationModel):
         if self.training and self.invented_speakers is not None:
             batch = self.invented_speakers(batch, self.scale)
         device, count = batch.motion.device, len(batch) * self.noise_draws
-        space = self.motion_space.preconditioning
-        if self.timestep_sampling == "log_snr" and space is not None and self._step_weights is None:
-            self._step_weights = self.process.even_in_log_snr(space.hidden().cpu()).to(device)
-        step = self.process.draw_steps(count, device, generator, min_snr=self.min_snr, weights=self._step_weights)
+        space, weights = self.motion_space.preconditioning, self._step_weights
+        if self.timestep_sampling == "log_snr" and space is not None and (weights is None or not self.training):
+            weights = self.process.even_in_log_snr(space.hidden().cpu()).to(device)
+            # Not from validation: weight averages are swapped in there, whose tables may not be known yet.
+            self._step_weights = weights if self.training else None
+        step = self.process.draw_steps(count, device, generator, min_snr=self.min_snr, weights=weights)
         shape = (count, batch.motion.shape[1], self.motion_space.coordinates)
         return self.losses_at(batch, step, unit_noise(shape, device, generator))
 
