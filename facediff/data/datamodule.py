@@ -409,7 +409,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             aligner=self.aligner if training and self.pair_sentences else None,
             augmenter=self.augmenter if training else None,
             mouth=self._mouth() if training and self.augmenter is not None else None,
-            projection=self.projection if training and self.augmenter is None else None,
+            projection=self.projection if training and self.augmenter is None else ProjectionSlot(),
         )
 
     def _mouth(self) -> npt.NDArray[np.float32]:

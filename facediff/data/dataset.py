@@ -368,7 +368,7 @@ class MotionDataset(Dataset[Sample]):
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
         augmenter: changes training speech; None leaves it as it was recorded.
         mouth: which vertices speech moves (V,), 0 to 1; needed with an augmenter.
-        projection: may make components (T, K) of motion (T, V, 3), which are kept in memory; None never does.
+        projection: may make components (T, K) of motion (T, V, 3), which are kept in memory.
     """
 
     corpus: Corpus
@@ -385,7 +385,7 @@ class MotionDataset(Dataset[Sample]):
     aligner: Aligner | None = None
     augmenter: Augmenter | None = None
     mouth: npt.NDArray[np.float32] | None = None
-    projection: ProjectionSlot | None = None
+    projection: ProjectionSlot = field(default_factory=ProjectionSlot)
     _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -413,7 +413,8 @@ class MotionDataset(Dataset[Sample]):
         first, last = max(0, start - self.context[0]), min(frames, stop + self.context[1])
         source = self._reference(clip, random)
         earliest, latest = self._window(self.corpus.frames(source), self.policy.max_frames, random)
-        audio, motion = self.corpus.read_audio(clip, first, last), self._motion(clip, first, last)
+        audio = self.corpus.read_audio(clip, first, last)
+        motion = self.projection.read(self.corpus, clip, first, last)
         if self.augmenter is not None:
             audio, motion = self._augmented(self.augmenter, clip, audio, motion, pick.seed)
         return Sample(
@@ -421,7 +422,7 @@ class MotionDataset(Dataset[Sample]):
             motion=motion,
             template=self.corpus.template(clip),
             identity=self.identities.index(clip.identity) if clip.identity in self.identities else UNKNOWN_IDENTITY,
-            reference=self._motion(source, earliest, latest),
+            reference=self.projection.read(self.corpus, source, earliest, latest),
             name=clip.name,
             identity_name=clip.identity,
             sentence=self.says(index),
@@ -431,12 +432,6 @@ class MotionDataset(Dataset[Sample]):
             repeated=pick.repeated,
             window=(start - first, stop - first) if any(self.context) else None,
         )
-
-    def _motion(self, clip: Clip, start: int, stop: int) -> Tensor:
-        """Offsets (T, V, 3) of some frames of a clip, or their components (T, K)."""
-        if self.projection is None:
-            return self.corpus.read_motion(clip, start, stop)
-        return self.projection.read(self.corpus, clip, start, stop)
 
     def _augmented(
         self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int

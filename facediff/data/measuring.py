@@ -8,7 +8,7 @@ changes, and of several training processes only the first measures and broadcast
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,8 +49,8 @@ def measure_scale(corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None
 
     def measure() -> npt.NDArray[np.float64]:
         total, count = 0.0, 0
-        for motion in _spread_frames(corpus, clips, FRAMES):
-            for frame in motion:
+        for clip in clips:
+            for frame in corpus.read_spread(clip, FRAMES):
                 total += float(frame.double().square().sum())
                 count += frame.numel()
         if not total:
@@ -70,10 +70,9 @@ def measure_components(
         frames_per_clip = min(FRAMES, max(2, PRINCIPAL_NUMBERS // (3 * corpus.n_vertices * max(1, len(clips)))))
         # Clips begin and end in silence. Of a large mesh only two frames of each are read: in every clip at another
         # place, so that together they lie everywhere.
-        phases = [(GOLDEN * number) % 1 for number in range(1, len(clips) + 1)]
         spread = [
-            corpus.read_spread(clip, frames_per_clip, phase).flatten(1)
-            for clip, phase in zip(clips, phases, strict=True)
+            corpus.read_spread(clip, frames_per_clip, phase=GOLDEN * number % 1).flatten(1)
+            for number, clip in enumerate(clips, start=1)
         ]
         frames = torch.cat(spread).double()
         mean = frames.mean(0)
@@ -130,12 +129,6 @@ def measure_windows(
 
     what = ("windows", WINDOWS, width, projected)
     return torch.from_numpy(np.array(_measured(corpus, clips, trainer, what, measure)))
-
-
-def _spread_frames(corpus: Corpus, clips: Sequence[Clip], count: int) -> Iterator[Tensor]:
-    """At most ``count`` evenly spread frames (n, V, 3) of every clip."""
-    for clip in clips:
-        yield corpus.read_spread(clip, count)
 
 
 def _measured(

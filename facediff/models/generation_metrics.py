@@ -46,8 +46,7 @@ from facediff.metrics import (
     device_name,
 )
 from facediff.models.base import AnimationModel
-from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of
-from facediff.models.inference import Style
+from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of, with_identity
 from facediff.utils import ranges
 
 REFERENCES = {
@@ -312,11 +311,7 @@ class Measurement:
             style = self.model.default_style(clip.identity)
         except FaceDiffError:
             return None
-        if isinstance(style, Style):
-            styled = replace(sample, style=style.vector.cpu())
-        else:
-            styled = replace(sample, reference=style.motion.float(), reference_name=style.clip)
-        return collate([styled]).to(self.model.device)
+        return with_identity(collate([sample]).to(self.model.device), sample.identity, style)
 
     def _views(self, clip: Clip, sample: Sample) -> list[tuple[str, Sample]]:
         views = []

@@ -16,7 +16,7 @@ SMALLEST = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Offsets from the template (T, V, 3), not scaled, to components (T, K).
+    """Offsets from the template (…, V, 3) to components (…, K).
 
     Attributes:
         into: the linear map, (3V, K).
@@ -26,9 +26,9 @@ class Projection:
     into: Float[Tensor, "all components"]
     offset: Float[Tensor, " components"]
 
-    def __call__(self, motion: Float[Tensor, "frames vertices 3"]) -> Float[Tensor, "frames components"]:
+    def __call__(self, motion: Float[Tensor, "*frames vertices 3"]) -> Float[Tensor, "*frames components"]:
         """The components of each frame."""
-        return motion.flatten(1) @ self.into - self.offset
+        return motion.flatten(-2) @ self.into - self.offset
 
 
 class PrincipalComponents(nn.Module):
@@ -106,17 +106,16 @@ class PrincipalComponents(nn.Module):
             # Not in mixed precision: a sum over 70 000 products in 16 bits would be off by more than the small
             # components' size. Mean and weights are folded into the map: at 6 000 vertices centring a copy of the
             # motion takes longer than the product.
-            into, offset = self._map()
-            return motion.flatten(2) @ into - offset
+            return self._projection()(motion)
 
     def projection(self, scale: float) -> Projection:
-        """The same for a clip's unscaled offsets, by itself, for the processes that read clips."""
-        into, offset = self._map()
-        return Projection((into * scale).cpu(), offset.cpu())
+        """The same for unscaled offsets, by itself and on the processor, for the processes that read clips."""
+        own = self._projection()
+        return Projection((own.into * scale).cpu(), own.offset.cpu())
 
-    def _map(self) -> tuple[Tensor, Tensor]:
+    def _projection(self) -> Projection:
         into = (self.basis * self.weights).T / self.deviations
-        return into, self.mean @ into
+        return Projection(into, self.mean @ into)
 
     def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames vertices 3"]:
         """The scaled offsets with these components; all other components are those of the mean."""

@@ -469,21 +469,9 @@ def reset_peak() -> None:
 def peak() -> int:
     """Peak memory in bytes since the last reset, or of the process where it cannot be reset."""
     with suppress(OSError, IndexError):
-        return _memory("VmHWM")
+        status = Path("/proc/self/status").read_text()
+        return int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0]) * 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-def peak_above_now() -> int:
-    """Bytes that can be taken unseen, since the peak was this much higher once; 0 where it can be reset."""
-    with suppress(OSError, IndexError):
-        reset_peak()
-        return max(0, peak() - _memory("VmRSS"))
-    return 0
-
-
-def _memory(line: str) -> int:
-    status = Path("/proc/self/status").read_text()
-    return int(re.findall(rf"{line}:\s+(\d+) kB", status)[0]) * 1024
 
 
 @contextmanager

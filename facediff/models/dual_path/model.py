@@ -251,7 +251,6 @@ class DualPathDiffusion(AnimationModel):
                 noised, variances = space.modes(covariance)
             self.rescale_noise(half_hidden(noised, variances))
         space.fit(self.process.signal, covariance)
-        self._step_weights = None
         return shapes
 
     def motion_weights(self) -> Float[Tensor, "vertices 3"]:
