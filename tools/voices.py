@@ -6,7 +6,9 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
 
 - *closures*: of the p, b and m at which the truth's lips close, the share at which the model's lips close too. A mouth
   is closed up to the truth's smallest opening of the clip and a fifth of its range. *Chance* is the mean of the same
-  share with the closures moved to every other time of the clip.
+  share with the closures moved to every other time of the clip. *Within 1 mm* and *gap*: how far the lips' pairs are
+  apart at their nearest in a closure, compared with the neutral face, in mm.
+- *kept out*: the clips of test C, whose voices nobody is trained with, by voice.
 - *pauses*: two sentences with 1 s of silence before, between and after them. How far the lips are open in the pauses,
   from 0.3 s after speech to 0.2 s before it, how far a lip vertex moves from a frame to the next, and the lip vertex
   error of the first 0.2 s of speech, which a gate that opens late would raise.
@@ -34,6 +36,7 @@ import facediff
 from facediff.data import Puppet, Sample
 from facediff.speech.audio import fit_length
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
+from facediff.synthetic.voices import Flite
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic
 from facediff.utils.tables import print_table
@@ -164,6 +167,50 @@ def noisy(decibels: float, kind: Callable[[int, int], Array] = tone) -> Change:
     return lambda speech: speech + kind(len(speech), 1) * level(speech) * 10 ** (-decibels / 20)
 
 
+def babble(decibels: float) -> Change:
+    """Six people who talk at once, so many decibels below the speech: flite's slt at six pitches."""
+
+    def change(speech: Array) -> Array:
+        random = np.random.default_rng(2)
+        people = [
+            pitched(Flite("slt").speak(text).samples.astype(np.float64), shift)
+            for text, shift in zip(CROWD, random.uniform(-7, 4, len(CROWD)), strict=True)
+        ]
+        crowd = sum(np.resize(np.roll(each, int(random.integers(len(each)))), len(speech)) for each in people)
+        return speech + crowd * level(speech) * 10 ** (-decibels / 20) / level(np.asarray(crowd))
+
+    return change
+
+
+CROWD = (
+    "The committee meets again on Thursday afternoon in the larger room upstairs",
+    "My brother has never been able to whistle and drive at the same time",
+    "They painted every window frame a different shade of green",
+    "Please remember to bring the umbrella when you come back from work",
+    "Half of the bakery's bread is sold before seven in the morning",
+    "Nobody in our family has ever really enjoyed playing cards",
+)
+"""What the crowd says."""
+
+
+def music(decibels: float) -> Change:
+    """Plucked strings (Karplus and Strong 1983), three at a time, so many decibels below the speech."""
+
+    def change(speech: Array) -> Array:
+        random, made = np.random.default_rng(4), np.zeros(len(speech) + 2 * SAMPLE_RATE)
+        for start in range(0, len(speech), 4800):
+            for note in random.choice([0, 3, 5, 7, 10, 12, 15, 19], 3, replace=False):
+                period = round(SAMPLE_RATE / (110 * 2 ** (note / 12)))
+                burst = np.concatenate([random.uniform(-1, 1, period), np.zeros(SAMPLE_RATE)])
+                feedback = np.zeros(period + 2)
+                feedback[0], feedback[-2:] = 1, -0.498
+                made[start : start + len(burst)] += lfilter([1.0], feedback, burst)
+        made = made[: len(speech)]
+        return speech + made * level(speech) * 10 ** (-decibels / 20) / level(made)
+
+    return change
+
+
 def both(first: Change, second: Change) -> Change:
     """One after the other."""
     return lambda speech: second(first(speech))
@@ -198,6 +245,10 @@ PAUSES: dict[str, Change] = {
     "hiss -30 dB": noisy(30, hiss),
     "hum -30 dB": noisy(30, hum),
     "lower voice, room tone -30 dB": both(voice(-3, 0.9), noisy(30)),
+    "music -20 dB": music(20),
+    "music -12 dB": music(12),
+    "babble -20 dB": babble(20),
+    "babble -12 dB": babble(12),
 }
 """Changes of sentences with pauses, by name."""
 
@@ -217,12 +268,15 @@ class Bench:
         checkpoint: the model.
         options: further keywords of `Animator.animate`.
         clips: most clips of a split.
+        root: folder of the corpus; the user's cache folder if None.
     """
 
-    def __init__(self, checkpoint: Path, options: dict[str, Any], clips: int | None = None) -> None:
+    def __init__(
+        self, checkpoint: Path, options: dict[str, Any], clips: int | None = None, root: str | None = None
+    ) -> None:
         self.model = facediff.load(checkpoint)
         self.options = options
-        self.data = Puppet()
+        self.data = Puppet(root=root)
         self.data.prepare_data()
         assets = self.data.assets()
         assert assets.inner_lip_pairs is not None
@@ -264,31 +318,40 @@ class Bench:
         return closures(phonemes, self.model.frame_rate), (spoken[0].start, spoken[-1].end)
 
     def voice(self, change: Change) -> dict[str, float]:
-        """Closures, chance and LVE over both splits, of speech that is changed."""
-        hits, chances, errors, frames = [], [], {"test_a": 0.0, "test_b": 0.0}, {"test_a": 0, "test_b": 0}
-        for split, samples in self.samples.items():
-            for sample in samples:
-                true = self.truth(sample)
-                made = self.animate(change(sample.audio.double().numpy()), sample)[: len(true)]
-                wide = self.opening(true)
-                limit = wide.min() + THRESHOLD * np.ptp(wide)
-                shut, closed = self.opening(made) <= limit, wide <= limit
-                count = len(shut)
-                for start, end in self.said(sample)[0]:
-                    if not closed[start:end].any():
-                        continue
-                    hits.append(float(shut[start:end].any()))
-                    starts = range(0, count - (end - start))
-                    chances.append(float(np.mean([shut[i : i + end - start].any() for i in starts])))
-                error = self.squared_error(made, true[: len(made)])
-                errors[split] += float(error.sum())
-                frames[split] += count
-        return {
-            "closures": float(np.mean(hits)),
-            "chance": float(np.mean(chances)),
-            "LVE A": errors["test_a"] / frames["test_a"],
-            "LVE B": errors["test_b"] / frames["test_b"],
-        }
+        """Closures, chance and LVE over test A and B, of speech that is changed."""
+        found = {split: self.spoken(samples, change) for split, samples in self.samples.items()}
+        closures, chances, gaps = (np.concatenate([each[i] for each in found.values()]) for i in range(3))
+        errors = {f"LVE {split[-1].upper()}": float(each[3].mean()) for split, each in found.items()}
+        return {**_closed(closures, chances, gaps), **errors}
+
+    def kept_out(self, voice: str) -> dict[str, float]:
+        """The same for the clips of test C that this voice speaks."""
+        numbers = [i for i, clip in enumerate(self.data.clips("test_c")) if clip.attributes["voice"] == voice]
+        samples = [self.data.dataset("test_c")[i] for i in numbers]
+        closures, chances, gaps, errors = self.spoken(samples, lambda speech: speech)
+        still = [self.squared_error(each.template.double().numpy()[None] * 1000, self.truth(each)) for each in samples]
+        return {**_closed(closures, chances, gaps), "LVE / still": float(errors.mean() / np.concatenate(still).mean())}
+
+    def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
+        """Of each closure: whether the lips close, by chance, and the gap in mm; of each frame: the squared error."""
+        hits, chances, gaps, errors = [], [], [], []
+        for sample in samples:
+            true = self.truth(sample)
+            made = self.animate(change(sample.audio.double().numpy()), sample)[: len(true)]
+            wide, rest = self.opening(true), self.opening(sample.template.double().numpy()[None] * 1000)
+            limit = wide.min() + THRESHOLD * np.ptp(wide)
+            opened = self.opening(made)
+            shut, closed = opened <= limit, wide <= limit
+            count = len(shut)
+            for start, end in self.said(sample)[0]:
+                if not closed[start:end].any():
+                    continue
+                hits.append(float(shut[start:end].any()))
+                gaps.append(float((opened[start:end] - rest).min()))
+                starts = range(0, count - (end - start))
+                chances.append(float(np.mean([shut[i : i + end - start].any() for i in starts])))
+            errors.append(self.squared_error(made, true[: len(made)]))
+        return np.array(hits), np.array(chances), np.array(gaps), np.concatenate(errors)
 
     def pause(self, change: Change) -> dict[str, float]:
         """Opening and tremble in pauses, and the error of onsets, of changed sentences with pauses."""
@@ -344,6 +407,15 @@ class Bench:
         }
 
 
+def _closed(hits: Array, chances: Array, gaps: Array) -> dict[str, float]:
+    return {
+        "closures": float(hits.mean()),
+        "chance": float(chances.mean()),
+        "within 1 mm": float((gaps < 1).mean()),
+        "gap": float(np.median(gaps)),
+    }
+
+
 def show(title: str, scores: dict[str, dict[str, float]]) -> None:
     """Print a table of scores by name."""
     columns = list(next(iter(scores.values())))
@@ -351,7 +423,9 @@ def show(title: str, scores: dict[str, dict[str, float]]) -> None:
     print()
 
 
-def measured(checkpoint: Path, options: dict[str, Any], clips: int | None = None, only: str = "") -> dict[str, Any]:
+def measured(
+    checkpoint: Path, options: dict[str, Any], clips: int | None = None, only: str = "", root: str | None = None
+) -> dict[str, Any]:
     """All tables, which are printed as they are ready.
 
     Args:
@@ -359,11 +433,14 @@ def measured(checkpoint: Path, options: dict[str, Any], clips: int | None = None
         options: further keywords of `Animator.animate`.
         clips: most clips of a split.
         only: measure tables and rows whose name contains this.
+        root: folder of the corpus; the user's cache folder if None.
     """
-    bench = Bench(checkpoint, options, clips)
+    bench = Bench(checkpoint, options, clips, root)
+    strangers = dict.fromkeys(clip.attributes["voice"] for clip in bench.data.clips("test_c"))
     found: dict[str, Any] = {}
     for title, rows, measure in (
         ("voices", VOICES, bench.voice),
+        ("kept out", {voice: voice for voice in strangers}, bench.kept_out),
         ("pauses, mm", PAUSES, bench.pause),
         ("nobody speaks, mm", NOTHING, bench.nothing),
     ):
@@ -387,10 +464,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--options", nargs="*", default=[], metavar="NAME=VALUE", help="keywords of Animator.animate")
     parser.add_argument("--clips", type=int, help="most clips of a split")
     parser.add_argument("--only", default="", metavar="WORDS", help="tables and rows whose name contains this")
+    parser.add_argument("--data-root", help="folder of the corpus (default: the user's cache folder)")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)
     options = dict(word.split("=", 1) for word in given.options)
-    scores = measured(given.checkpoint, options, given.clips, given.only)
+    scores = measured(given.checkpoint, options, given.clips, given.only, given.data_root)
     if given.json:
         with atomic(given.json) as temporary:
             temporary.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")

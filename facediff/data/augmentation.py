@@ -401,6 +401,64 @@ class Hum(SpeechAugmentation):
         return speech + hum * gain_for(speech, hum, random.uniform(self.least, self.most))
 
 
+@augmentation.register("babble")
+class Babble(SpeechAugmentation):
+    """Other people who talk in the background.
+
+    They are copies of the clip itself from random places, faster or slower and half of them backwards, so that nothing
+    that they say fits the motion.
+
+    Args:
+        share: of the augmented clips.
+        least: least ratio of speech to babble, in decibels.
+        most: largest ratio.
+        voices: most people.
+    """
+
+    def __init__(
+        self,
+        *,
+        share: Share = 0.25,
+        least: Ratio = 6.0,
+        most: Ratio = 30.0,
+        voices: Annotated[int, Range(1, 20)] = 8,
+    ) -> None:
+        super().__init__(share=share)
+        self.least, self.most, self.voices = least, max(least, most), voices
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Add babble."""
+        import soxr
+
+        babble = np.zeros(len(speech))
+        for _ in range(int(random.integers(1, self.voices + 1))):
+            copy = soxr.resample(speech, 1000 * random.uniform(0.8, 1.25), 1000, quality="LQ")
+            # As often as it takes: a shorter copy would leave a part of the clip without this person.
+            copy = np.resize(copy[::-1] if random.random() < 0.5 else copy, len(speech))
+            babble += np.roll(copy, int(random.integers(len(speech)))) * random.uniform(0.3, 1.0)
+        return speech + babble * gain_for(speech, babble, random.uniform(self.least, self.most))
+
+
+@augmentation.register("music")
+class Music(SpeechAugmentation):
+    """Music in the background: chords of decaying partials, and often a drum.
+
+    Args:
+        share: of the augmented clips.
+        least: least ratio of speech to music, in decibels.
+        most: largest ratio.
+    """
+
+    def __init__(self, *, share: Share = 0.25, least: Ratio = 6.0, most: Ratio = 30.0) -> None:
+        super().__init__(share=share)
+        self.least, self.most = least, max(least, most)
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Add music."""
+        music = played(len(speech), random)
+        return speech + music * gain_for(speech, music, random.uniform(self.least, self.most))
+
+
 @augmentation.register("pauses")
 class Pauses(Augmentation):
     """Silence for a while, or in the whole clip, during which the mouth comes to rest.
@@ -456,6 +514,40 @@ def gain_for(speech: npt.NDArray[np.floating], noise: npt.NDArray[np.floating], 
     """The factor on noise for a ratio of speech to noise in decibels."""
     power = float(np.mean(np.square(noise, dtype=np.float64)))
     return float(np.sqrt(np.mean(np.square(speech, dtype=np.float64)) / max(power, 1e-20))) * 10 ** (-ratio / 20)
+
+
+SCALE = (0, 2, 4, 5, 7, 9, 11)
+"""Semitones of a major scale."""
+
+PERIOD = 512
+"""Samples in which a period of a musical tone is stored."""
+
+
+def played(length: int, random: np.random.Generator) -> npt.NDArray[np.floating]:
+    """Music (length,) of a random key, tempo and sound: a chord or a single note on every beat, and often a drum."""
+    music = np.zeros(length)
+    key = random.uniform(90, 240)
+    beat = round(random.uniform(0.15, 0.7) * SAMPLE_RATE)
+    rise = round(random.uniform(0.003, 0.08) * SAMPLE_RATE)
+    fading = random.uniform(0.3, 2.0)
+    drum = max(0.0, random.uniform(-0.5, 1.0))
+    orders = np.arange(1, 9)
+    sizes = random.uniform(0.2, 1.0, 8) * orders ** -random.uniform(0.6, 2.5)
+    turns = np.arange(PERIOD)[:, None] / PERIOD * orders + random.random(8)
+    cycle = (sizes * np.sin(2 * np.pi * turns)).sum(1)
+    ringing = round(min(3 * fading, 2.5) * SAMPLE_RATE)
+    for start in range(-int(random.integers(beat)), length, beat):
+        stop = min(length, max(0, start + ringing))
+        times = (np.arange(max(start, 0), stop) - start) / SAMPLE_RATE
+        shape = np.exp(-times / fading) * np.minimum(times * SAMPLE_RATE / rise, 1)
+        degree = int(random.integers(14))
+        for third in range(0, 2 * int(random.integers(1, 4)), 2):
+            octaves, step = divmod(degree + third, len(SCALE))
+            pitch = key * 2 ** (octaves + SCALE[step] / 12)
+            music[max(start, 0) : stop] += shape * cycle[(pitch * PERIOD * times).astype(int) % PERIOD]
+        if drum:
+            music[max(start, 0) : stop] += drum * random.standard_normal(len(times)) * np.exp(-times / 0.04)
+    return music
 
 
 def filtered(speech: npt.NDArray[np.floating], gain: Any) -> npt.NDArray[np.floating]:  # noqa: ANN401

@@ -53,8 +53,10 @@ from facediff.metrics.by_name import feed as feed
 from facediff.metrics.by_name import parse as parse
 from facediff.metrics.eyes import BlinkRate as BlinkRate
 from facediff.metrics.eyes import BlinkRateRatio as BlinkRateRatio
+from facediff.metrics.eyes import EyelidDrift as EyelidDrift
 from facediff.metrics.eyes import blink_rate as blink_rate
 from facediff.metrics.eyes import blink_rate_ratio as blink_rate_ratio
+from facediff.metrics.eyes import eyelid_drift as eyelid_drift
 from facediff.metrics.generation import DifferenceRatio as DifferenceRatio
 from facediff.metrics.generation import EnergyScore as EnergyScore
 from facediff.metrics.generation import FrameStep as FrameStep

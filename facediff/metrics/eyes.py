@@ -1,4 +1,4 @@
-"""Blinks: how often the lids shut, a minute or as a share of the truth's.
+"""Eyelids: how often they shut, a minute or as a share of the truth's, and whether they rest between blinks.
 
 The opening of the eyes is read off pairs of an upper and a lower eyelid vertex, as that of the mouth is off pairs of
 lip vertices. How far they are shut is a share of the sequence's own usual opening, so that heavy lids or a squint do
@@ -40,7 +40,24 @@ def count_blinks(opening: Tensor, *, closed: float = CLOSED, reopened: float = R
     return ((marks[1:] > 0) & (marks[:-1] < 0)).sum().double() + (marks[:1] > 0).sum()
 
 
-class BlinkMetric(OpeningMetric, RatioMetric):
+class LidMetric(OpeningMetric, RatioMetric):
+    """Base of metrics of the eyelids.
+
+    Args:
+        pairs: upper and lower eyelid vertices, :class:`EyelidPairs` or pairs of indices.
+        definition: the metric in words.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ("lid_pairs",)
+
+    def __init__(self, pairs: LipPairsLike, *, definition: str, **options: Unpack[SequenceOptions]) -> None:
+        if not isinstance(pairs, EyelidPairs):
+            bare = pairs.pairs if isinstance(pairs, LipPairs) else pairs
+            pairs = EyelidPairs.from_pairs("eyelid pairs", bare)
+        super().__init__(pairs, definition=definition, **options)
+
+
+class BlinkMetric(LidMetric):
     """Base of metrics that count blinks.
 
     Args:
@@ -48,8 +65,6 @@ class BlinkMetric(OpeningMetric, RatioMetric):
         closed: share of the usual opening by which the lids must be shut for a blink to begin.
         reopened: share by which they may still be shut for another blink to be possible.
     """
-
-    needs: ClassVar[tuple[str, ...]] = ("lid_pairs",)
 
     def __init__(
         self,
@@ -62,9 +77,6 @@ class BlinkMetric(OpeningMetric, RatioMetric):
     ) -> None:
         if not 0 <= reopened <= closed < 1:
             raise ValueError(f"closed is {closed:g} and reopened {reopened:g}; expected 0 <= reopened <= closed < 1")
-        if not isinstance(pairs, EyelidPairs):
-            bare = pairs.pairs if isinstance(pairs, LipPairs) else pairs
-            pairs = EyelidPairs.from_pairs("eyelid pairs", bare)
         definition = (
             f"{definition}, a blink being a rise of 1 − opening / median opening of the sequence above {closed:g} "
             f"after it was below {reopened:g}, an opening the mean distance of {{pairs}}"
@@ -161,5 +173,49 @@ class BlinkRate(BlinkMetric):
         return (predicted if self.of == "prediction" else true), minutes
 
 
+@metric.register("eyelid_drift")
+class EyelidDrift(LidMetric):
+    """Eyelid drift: how far lids stray from their usual opening between blinks, as a share of how far the truth's do.
+
+    Σ_t |c[t]| over the frames with c[t] = 1 − o[t] / median(o) below ``reopened``, divided by how many they are; sums
+    over sequences are weighted by their frames. Lids that wander by chance may have the variance and the spectrum of
+    lids that rest and blink, and look tired or startled. Definition and limit are ours.
+
+    Args:
+        pairs: upper and lower eyelid vertices.
+        reopened: share of the usual opening by which lids are shut in a blink only.
+
+    >>> import torch
+    >>> opening = torch.ones(2, 60)
+    >>> opening[:, 20:24], opening[0, 40:], opening[1, 40:] = 0.0, 0.875, 0.75
+    >>> truth, wandering = opening[:, :, None, None] * torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    >>> round(eyelid_drift(wandering, truth, [(0, 1)]).item(), 6)
+    2.0
+    """
+
+    divides_by = "the truth's lids do not move between blinks"
+
+    def __init__(self, pairs: LipPairsLike, *, reopened: float = REOPENED, **options: Unpack[SequenceOptions]) -> None:
+        if not 0 < reopened < 1:
+            raise ValueError(f"reopened is {reopened:g}; expected a number between 0 and 1")
+        definition = (
+            f"mean |1 − opening / median opening| over frames in which it is below {reopened:g}, an opening the mean "
+            f"distance of {{pairs}}, over that of the truth"
+        )
+        super().__init__(pairs, definition=definition, **options)
+        self.reopened = reopened
+
+    def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        """Both sides' drift, times the frames."""
+        predicted, true = (self._drift(opening) * clip.frames for opening in self.openings(clip))
+        return predicted, true
+
+    def _drift(self, opening: Tensor) -> Tensor:
+        shut = 1.0 - opening / opening.quantile(0.5).clamp_min(1e-12)
+        between = shut < self.reopened  # none where the eyes are never open
+        return shut.abs().where(between, 0.0).sum() / between.sum().clamp_min(1)
+
+
 blink_rate = functional(BlinkRate)
 blink_rate_ratio = functional(BlinkRateRatio)
+eyelid_drift = functional(EyelidDrift)

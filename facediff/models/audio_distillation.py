@@ -47,6 +47,8 @@ ROBUST_AUGMENTATIONS = (
     "codec:share=0.1",
     "noise:share=0.7",
     "hum:share=0.1",
+    "babble",
+    "music",
 )
 """Default augmentations of speech; see docs/voices.md."""
 
@@ -74,6 +76,8 @@ class DistillationOptions:
         interpolation: of the weights, from the teacher's (0) to the trained student's (1).
         learning_rate: the highest; it rises over the first twentieth of the steps and falls as a cosine.
         seed: of all random numbers.
+        pauses: share of the pieces that get a pause, in which the background of augmented speech goes on: what the
+            teacher hears in silence, the student is to hear in noise, music and babble.
         workers: processes that augment speech; 0 for this one.
         look_ahead: seconds of speech after a feature that the student gets; None for the whole recording, which the
             teacher always gets.
@@ -84,6 +88,7 @@ class DistillationOptions:
     batch_size: int = 12
     share: float = 0.5
     further: int = 1200
+    pauses: float = 0.4
     interpolation: float = 0.85
     learning_rate: float = 1e-3
     seed: int = 0
@@ -92,7 +97,7 @@ class DistillationOptions:
 
 
 LOW_LATENCY_DISTILLATION = DistillationOptions(
-    augmentations=(), share=0.0, interpolation=1.0, look_ahead=LOW_LATENCY.after
+    augmentations=(), share=0.0, pauses=0.0, interpolation=1.0, look_ahead=LOW_LATENCY.after
 )
 """How an audio encoder is distilled for low latency."""
 
@@ -269,6 +274,8 @@ class SpeechPairs(Dataset[DistillationBatch]):
         clean, augmented = [], []
         for _ in range(self.options.batch_size):
             speech = self._speech(random)
+            if self.options.pauses and random.random() < self.options.pauses:
+                speech = with_pause(speech, random)
             clean.append(speech)
             augmented.append(self._augmented(speech, random) if random.random() < self.options.share else speech)
         lengths = torch.tensor([len(speech) for speech in clean])
@@ -313,6 +320,15 @@ class SpeechPairs(Dataset[DistillationBatch]):
             speech, nothing, len(nothing) * SAMPLE_RATE / max(1, len(speech)), nothing[0], nothing[0, :, 0]
         )
         return self.augmenter(example, int(random.integers(2**31))).speech
+
+
+def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
+    """Speech (S,) with a faint pause of 0.3 to 1.5 s, often at an end; what no longer fits is cut off."""
+    most = len(speech) // 2
+    count = min(round(random.uniform(0.3, 1.5) * SAMPLE_RATE), most)
+    place = round(float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (len(speech) - count))
+    pause = random.standard_normal(count).astype(np.float32) * float(np.abs(speech).max(initial=0)) * 1e-4
+    return np.concatenate([speech[:place], pause, speech[place : len(speech) - count]])
 
 
 def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from facediff.metrics import (
     CoverageError,
     DifferenceRatio,
     EnergyScore,
+    EyelidDrift,
     FaceDynamicsDeviation,
     FrameStep,
     LipPairs,
@@ -45,6 +46,7 @@ from facediff.metrics import (
     SpreadErrorRatio,
     device_name,
 )
+from facediff.metrics.eyes import LidMetric
 from facediff.models.base import AnimationModel
 from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of, with_identity
 from facediff.utils import ranges
@@ -73,6 +75,7 @@ GENERATION_METRICS: dict[str, str] = {
     "blink_ratio": "blink rate / truth's (1)",
     "blinks_a_minute": "blinks a minute",
     "true_blinks_a_minute": "blinks a minute, truth",
+    "eyelid_drift": "eyelid drift between blinks / truth's (1)",
     "fdd_still": "FDD / still face's (0)",
     "fdd_signed_still": "FDD, signed / still face's (0)",
     "lve": "LVE, one sample",
@@ -227,6 +230,7 @@ class Measurement:
                 "blink_ratio": BlinkRateRatio(corpus.eyelids),
                 "blinks_a_minute": BlinkRate(corpus.eyelids, frames_per_second=rate),
                 "true_blinks_a_minute": BlinkRate(corpus.eyelids, frames_per_second=rate, of="truth"),
+                "eyelid_drift": EyelidDrift(corpus.eyelids),
             }
         if corpus.lips is not None and "closures" not in corpus.missing:
             self.of_each |= {
@@ -264,7 +268,7 @@ class Measurement:
             for metric in self.of_each.values():
                 if isinstance(metric, BilabialClosureRate):
                     metric.update(drawn, truth, closures=closures, offsets_from=template)
-                elif isinstance(metric, BlinkRate | BlinkRateRatio):
+                elif isinstance(metric, LidMetric):
                     metric.update(drawn, truth, offsets_from=template)
                 else:
                     metric.update(drawn, truth)

@@ -40,6 +40,7 @@ NO_CLIP_VALUES = {
     "spectrum_distance",
     "blink_rate",
     "blink_rate_ratio",
+    "eyelid_drift",
 }
 PHONEMES = "start,end,ipa,viseme\n0.00,0.08,m,PP\n0.08,0.2,a,aa\n0.2,0.28,ˈb,PP\n"
 

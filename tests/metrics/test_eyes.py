@@ -103,6 +103,29 @@ def test_the_ratio_is_one_of_sums_and_the_rate_one_of_minutes() -> None:
         fm.blink_rate_ratio(truths, face(torch.ones(2, 100)), LIDS)
 
 
+def test_lids_that_wander_have_the_variance_of_blinks_and_drift() -> None:
+    """NumPy's definition, on lids that blink and on lids of the same variance that never rest."""
+    random = np.random.default_rng(0)
+    resting = np.full(400, 2.0) + 0.01 * random.standard_normal(400)
+    for start in range(20, 400, 80):
+        resting[start : start + 5] = 0.1
+    wandering = 2.0 + resting.std() * random.standard_normal(400)
+
+    def drift(opening: np.ndarray) -> float:
+        shut = 1 - opening / np.quantile(opening, 0.5)
+        return float(np.abs(shut[shut < 0.3]).mean())
+
+    made, true = (face(torch.from_numpy(opening)) for opening in (wandering, resting))
+    found = fm.eyelid_drift(made, true, LIDS).item()
+    assert found == pytest.approx(drift(wandering) / drift(resting))
+    assert found > 5
+    assert fm.motion_liveliness(made, true).item() == pytest.approx(1, abs=0.1)
+    assert fm.eyelid_drift(face(torch.zeros(20)), true[:20], LIDS).item() == 0  # shut throughout
+    for limit in (0.0, 1.0, float("nan")):
+        with pytest.raises(ValueError, match="reopened"):
+            fm.EyelidDrift(LIDS, reopened=limit)
+
+
 def test_the_built_in_corpus_blinks_as_often_as_was_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
 

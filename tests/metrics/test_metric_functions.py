@@ -99,6 +99,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "clip_speech_lip_correlation": {"n_identities": 1, "of": "prediction"},
     "coverage_error": {"n_samples": 10, "squared": True, "pooling": "frames"},
     "energy_score": {"n_samples": 4, "of": "frames", "pooling": "frames"},
+    "eyelid_drift": {"reopened": 0.3},
     "face_dynamics_deviation": {"sign": "absolute"},
     "frame_speech_lip_correlation": {"of": "prediction"},
     "identity_diversity": {"pooling": "sequences"},

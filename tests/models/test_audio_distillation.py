@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.data.augmentation import filtered
+from facediff.data.augmentation import Augmenter, filtered, read_augmentations
 from facediff.errors import FaceDiffError
 from facediff.models.adaptation import with_audio_encoder
 from facediff.models.audio_distillation import (
     LOW_LATENCY_DISTILLATION,
     DistillationOptions,
+    SpeechPairs,
     distil_audio_encoder,
     encoder_weights,
 )
@@ -132,6 +133,21 @@ def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., Ani
     data.asked.clear()
     distil_audio_encoder(make_model(), data, replace(FEW, further=0))
     assert not data.asked
+
+
+def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> None:
+    options = replace(FEW, further=0, pauses=1.0, share=1.0, steps=20)
+    pairs = SpeechPairs(tiny, Augmenter(read_augmentations(["music:share=1,least=6,most=6"])), options)
+    pauses = 0
+    for number in range(len(pairs)):
+        batch = pairs[number]
+        for clean, student, length in zip(batch.clean, batch.student_input, batch.lengths.tolist(), strict=True):
+            steps = length // 160
+            quiet, heard = (each[: steps * 160].reshape(steps, 160).abs().amax(1) for each in (clean, student))
+            paused = (quiet < 1e-3 * clean.abs().max()).numpy()
+            pauses += paused.sum() >= 25  # steps of 10 ms
+            assert float(heard[torch.from_numpy(paused)].mean()) > 0.01 * float(student.abs().max())
+    assert pauses > 20
 
 
 def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tiny: Tiny) -> None:
