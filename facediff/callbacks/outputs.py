@@ -24,6 +24,7 @@ from facediff.utils.tables import format_table
 
 METHOD_NAMES = {
     "model": "model",
+    "usual_style": "model, the style that animate takes",
     "still": "still face",
     "mean_face": "speaker's mean face",
     "shuffled": "model, shuffled speech",

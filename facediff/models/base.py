@@ -28,7 +28,7 @@ from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.checkpoint_content import MotionScale, StyleSource
 from facediff.models.checkpoint_reading import checked_file
-from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned
+from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, with_usual_styles
 from facediff.models.inference import Prediction
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.person_styles import PersonStyles
@@ -325,6 +325,9 @@ class AnimationModel(PersonStyles, ABC):
             if view.decoy_audio is not None:
                 decoy = replace(view, audio=view.decoy_audio, features=None)
                 self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)
+        # A test gives every clip a reference of its own speaker and mood; whoever animates has none.
+        for view in with_usual_styles(batch, self.default_style) if self.style_of(batch).shape[1] else ():
+            self.evaluation.update(split, "usual_style", self.generate(view, seed=0), view)
         # Baselines: the model with speech that does not belong to the clip, and faces that do not move.
         self.evaluation.score_baselines(split, batch)
 
@@ -431,13 +434,13 @@ class AnimationModel(PersonStyles, ABC):
         count = max([at_least, *(module.count for module in waiting)])
         if not count:
             return None
-        weights = self.motion_weights().flatten()
+        weights = self.motion_weights(data).flatten()
         mean, shapes = data.principal_motion(count, weights)
         for module in waiting:
             module.attach(mean * self.scale, shapes * self.scale, weights)
         return shapes * self.scale
 
-    def motion_weights(self) -> Float[Tensor, "vertices 3"]:
+    def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "vertices 3"]:  # noqa: ARG002
         """What motion is multiplied by before its principal components are taken."""
         return torch.ones(self.n_vertices, 3)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -91,9 +91,22 @@ def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Bat
     )
 
 
-METHODS = ("model", "still", "mean_face", "shuffled")
-"""Methods that are scored: the model; a face that never moves from its template, or from the mean of its speaker's
-training clips; the model given another sentence's speech."""
+def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]) -> list[Batch]:
+    """The clips as ``animate`` makes them where nobody names a style, in one batch for each identity that has one."""
+    views = []
+    for name in dict.fromkeys(batch.identity_names):
+        clips = [clip for clip, other in enumerate(batch.identity_names) if other == name]
+        with contextlib.suppress(FaceDiffError):
+            style = style_of(name)
+            if not isinstance(style, Style) or style.vector.numel():
+                views.append(with_identity(batch.select(clips), int(batch.identity[clips[0]]), style))
+    return views
+
+
+METHODS = ("model", "usual_style", "still", "mean_face", "shuffled")
+"""Methods that are scored: the model; the model with the style that ``animate`` takes where none is given; a face that
+never moves from its template, or from the mean of its speaker's training clips; the model given another sentence's
+speech."""
 
 ENERGY_REGIONS = ("lips", "upper_face")
 """Regions by whose energy scores the best checkpoint is chosen, and whose smoothness is scored."""

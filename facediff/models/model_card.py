@@ -31,6 +31,7 @@ SPLITS = {
 }
 METHODS = {
     "model": "this model",
+    "usual_style": "this model, the style that animate takes",
     "still": "still face",
     "mean_face": "speaker's mean face",
     "shuffled": "this model, shuffled speech",

@@ -137,6 +137,10 @@ class ComponentMotion(MotionSpace):
         upper_face_weight: how much more a movement of the upper face counts than another of the same size, in the
             components and in the losses.
         lips_weight: the same for the lips.
+        eyelids_weight: the same for the vertices of the corpus's eyelid pairs, if it lists any; None counts them as the
+            upper face. Lids are few
+            vertices: as a part of the upper face they are noise to a short training, which then leaves them to the
+            Gaussian prior, and they wander instead of resting and blinking.
         prior_frames: length W of the windows, in frames, in which the preconditioning knows how each component moves
             over time, measured on the training split; odd. 1 takes every frame by itself, so that what a network leaves
             of the noise is jitter.
@@ -153,12 +157,15 @@ class ComponentMotion(MotionSpace):
         whitening: Share = 0.5,
         upper_face_weight: RegionWeight = 1.0,
         lips_weight: RegionWeight = 1.0,
+        eyelids_weight: RegionWeight | None = None,
         prior_frames: PriorFrames = 1,
     ) -> None:
         super().__init__()
         self.coordinates = count
         self.whitening = whitening
         self._region_weights = {"upper_face": upper_face_weight, "lips": lips_weight}
+        if eyelids_weight is not None:
+            self._region_weights["eyelids"] = eyelids_weight
         self.components = PrincipalComponents(n_vertices, count)
         self.register_buffer("sizes", torch.ones(count))
         if prior_frames % 2 == 0:
@@ -172,7 +179,7 @@ class ComponentMotion(MotionSpace):
 
     @property
     def region_weights(self) -> Mapping[str, float]:
-        """Those of upper face and lips."""
+        """Those of upper face, lips and eyelids."""
         return self._region_weights
 
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:

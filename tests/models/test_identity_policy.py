@@ -68,3 +68,24 @@ def test_the_mean_over_identities_is_reported(
     assert reported[logged] == pytest.approx(total / frames, rel=1e-4)
     rows = [row for row in model.evaluation.sequences() if row["split"] == "test_b" and row["method"] == method]
     assert {row["identity"] for row in rows} == {"A", "B"}
+
+
+def test_what_animate_gives_is_a_row_of_its_own(
+    make_model: Make, tiny: Tiny, make_trainer: Callable[..., Trainer]
+) -> None:
+    """Without a style, ``animate`` takes the speaker's stored reference, whatever the clip's own is."""
+    model = make_model(motion_scale="none")
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    scores: dict[str, float] = {}
+    for part in make_trainer().test(model, datamodule=tiny, verbose=False):
+        scores |= part
+    assert scores["test_a/usual_style/lve"] != scores["test_a/lve"]
+    assets, errors = tiny.assets(), []
+    for i in range(len(tiny.dataset("test_a"))):
+        sample = tiny.dataset("test_a")[i]
+        stored = replace(sample, reference=assets.references[sample.identity_name].motion.float())
+        with torch.inference_mode():
+            made = model.eval().generate(collate([stored]), seed=0)[0]
+        error = (made - sample.motion)[:, assets.regions["lips"]]
+        errors.append(error.double().square().sum(-1).amax(-1))
+    assert scores["test_a/usual_style/lve"] == pytest.approx(float(torch.cat(errors).mean()), rel=1e-4)

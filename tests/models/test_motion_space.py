@@ -498,13 +498,29 @@ def test_the_noise_scale_is_measured_by_the_64_largest_components(
 def test_lips_and_upper_face_count_by_their_own_weights(make_model: Make, tiny: Tiny) -> None:
     model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0, lips_weight=0.5))
     model.adopt(tiny.assets().with_motion_scale(1.0))
-    weights, regions = model.motion_weights(), model.assets.regions
+    weights, regions = model.motion_weights(tiny), model.assets.regions
     assert weights.shape == (model.n_vertices, 3)
     assert (weights[regions["upper_face"]] == 3).all()
     assert (weights[regions["lips"]] == 0.5).all()
     plain: DualPathDiffusion = make_model()
     plain.adopt(tiny.assets().with_motion_scale(1.0))
-    assert (plain.motion_weights() == 1).all()
+    assert (plain.motion_weights(tiny) == 1).all()
+
+
+def test_eyelids_count_by_the_pairs_of_the_corpus(
+    make_model: Make, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0, eyelids_weight=9.0))
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    upper = model.assets.regions["upper_face"]
+    monkeypatch.setattr(tiny, "eyelid_pairs", lambda: None)  # VOCASET and BIWI list none
+    assert (model.motion_weights(tiny)[upper] == 3).all()
+    lids = upper[:4].view(2, 2)
+    monkeypatch.setattr(tiny, "eyelid_pairs", lambda: lids)
+    weights = model.motion_weights(tiny)
+    assert (weights[lids.flatten()] == 9).all()
+    assert int((weights == 9).sum()) == 12
+    assert (weights[upper[4:]] == 3).all()
 
 
 def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) -> None:

@@ -253,11 +253,14 @@ class DualPathDiffusion(AnimationModel):
         space.fit(self.process.signal, covariance)
         return shapes
 
-    def motion_weights(self) -> Float[Tensor, "vertices 3"]:
-        """The motion space's weights of regions."""
-        weights = super().motion_weights()
+    def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "vertices 3"]:
+        """The motion space's weights of regions, of those that the corpus lists."""
+        weights, eyelids = super().motion_weights(data), data.eyelid_pairs()
+        # The last of them counts where regions overlap: eyelids lie in the upper face.
+        regions = self.assets.regions | ({} if eyelids is None else {"eyelids": eyelids.flatten()})
         for region, weight in self.motion_space.region_weights.items():
-            weights[self.assets.regions[region]] = weight
+            if region in regions:
+                weights[regions[region]] = weight
         return weights
 
     def training_projection(self) -> Projection | None:
