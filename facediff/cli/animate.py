@@ -17,12 +17,12 @@ from facediff.animation.options import (
     TargetOptions,
     WindowOptions,
 )
-from facediff.cli.options import Checkpoint, Scheduler, Workers, check_output, confirm_cost
+from facediff.cli.options import Scheduler, Workers, check_output, confirm_cost
 from facediff.cli.parsing import changed, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.hub import check_animating_source
+from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
 
@@ -47,7 +47,7 @@ class BatchOptions:
 def animate(
     speech: Annotated[list[Path], Option(metavar="SPEECH", reads=True, dash=True)],
     *,
-    checkpoint: Checkpoint,
+    checkpoint: Annotated[Path | None, Option(metavar="C", reads=True)] = None,
     output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file or folder", dash=True)],
     stream: bool = False,
     rate: Annotated[ranges.SampleRate, Option(metavar="HZ")] = 16_000,
@@ -66,6 +66,7 @@ def animate(
     """Animate a face with a recording of speech, with many, or with speech as it comes.
 
     For example:
+      facediff animate speech.wav -o speech.html
       facediff animate speech.wav --checkpoint demo/puppet.ckpt -o speech.mp4
       facediff animate speech.wav --checkpoint demo/puppet.ckpt --samples 3 --blinks -o speech.html
       facediff animate recordings/ --checkpoint demo/puppet.ckpt --suffix .glb -o animations/
@@ -74,7 +75,7 @@ def animate(
     Args:
         speech: recording: wav, flac, ogg, mp3 or a video; several or a folder for a batch; - with --stream
         checkpoint: trained model (.ckpt), a folder of `facediff publish` or `facediff export-model`, or USER/NAME of
-            the Hugging Face hub
+            the Hugging Face hub (default: the model that comes with facediff)
         output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
         stream: read PCM (16 bit, mono, little endian) from standard input as it comes
         rate: sample rate of that PCM
@@ -112,6 +113,7 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     if not streamed and not several and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
+    checkpoint = model_or_bundled(checkpoint)
     check_animating_source(checkpoint)
     check_scheduler(batch.scheduler)
     check_output(files, batch.suffix if several else ".npy" if stream else output.suffix)

@@ -21,6 +21,7 @@ def export_model(
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
     quick_steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
     speech: File = None,
+    identities: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
 ) -> None:
     """Write a model for ONNX Runtime: graphs, templates, styles, and a description.
 
@@ -39,6 +40,7 @@ def export_model(
         steps: its denoising steps
         quick_steps: its denoising steps at low latency (default: 2)
         speech: recording that the folder is compared with the model on; a made-up sound by default
+        identities: whose faces and styles the folder has (default: all that the model knows)
     """
     if output.exists():
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
@@ -62,7 +64,7 @@ def export_model(
             raise FaceDiffError(f"--quick-steps: {type(loaded).__name__} keeps its steps at low latency; omit it")
         loaded.low_latency_steps = quick_steps
     tell(f"recording the graphs of {type(loaded).__name__}, which takes a minute …")
-    description = export(loaded, output, precision=weights, speech=samples)
+    description = export(loaded, output, precision=weights, speech=samples, identities=identities)
     megabytes = sum(description.sizes.values()) / 1e6
     check = description.check
     tell(

@@ -15,8 +15,11 @@ from facediff.animation.options import (
 )
 from facediff.errors import FaceDiffError
 from facediff.live.options import LiveOptions
-from facediff.utils.hub import check_animating_source
+from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
+
+SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
+"""What a recording's name may end in where it stands in the model's place, for the model that comes with facediff."""
 
 if TYPE_CHECKING:
     from facediff.live.model import LiveModel
@@ -40,12 +43,12 @@ def live(
     one, with low latency, unless --window or --overlap are given.
 
     For example:
-      facediff live puppet-onnx --microphone --to browser
+      facediff live --microphone --to browser
       facediff live speech.wav --checkpoint demo/puppet.ckpt --to livelink://127.0.0.1:11111 --shapes puppet
       arecord -q -f S16_LE -r 16000 -t raw | facediff live puppet-onnx - --to jsonl:-
 
     Args:
-        model: the model, unless --checkpoint names it
+        model: the model, unless --checkpoint names it (default: the one that comes with facediff)
         speech: recording, played in real time; - for 16-bit samples (mono, little endian) on standard input
         checkpoint: trained model (.ckpt), a folder of `facediff publish` or `facediff export-model`, or USER/NAME of
             the Hugging Face hub
@@ -59,8 +62,9 @@ def live(
         if speech is not None:
             raise FaceDiffError(f"{model}: one model too many; give it alone, or --checkpoint")
         model, speech = checkpoint, model
-    if model is None:
-        raise FaceDiffError("--checkpoint: missing; give a trained model, or a folder of `facediff export-model`")
+    if model is not None and speech is None and (str(model) == "-" or model.suffix.lower() in SOUNDS):
+        model, speech = None, model
+    model = model_or_bundled(model)
     check_animating_source(model)
     if speech is not None and str(speech) != "-" and not speech.is_file():
         raise FaceDiffError(f"{speech}: no such sound file; give a recording, - for standard input, or --microphone")

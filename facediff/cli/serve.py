@@ -8,12 +8,13 @@ from typing import Annotated
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.hub import model_or_bundled
 from facediff.utils.option import Option
 from facediff.utils.server import LOOPBACK, require_server
 
 
 def serve(
-    model: Annotated[Path, Option(metavar="FOLDER", reads=True)],
+    model: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None,
     *,
     output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
     host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
@@ -27,12 +28,11 @@ def serve(
     is fetched from the npm registry once, and kept in facediff's cache.
 
     For example:
-      facediff export-model demo/puppet.ckpt -o puppet-onnx
-      facediff serve puppet-onnx --open
+      facediff serve --open
       facediff serve puppet-onnx -o site      # a folder for any web server
 
     Args:
-        model: folder of `facediff export-model`
+        model: folder of `facediff export-model` (default: the model that comes with facediff)
         output: folder to write in place of serving: page, model and ONNX Runtime, for any web server
         host: address to listen at
         port: to listen at; 0 for any free one
@@ -47,6 +47,7 @@ def serve(
     from facediff.runtime.onnxruntime_web import web_runtime
     from facediff.runtime.site import make_site, serve_site, write_site
 
+    model = model_or_bundled(model)
     read_folder(model)  # before anything is fetched
     site = make_site(model, web_runtime(runtime, say=tell))
     if output is not None:

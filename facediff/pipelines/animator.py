@@ -25,7 +25,7 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.hub import EXPECTED, check_model_source, is_exported
+from facediff.utils.hub import EXPECTED, check_model_source, is_exported, model_or_bundled
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import SAMPLE_RATES, check_number
 
@@ -47,13 +47,14 @@ PRECISIONS: dict[str, Literal["32", "bf16"]] = {"float32": "32", "bfloat16": "bf
 
 
 def load(
-    source: str | Path, device: str = "auto", commercial_only: bool = False, dtype: DType = "float32"
+    source: str | Path | None = None, device: str = "auto", commercial_only: bool = False, dtype: DType = "float32"
 ) -> Animator | ExportedAnimator:
     """A model, ready to animate.
 
     Args:
         source: a checkpoint (.ckpt), a model folder that ``facediff publish`` has written, ``user/name[@revision]`` of
-            the Hugging Face hub, or a folder of ``facediff export-model``, which needs no PyTorch.
+            the Hugging Face hub, or a folder of ``facediff export-model``, which needs no PyTorch; the model that comes
+            with facediff if None.
         device: where it computes: cpu, cuda …; ``auto`` for a CUDA device where there is one.
         commercial_only: refuse a model whose licence labels do not allow commercial use.
         dtype: in which it multiplies, float32 or bfloat16.
@@ -67,6 +68,7 @@ def load(
         >>> model.animate("speech.wav", identity="F1").save("speech.mp4")  # doctest: +SKIP
         [PosixPath('speech.mp4')]
     """
+    source = model_or_bundled(None) if source is None else source
     if not isinstance(source, str | Path):
         raise FaceDiffError(f"source: is of the type {type(source).__name__}; {EXPECTED}")
     if is_exported(source):

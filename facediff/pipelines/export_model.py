@@ -6,7 +6,7 @@ import hashlib
 import io
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.style_files import Stillness, stillness_of
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, read_folder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic_folder
@@ -59,6 +59,8 @@ def export_model(
     *,
     precision: Precision = "float32",
     speech: npt.NDArray[np.float32] | None = None,
+    identities: Sequence[str] | None = None,
+    styles: Mapping[str, Style] | None = None,
 ) -> Description:
     """Write a model as graphs for ONNX Runtime, with everything that animating needs.
 
@@ -71,17 +73,24 @@ def export_model(
         folder: to write; it must not exist.
         precision: how weights are stored.
         speech: (S,) at 16 kHz that the folder is compared with the model on; noise bursts if None.
+        identities: whose faces and styles the folder is to have; of all that the model knows if None.
+        styles: further styles by their names.
 
     Returns:
         the description, with the comparison in ``check``.
 
     Raises:
-        FaceDiffError: if the model cannot be exported, or float32 differs from PyTorch by more than 1e-4 of the
-            motion's range.
+        FaceDiffError: if the model cannot be exported, knows no such identity, or float32 differs from PyTorch by more
+            than 1e-4 of the motion's range.
         MissingExtraError: if the packages for ONNX are not installed.
     """
     require_onnx()
     graphs = model.graphs()
+    known = list(model.assets.templates)
+    for name in identities or ():
+        if name not in known:
+            raise OptionError("identities", f'there is no "{name}": {choices(name, known)}')
+    whose = known if identities is None else [name for name in known if name in set(identities)]
     with atomic_folder(folder) as staged:
         sizes, described = {}, {}
         for part in graphs.parts:
@@ -91,12 +100,12 @@ def export_model(
             path.write_bytes(document.SerializeToString())
             sizes[path.name] = path.stat().st_size
             described[part.name] = described_ends(document)
-        arrays, styles, faces = arrays_of(model, graphs)
+        arrays, named = arrays_of(model, graphs, whose, styles or {})
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
         (staged / ARRAYS).write_bytes(buffer.getvalue())
         sizes[ARRAYS] = len(buffer.getvalue())
-        description = describe(model, graphs, precision, sizes, described, styles, faces)
+        description = describe(model, graphs, precision, sizes, described, named, whose)
         write_json(staged / DESCRIPTION, description.content())
         read_folder(staged)  # what is written must be what is read
         checked = replace(description, check=compare(model, staged, speech if speech is not None else trial_speech()))
@@ -268,14 +277,16 @@ def described_ends(document: onnx.ModelProto) -> dict[str, list[dict[str, Any]]]
     }
 
 
-def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDArray[Any]], list[str], list[str]]:
-    """What ``arrays.npz`` holds, and the names of its styles and faces."""
+def arrays_of(
+    model: AnimationModel, graphs: Graphs, faces: list[str], further: Mapping[str, Style]
+) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
+    """What ``arrays.npz`` holds for these faces, and the names of its styles."""
     from facediff.editing.expressiveness import rest_weights
     from facediff.models.styles import vector_of
     from facediff.pipelines.trained import facts_of
 
     assets = model.assets
-    faces, facts = list(assets.templates), facts_of(assets)
+    facts = facts_of(assets)
     regions = facts["regions"]
     templates = np.stack([np.asarray(assets.templates[name], np.float32) for name in faces])
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -293,21 +304,23 @@ def arrays_of(model: AnimationModel, graphs: Graphs) -> tuple[dict[str, npt.NDAr
     if graphs.sampling is not None and graphs.sampling.noise is not None:
         arrays["noise"] = graphs.sampling.noise.numpy()
     if graphs.style != "reference":
-        return arrays, list(assets.identities) if graphs.style == "identity" else [], faces
+        return arrays, list(assets.identities) if graphs.style == "identity" else []
     chosen: dict[str, Reference | Style] = {}
-    for name in dict.fromkeys([*model.styled_identities(), *faces]):
+    for name in [name for name in dict.fromkeys([*model.styled_identities(), *faces]) if name in faces]:
         with suppress(FaceDiffError):  # a face without a style is given one by name
             chosen[name] = model.default_style(name)
     # Where identities do without their stored clips, these are styles by their own names, as in a checkpoint.
     defaults = {id(style) for style in chosen.values()}
-    chosen |= {reference.clip: reference for reference in assets.references.values() if id(reference) not in defaults}
+    stored = [assets.references[name] for name in faces if name in assets.references]
+    chosen |= {reference.clip: reference for reference in stored if id(reference) not in defaults}
+    chosen |= further
     styles = {name: vector_of(style, model).numpy() for name, style in chosen.items()}
     if not styles:
         raise FaceDiffError("styles: the checkpoint holds no reference motion; train with a corpus that gives one")
     arrays["styles"] = np.stack(list(styles.values()))
     if (stillness := model_stillness(model)) is not None:
         arrays["still"] = stillness.vertices
-    return arrays, list(styles), faces
+    return arrays, list(styles)
 
 
 def model_stillness(model: AnimationModel) -> Stillness | None:

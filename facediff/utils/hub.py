@@ -21,6 +21,9 @@ from facediff.utils.checksums import sha256
 from facediff.utils.limits import LIMITS, brief
 
 CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"
+BUNDLED = Path(__file__).parents[1] / "bundled" / "puppet"
+"""The model that comes with facediff: a folder of ``facediff export-model``, made by ``tools/bundled_model.py``."""
+
 FILES = (CONFIG, WEIGHTS, ASSETS, CARD)
 """The files of a model folder; no other is fetched."""
 
@@ -81,6 +84,23 @@ def check_animating_source(source: str | os.PathLike[str]) -> None:
     """
     if not is_exported(source):
         check_model_source(source)
+
+
+def model_or_bundled(source: Path | None) -> Path:
+    """The model that somebody named, or the one that comes with facediff, which is said in a line.
+
+    Raises:
+        FaceDiffError: if none was named and this copy of facediff was installed without it.
+    """
+    if source is not None:
+        return source
+    if not is_exported(BUNDLED):
+        raise FaceDiffError(f"--checkpoint: missing, and this copy of facediff has no model at {BUNDLED}; {EXPECTED}")
+    print(
+        f"no --checkpoint: {BUNDLED.name}, the model that comes with facediff; its speech and faces are synthetic",
+        file=sys.stderr,
+    )
+    return BUNDLED
 
 
 def check_training_source(source: str | os.PathLike[str]) -> None:

@@ -165,7 +165,7 @@ class ExportedModel {
   /** What motion is conditioned on besides speech. Args: names and numbers, which may be absent. */
   conditions({ identity, condition, style, seed = 0, expressivity = 1 }) {
     const { about, arrays } = this;
-    const chosen = identity ?? (about.identities.length ? about.identities : about.faces)[0];
+    const chosen = identity ?? about.identities.find((name) => about.faces.includes(name)) ?? about.faces[0];
     const known = (what, name, names) => {
       if (!names.includes(name)) throw new Error(`${what}: there is no "${name}"; choose one of the list`);
       return names.indexOf(name);

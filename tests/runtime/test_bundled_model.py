@@ -1,0 +1,64 @@
+"""The model that comes with the package: taken where none is named, small, without PyTorch, and what it says it is."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import facediff
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.runtime.folder import read_folder
+from facediff.synthetic.cast import SEEN, UNSEEN
+from facediff.utils import hub
+
+SPEECH = Path(__file__).parents[2] / "docs" / "examples" / "speech.wav"
+WITHOUT_TORCH = "import sys; sys.modules['torch'] = None; from facediff.cli.app import main; main(sys.argv[1:])"
+
+
+def test_a_recording_becomes_a_page_without_a_checkpoint_and_without_pytorch(tmp_path: Path) -> None:
+    page = tmp_path / "speech.html"
+    command = [sys.executable, "-c", WITHOUT_TORCH, "animate", str(SPEECH), "-o", str(page)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    said = [line for line in done.stderr.splitlines() if line.startswith("no --checkpoint")]
+    assert said == ["no --checkpoint: puppet, the model that comes with facediff; its speech and faces are synthetic"]
+    assert page.stat().st_size > 10_000
+
+
+def test_it_is_small_and_knows_ten_people_and_their_moods() -> None:
+    files = list(hub.BUNDLED.iterdir())
+    assert sum(path.stat().st_size for path in files) < 16e6
+    about = read_folder(hub.BUNDLED)[0]
+    assert about.synthetic
+    assert set(about.faces) == {*SEEN, *UNSEEN}
+    assert {f"{name}_{mood}" for name in SEEN for mood in ("calm", "neutral", "lively")} <= set(about.styles)
+    provenance = json.loads((hub.BUNDLED / "provenance.json").read_text())
+    assert provenance["generation_metrics"]
+    assert "facediff fit" in provenance["recipe"]
+
+
+def test_the_lively_style_moves_more_than_the_calm_one(capsys: pytest.CaptureFixture[str]) -> None:
+    model = facediff.load()
+    assert "puppet" in capsys.readouterr().err
+    for name in SEEN[:2]:
+        moves = [
+            np.std(model.animate(SPEECH, identity=name, style=f"{name}_{mood}", seed=1).vertices, axis=0).mean()
+            for mood in ("calm", "lively")
+        ]
+        assert moves[1] > 1.1 * moves[0]
+
+
+def test_without_it_a_checkpoint_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(hub, "BUNDLED", tmp_path / "none")
+    with pytest.raises(FaceDiffError, match="--checkpoint: missing"):
+        facediff.load()
+    assert main(["animate", str(SPEECH), "-o", str(tmp_path / "x.npy")]) == 2
+    assert "--checkpoint: missing" in capsys.readouterr().err
+    assert not (tmp_path / "x.npy").exists()
