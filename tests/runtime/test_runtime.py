@@ -294,6 +294,18 @@ def test_hubert_is_exported_too(tiny_root: Path, tmp_path: Path, hubert_source: 
 
 
 @pytest.mark.slow
+def test_faces_and_styles_of_some_identities_are_exported(tiny_root: Path, tmp_path: Path) -> None:
+    made = ready(tiny_root)
+    with pytest.raises(FaceDiffError, match='identities: there is no "nobody"'):
+        export_model(made, tmp_path / "out", identities=["nobody"])
+    description = export_model(made, tmp_path / "out", identities=["B"])
+    assert description.faces == ["B"]
+    assert all(name.startswith("B") for name in description.styles)
+    speech = np.random.default_rng(0).normal(size=16_000).astype(np.float32) * 0.1
+    assert facediff.load(tmp_path / "out").animate(speech, 16_000).metadata["identity"] == "B"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("precision", "bound"), [("float16", 0.02), ("int8", 0.1)])
 def test_fewer_bits_make_a_smaller_folder(
     tiny_root: Path, tmp_path: Path, precision: str, bound: float, folder: Path, monkeypatch: pytest.MonkeyPatch
