@@ -1,8 +1,8 @@
-"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
+r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
 The recipe, where flite is installed, on one core of an AMD EPYC in about 40 minutes beside another training:
 
-    $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \\
+    $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
         --model.motion_space.eyelids_weight=20
     $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 1200 -o puppet.ckpt
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json

@@ -31,7 +31,12 @@ def printed(outputs: list[Any], folder: Path) -> list[Any]:
         if output.output_type == "stream" and output.name == "stderr":
             continue
         text = output.text if output.output_type == "stream" else output.data.get("text/plain", "")
-        text = ANSI.sub("", text).replace(str(folder / "cache"), "~/.cache/facediff").replace(f"{folder}/", "")
+        text = (
+            ANSI.sub("", text)
+            .replace(str(folder / "cache"), "~/.cache/facediff")
+            .replace(f"{folder}/", "")
+            .replace(f"{ROOT}/", "")
+        )
         ours = not re.search("Trainable params|Name .*Params|Loading `train_dataloader`|`Trainer|litlogger", text)
         if ours and text.strip():
             lines.append(text.rstrip())

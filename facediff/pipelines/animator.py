@@ -456,8 +456,15 @@ class ExportedAnimator(SpeechAnimator):
 
     @property
     def identities(self) -> list[str]:
-        """The identities that it was trained on; the first one is the default."""
-        return list(self.model.description.identities or self.model.description.faces)
+        """The identities that it was trained on and whose faces it has; the first one is the default."""
+        about = self.model.description
+        return [name for name in about.identities if name in about.faces] or list(about.faces)
+
+    @property
+    def corpus(self) -> str:
+        """The corpus that it was trained on."""
+        about = self.model.description
+        return f"{about.corpus} (synthetic)" if about.synthetic else about.corpus
 
     @property
     def frame_rate(self) -> float:
