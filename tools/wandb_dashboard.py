@@ -111,7 +111,10 @@ def panels_by_section(panels: ModuleType, clips: Sequence[str], terms: Sequence[
             *(
                 panels.BarPlot(
                     title=f"{metric}, {words}",
-                    metrics=[f"{split}/{method}{metric}" for method in ("", "still/", "mean_face/", "shuffled/")],
+                    metrics=[
+                        f"{split}/{method}{metric}"
+                        for method in ("", "usual_style/", "still/", "mean_face/", "shuffled/")
+                    ],
                 )
                 for split, words in SPLITS.items()
                 for metric in METRICS

@@ -96,10 +96,12 @@ def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]
     views = []
     for name in dict.fromkeys(batch.identity_names):
         clips = [clip for clip, other in enumerate(batch.identity_names) if other == name]
-        with contextlib.suppress(FaceDiffError):
+        try:
             style = style_of(name)
-            if not isinstance(style, Style) or style.vector.numel():
-                views.append(with_identity(batch.select(clips), int(batch.identity[clips[0]]), style))
+        except FaceDiffError:  # nobody animates as this identity without naming a style
+            continue
+        if not isinstance(style, Style) or style.vector.numel():
+            views.append(with_identity(batch.select(clips), int(batch.identity[clips[0]]), style))
     return views
 
 

@@ -138,9 +138,8 @@ class ComponentMotion(MotionSpace):
             components and in the losses.
         lips_weight: the same for the lips.
         eyelids_weight: the same for the vertices of the corpus's eyelid pairs, if it lists any; None counts them as the
-            upper face. Lids are few
-            vertices: as a part of the upper face they are noise to a short training, which then leaves them to the
-            Gaussian prior, and they wander instead of resting and blinking.
+            upper face. Lids are few vertices: so counted, a short training leaves them to the Gaussian prior, and they
+            wander instead of resting and blinking.
         prior_frames: length W of the windows, in frames, in which the preconditioning knows how each component moves
             over time, measured on the training split; odd. 1 takes every frame by itself, so that what a network leaves
             of the noise is jitter.

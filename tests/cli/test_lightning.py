@@ -68,7 +68,7 @@ def test_test_takes_everything_from_the_checkpoint(
     report = json.loads((table.parent / "test_report.json").read_text())
     assert report["provenance"] == json.loads((table.parent / "provenance.json").read_text())
     assert report["columns"]["lve"] == {"pooling": "frames", "better": "lower"}
-    assert len(report["sequences"]) == 24
+    assert len(report["sequences"]) == 30
 
 
 @pytest.mark.slow
@@ -387,8 +387,8 @@ def test_three_processes_score_as_one_does(
         (mine,) = (tmp_path / "one").rglob(name)
         (theirs,) = (tmp_path / "three").rglob(name)
         one, three = (list(csv.DictReader(path.read_text().splitlines())) for path in (mine, theirs))
-        # Two splits by four methods; four clips of test A and two of test B, each with four methods.
-        assert len(one) == len(three) == {"test_scores.csv": 8, "test_sequences.csv": 24}[name]
+        # Two splits by five methods; four clips of test A and two of test B, each with five methods.
+        assert len(one) == len(three) == {"test_scores.csv": 10, "test_sequences.csv": 30}[name]
         for row, other in zip(one, three, strict=True):
             for column, value in row.items():
                 if column in ("mve", "lve", "fdd"):
@@ -438,7 +438,7 @@ def test_wandb_gets_the_sequences_and_the_protocol(
     assert main(words) == 0
     wandb.finish()
     columns = ["split", "method", "clip", "identity", "frames", "mood", "mve", "lve", "fdd", "audio", "error"]
-    assert logged == {"columns": columns, "rows": 24}
+    assert logged == {"columns": columns, "rows": 30}
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="of glibc")

@@ -168,7 +168,6 @@ def test_usual_gate_waits_no_longer_than_the_windows() -> None:
         (["FOLDER", "-", "--to", "keep:1", "--window", "nan"], "--window"),
         (["FOLDER", "-", "--to", "keep:1", "--checkpoint", "FOLDER"], "--checkpoint"),
         (["-", "--to", "keep:1", "--checkpoint", "nowhere"], "nowhere"),
-        (["--to", "keep:1", "--microphone"], "--checkpoint"),
         (["FOLDER", "-", "--to", "keep:1", "--seconds", "0"], "--seconds"),
         (["FOLDER", "-", "--to", "keep:1", "--threads", "-1"], "--threads"),
     ],

@@ -108,7 +108,8 @@ def in_eager(model: AnimationModel) -> RuntimeModel:
     """The runtime over the graphs' own modules."""
     graphs = model.graphs()
     parts = {part.name: part for part in graphs.parts}
-    arrays, styles, faces = arrays_of(model, graphs)
+    faces = list(model.assets.templates)
+    arrays, styles = arrays_of(model, graphs, faces, {})
     about = describe(model, graphs, "float32", {}, dict.fromkeys(parts, {}), styles, faces)
     return RuntimeModel(about, arrays, lambda name: Session(parts[name]))
 

@@ -255,9 +255,10 @@ class DualPathDiffusion(AnimationModel):
 
     def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "vertices 3"]:
         """The motion space's weights of regions, of those that the corpus lists."""
-        weights, eyelids = super().motion_weights(data), data.eyelid_pairs()
+        weights, regions = super().motion_weights(data), dict(self.assets.regions)
+        if "eyelids" in self.motion_space.region_weights and (pairs := data.eyelid_pairs()) is not None:
+            regions["eyelids"] = pairs.flatten()
         # The last of them counts where regions overlap: eyelids lie in the upper face.
-        regions = self.assets.regions | ({} if eyelids is None else {"eyelids": eyelids.flatten()})
         for region, weight in self.motion_space.region_weights.items():
             if region in regions:
                 weights[regions[region]] = weight
