@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -167,19 +168,18 @@ def noisy(decibels: float, kind: Callable[[int, int], Array] = tone) -> Change:
     return lambda speech: speech + kind(len(speech), 1) * level(speech) * 10 ** (-decibels / 20)
 
 
-def babble(decibels: float) -> Change:
-    """Six people who talk at once, so many decibels below the speech: flite's slt at six pitches."""
+@lru_cache
+def crowd_voice(text: str, semitones: float) -> Array:
+    """One of a crowd: flite's slt at another pitch."""
+    return pitched(Flite("slt").speak(text).samples.astype(np.float64), semitones)
 
-    def change(speech: Array) -> Array:
-        random = np.random.default_rng(2)
-        people = [
-            pitched(Flite("slt").speak(text).samples.astype(np.float64), shift)
-            for text, shift in zip(CROWD, random.uniform(-7, 4, len(CROWD)), strict=True)
-        ]
-        crowd = sum(np.resize(np.roll(each, int(random.integers(len(each)))), len(speech)) for each in people)
-        return speech + crowd * level(speech) * 10 ** (-decibels / 20) / level(np.asarray(crowd))
 
-    return change
+def babble(count: int, seed: int) -> Array:
+    """Six people who talk at once, as loud as unit speech."""
+    random = np.random.default_rng(seed + 1)
+    people = [crowd_voice(*each) for each in zip(CROWD, random.uniform(-7, 4, len(CROWD)), strict=True)]
+    crowd = np.asarray(sum(np.resize(np.roll(each, int(random.integers(len(each)))), count) for each in people))
+    return crowd / level(crowd)
 
 
 CROWD = (
@@ -193,22 +193,18 @@ CROWD = (
 """What the crowd says."""
 
 
-def music(decibels: float) -> Change:
-    """Plucked strings (Karplus and Strong 1983), three at a time, so many decibels below the speech."""
-
-    def change(speech: Array) -> Array:
-        random, made = np.random.default_rng(4), np.zeros(len(speech) + 2 * SAMPLE_RATE)
-        for start in range(0, len(speech), 4800):
-            for note in random.choice([0, 3, 5, 7, 10, 12, 15, 19], 3, replace=False):
-                period = round(SAMPLE_RATE / (110 * 2 ** (note / 12)))
-                burst = np.concatenate([random.uniform(-1, 1, period), np.zeros(SAMPLE_RATE)])
-                feedback = np.zeros(period + 2)
-                feedback[0], feedback[-2:] = 1, -0.498
-                made[start : start + len(burst)] += lfilter([1.0], feedback, burst)
-        made = made[: len(speech)]
-        return speech + made * level(speech) * 10 ** (-decibels / 20) / level(made)
-
-    return change
+def music(count: int, seed: int) -> Array:
+    """Plucked strings (Karplus and Strong 1983), three at a time, as loud as unit speech."""
+    random, made = np.random.default_rng(seed + 3), np.zeros(count + 2 * SAMPLE_RATE)
+    for start in range(0, count, 4800):
+        for note in random.choice([0, 3, 5, 7, 10, 12, 15, 19], 3, replace=False):
+            period = round(SAMPLE_RATE / (110 * 2 ** (note / 12)))
+            burst = np.concatenate([random.uniform(-1, 1, period), np.zeros(SAMPLE_RATE)])
+            feedback = np.zeros(period + 2)
+            feedback[0], feedback[-2:] = 1, -0.498
+            made[start : start + len(burst)] += lfilter([1.0], feedback, burst)
+    made = made[:count]
+    return np.asarray(made / level(made))
 
 
 def both(first: Change, second: Change) -> Change:
@@ -245,10 +241,10 @@ PAUSES: dict[str, Change] = {
     "hiss -30 dB": noisy(30, hiss),
     "hum -30 dB": noisy(30, hum),
     "lower voice, room tone -30 dB": both(voice(-3, 0.9), noisy(30)),
-    "music -20 dB": music(20),
-    "music -12 dB": music(12),
-    "babble -20 dB": babble(20),
-    "babble -12 dB": babble(12),
+    "music -20 dB": noisy(20, music),
+    "music -12 dB": noisy(12, music),
+    "babble -20 dB": noisy(20, babble),
+    "babble -12 dB": noisy(12, babble),
 }
 """Changes of sentences with pauses, by name."""
 

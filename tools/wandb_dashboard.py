@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError
+from facediff.models.evaluation import METHODS
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -111,10 +112,7 @@ def panels_by_section(panels: ModuleType, clips: Sequence[str], terms: Sequence[
             *(
                 panels.BarPlot(
                     title=f"{metric}, {words}",
-                    metrics=[
-                        f"{split}/{method}{metric}"
-                        for method in ("", "usual_style/", "still/", "mean_face/", "shuffled/")
-                    ],
+                    metrics=[f"{split}/{method}{metric}" for method in ("", *(f"{name}/" for name in METHODS[1:]))],
                 )
                 for split, words in SPLITS.items()
                 for metric in METRICS

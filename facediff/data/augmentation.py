@@ -352,8 +352,31 @@ class Room(SpeechAugmentation):
         return cast(Wave, fftconvolve(speech, tail.astype(np.float32))[: len(speech)])
 
 
+class Background(SpeechAugmentation):
+    """A sound that is added to the speech, at a random ratio of the two.
+
+    Args:
+        share: of the augmented clips.
+        least: least ratio of speech to the sound, in decibels.
+        most: largest ratio.
+    """
+
+    def __init__(self, *, share: Share, least: Ratio, most: Ratio) -> None:
+        super().__init__(share=share)
+        self.least, self.most = least, max(least, most)
+
+    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Add the sound."""
+        sound = self.sound(speech, random)
+        return speech + sound * gain_for(speech, sound, random.uniform(self.least, self.most))
+
+    @abstractmethod
+    def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """The sound (S,) that is added to speech (S,), of any level."""
+
+
 @augmentation.register("noise")
-class Noise(SpeechAugmentation):
+class Noise(Background):
     """Noise of a random colour, from white to brown, and of a level that may change slowly.
 
     Args:
@@ -363,18 +386,16 @@ class Noise(SpeechAugmentation):
     """
 
     def __init__(self, *, share: Share = 0.6, least: Ratio = 5.0, most: Ratio = 50.0) -> None:
-        super().__init__(share=share)
-        self.least, self.most = least, max(least, most)
+        super().__init__(share=share, least=least, most=most)
 
-    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Add noise."""
+    def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Noise of one colour."""
         exponent = random.uniform(-1.0, 0.2)
-        noise = filtered(random.standard_normal(len(speech)), lambda hertz: np.maximum(hertz / 500, 0.08) ** exponent)
-        return speech + noise * gain_for(speech, noise, random.uniform(self.least, self.most))
+        return filtered(random.standard_normal(len(speech)), lambda hertz: np.maximum(hertz / 500, 0.08) ** exponent)
 
 
 @augmentation.register("hum")
-class Hum(SpeechAugmentation):
+class Hum(Background):
     """Mains hum: 50 or 60 Hz with its harmonics.
 
     Args:
@@ -384,11 +405,10 @@ class Hum(SpeechAugmentation):
     """
 
     def __init__(self, *, share: Share = 0.2, least: Ratio = 10.0, most: Ratio = 50.0) -> None:
-        super().__init__(share=share)
-        self.least, self.most = least, max(least, most)
+        super().__init__(share=share, least=least, most=most)
 
-    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Add hum."""
+    def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Hum of one frequency."""
         base = (50.0, 60.0)[int(random.integers(2))] * random.uniform(0.995, 1.005)
         orders = np.arange(1, 13)
         sizes = random.uniform(0.2, 1.0, 12) * orders ** -random.uniform(0.5, 2.0)
@@ -397,12 +417,11 @@ class Hum(SpeechAugmentation):
             size * np.sin(order * phase + shift)
             for order, size, shift in zip(orders, sizes, random.uniform(0, 2 * np.pi, 12), strict=True)
         )
-        hum = np.asarray(hum)
-        return speech + hum * gain_for(speech, hum, random.uniform(self.least, self.most))
+        return np.asarray(hum)
 
 
 @augmentation.register("babble")
-class Babble(SpeechAugmentation):
+class Babble(Background):
     """Other people who talk in the background.
 
     They are copies of the clip itself from random places, faster or slower and half of them backwards, so that nothing
@@ -423,11 +442,11 @@ class Babble(SpeechAugmentation):
         most: Ratio = 30.0,
         voices: Annotated[int, Range(1, 20)] = 8,
     ) -> None:
-        super().__init__(share=share)
-        self.least, self.most, self.voices = least, max(least, most), voices
+        super().__init__(share=share, least=least, most=most)
+        self.voices = voices
 
-    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Add babble."""
+    def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Babble of some people."""
         import soxr
 
         babble = np.zeros(len(speech))
@@ -436,11 +455,11 @@ class Babble(SpeechAugmentation):
             # As often as it takes: a shorter copy would leave a part of the clip without this person.
             copy = np.resize(copy[::-1] if random.random() < 0.5 else copy, len(speech))
             babble += np.roll(copy, int(random.integers(len(speech)))) * random.uniform(0.3, 1.0)
-        return speech + babble * gain_for(speech, babble, random.uniform(self.least, self.most))
+        return babble
 
 
 @augmentation.register("music")
-class Music(SpeechAugmentation):
+class Music(Background):
     """Music in the background: chords of decaying partials, and often a drum.
 
     Args:
@@ -450,13 +469,11 @@ class Music(SpeechAugmentation):
     """
 
     def __init__(self, *, share: Share = 0.25, least: Ratio = 6.0, most: Ratio = 30.0) -> None:
-        super().__init__(share=share)
-        self.least, self.most = least, max(least, most)
+        super().__init__(share=share, least=least, most=most)
 
-    def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Add music."""
-        music = played(len(speech), random)
-        return speech + music * gain_for(speech, music, random.uniform(self.least, self.most))
+    def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
+        """Music as long as the speech."""
+        return played(len(speech), random)
 
 
 @augmentation.register("pauses")

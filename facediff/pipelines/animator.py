@@ -457,8 +457,7 @@ class ExportedAnimator(SpeechAnimator):
     @property
     def identities(self) -> list[str]:
         """The identities that it was trained on and whose faces it has; the first one is the default."""
-        about = self.model.description
-        return [name for name in about.identities if name in about.faces] or list(about.faces)
+        return self.model.description.known
 
     @property
     def corpus(self) -> str:

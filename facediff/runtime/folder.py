@@ -126,6 +126,11 @@ class Description:
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     @property
+    def known(self) -> list[str]:
+        """The identities that it was trained on and whose faces it has, or else all faces; the first is the default."""
+        return [name for name in self.identities if name in self.faces] or list(self.faces)
+
+    @property
     def plan(self) -> WindowPlan:
         """How long speech is cut."""
         return WindowPlan(**self.windows)

@@ -128,8 +128,7 @@ class RuntimeModel(ExportedGraphs):
     def _face(self, choice: RuntimeChoices) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and the conditions of its motion."""
         about, style = self.description, choice.style
-        usual = next((name for name in about.identities if name in about.faces), about.faces[0])
-        chosen = usual if choice.identity is None else choice.identity
+        chosen = about.known[0] if choice.identity is None else choice.identity
         if chosen not in about.faces:
             raise OptionError("identity", f'there is no "{chosen}": {choices(chosen, about.faces)}')
         if choice.condition is not None and choice.condition not in about.identities:

@@ -59,6 +59,9 @@ def test_without_it_a_checkpoint_is_asked_for(
     monkeypatch.setattr(hub, "BUNDLED", tmp_path / "none")
     with pytest.raises(FaceDiffError, match="--checkpoint: missing"):
         facediff.load()
-    assert main(["animate", str(SPEECH), "-o", str(tmp_path / "x.npy")]) == 2
-    assert "--checkpoint: missing" in capsys.readouterr().err
+    animate = ["animate", str(SPEECH), "-o", str(tmp_path / "x.npy")]
+    for words in (animate, ["live", "--to", "keep:1", "--microphone"], ["serve"]):
+        assert main(words) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert "--checkpoint: missing" in line
     assert not (tmp_path / "x.npy").exists()
