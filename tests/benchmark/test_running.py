@@ -185,6 +185,7 @@ def is_running(process: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes")
+@pytest.mark.slow
 def test_killed_and_started_again_the_table_is_that_of_another_benchmark_with_the_same_seeds(folder: Path) -> None:
     process = begin(folder)
     trained = folder / "out" / "runs"

@@ -141,6 +141,7 @@ def scipy_both(one: np.ndarray, other: np.ndarray, frames: np.ndarray) -> object
 
 
 @pytest.mark.parametrize("runs", [3, 5, 10])
+@pytest.mark.slow
 def test_false_positives_stay_at_five_per_cent_where_both_chances_act(runs: int) -> None:
     """Of two equal methods, whatever share of the variance is that of sentences; the larger p-value gave 10 %."""
     rng, count = np.random.default_rng(runs), 700
@@ -165,6 +166,7 @@ def test_references_cost_the_methods_no_power() -> None:
     assert methods["3"][1] == plain["3"]
 
 
+@pytest.mark.slow
 def test_tables_of_noise_mark_nothing_as_best() -> None:
     """In at most 5 % of them, up to the chance of 150 tables; sentences alone would mark far more."""
     rng = np.random.default_rng(5)

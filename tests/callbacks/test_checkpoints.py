@@ -117,14 +117,14 @@ def uninterrupted(
     [
         (1, 1, None, 0),  # within the first epoch
         pytest.param(2, 1, None, 0, marks=pytest.mark.slow),
-        (3, 1, None, 0),  # between epochs
+        pytest.param(3, 1, None, 0, marks=pytest.mark.slow),  # between epochs
         pytest.param(4, 2, None, 0, marks=pytest.mark.slow),
         (5, 3, None, 0),  # some steps after the last checkpoint
         pytest.param(8, 1, None, 0, marks=pytest.mark.slow),
-        (4, 1, None, 1),
+        pytest.param(4, 1, None, 1, marks=pytest.mark.slow),
         pytest.param(2, 100, signal.SIGINT, 0, marks=pytest.mark.slow),
         (5, 100, signal.SIGINT, 0),
-        (4, 100, signal.SIGTERM, 0),
+        pytest.param(4, 100, signal.SIGTERM, 0, marks=pytest.mark.slow),
         pytest.param(3, 100, signal.SIGUSR1, 0, marks=pytest.mark.slow),
     ],
 )
@@ -175,7 +175,7 @@ VARIANTS: dict[str, dict[str, object]] = {
 
 
 # Those that go another way through the loader, the loop or the optimiser; the others are combinations of the same.
-QUICK = ("accumulated gradients", "validation within an epoch", "windows", "clipped gradients")
+QUICK = ("accumulated gradients", "windows")
 STOPS = dict.fromkeys(QUICK, (2, 5))
 
 

@@ -96,6 +96,7 @@ def model_of(checkpoint: Path, *, averaged: bool) -> DualPathDiffusion:
     return model
 
 
+@pytest.mark.slow
 def test_preview_shows_averaged_weights(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -257,6 +258,7 @@ def test_preview_logger_that_fails_does_not_stop_the_others(
     assert len(list(Path(board.log_dir).glob("previews/epoch_0001/*"))) == 4
 
 
+@pytest.mark.slow
 def test_preview_warns_once_of_a_missing_package(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,6 +297,7 @@ def test_preview_refuses_bad_options(make_model: MakeModel, make_trainer: MakeTr
         trainer.fit(make_model(), datamodule=tiny)
 
 
+@pytest.mark.slow
 def test_preview_in_tensorboard_has_pictures_and_sound(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -313,6 +316,7 @@ def test_preview_in_tensorboard_has_pictures_and_sound(
     assert events.Scalars("preview/seconds")[0].value > 0
 
 
+@pytest.mark.slow
 def test_preview_in_wandb_has_videos_and_a_growing_table(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -105,6 +105,7 @@ def test_speech_feature_window_is_where_the_motion_window_is(tiny_root: Path) ->
         assert sample.features.flatten().tolist() == list(range(2 * start, 2 * start + 10))
 
 
+@pytest.mark.slow
 def test_speech_feature_cache_replaces_a_damaged_file(
     losses: Callable[..., tuple[list[float], int]], tmp_path: Path
 ) -> None:
@@ -126,6 +127,7 @@ def test_speech_feature_cache_refuses_an_encoder_without_a_frozen_part(
         trainer.fit(make_model(), datamodule=tiny)
 
 
+@pytest.mark.slow
 def test_speech_feature_cache_from_the_command_line(
     tiny_root: Path, hubert_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,6 +60,7 @@ def error_of_c(path: Path, tiny: Tiny) -> float:
     return total
 
 
+@pytest.mark.slow
 def test_new_speaker_comes_first_and_the_others_stay(adapted: Path, checkpoint: Path) -> None:
     before, after = load_model(checkpoint), load_model(adapted)
     assert after.identities == ["C", *before.identities]
@@ -98,6 +99,7 @@ def test_new_speaker_is_tested_and_animated_by_name(
     assert np.load(out).shape == (25, 24, 3)
 
 
+@pytest.mark.slow
 def test_train_person_leaves_the_rest_alone(checkpoint: Path, tmp_path: Path) -> None:
     path = tmp_path / "C.ckpt"
     words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--train", "person"]
@@ -242,6 +244,7 @@ def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         assert "--voices" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_low_latency_with_another_audio_encoder(
     checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

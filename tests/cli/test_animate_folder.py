@@ -246,6 +246,7 @@ def test_wrong_outputs_and_suffixes_of_a_batch_are_refused(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_a_second_batch_keeps_outputs_made_with_the_same_correspondence_and_shapes(
     checkpoint: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -59,6 +59,7 @@ FIT += ["--trainer.enable_model_summary=false", "--trainer.log_every_n_steps=1"]
     ],
     ids=["biwi", "vocaset", "mead3d"],
 )
+@pytest.mark.slow
 def test_from_the_raw_files_to_scores(
     raw: Callable[[Path], list[str]],
     module: str,

@@ -51,6 +51,7 @@ def test_expressivity_goes_from_the_mean_to_the_sample(checkpoint: Path, tmp_pat
     assert np.abs(sample - mean).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_expressivity_by_region_fades_into_the_rest(speech: Path, checkpoint: Path) -> None:
     sample, mean = (made(speech, checkpoint, "--expressivity", share) for share in (1, 0))
     regions = load_model(checkpoint).assets.regions
@@ -124,6 +125,7 @@ def test_impossible_values_are_one_sentence(
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_a_mean_is_scored_by_test(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 

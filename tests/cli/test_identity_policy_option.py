@@ -9,6 +9,7 @@ import pytest
 from facediff.cli.app import main
 
 
+@pytest.mark.slow
 def test_the_policy_is_chosen_at_test_time_and_printed(
     checkpoint: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -141,6 +141,7 @@ def test_flags_that_would_change_a_checkpoints_model_are_refused(
 
 
 @pytest.mark.filterwarnings("ignore:The dirpath has changed")
+@pytest.mark.slow
 def test_training_resumes(fit: Fit, checkpoint: Path, tmp_path: Path) -> None:
     words = [f"--trainer.logger.save_dir={tmp_path}", "--model.decoder=gru", "--model.decoder.num_layers=1"]
     assert fit(*words, f"--ckpt_path={checkpoint}", "--trainer.max_epochs=2") == 0
@@ -253,8 +254,7 @@ def test_a_component_chosen_by_name_starts_from_its_own_defaults(
 
 
 EXPERIMENTS = sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml"))
-QUICK = ("biwi", "biwi_paper", "mead3d", "vocaset", "vocaset_style_content_paper", "puppet_hubert", "biwi_faceformer")
-QUICK += ("vocaset_diffspeaker", "puppet_codetalker_prior", "puppet_mask")
+QUICK = ("biwi_faceformer", "biwi_paper", "mead3d", "vocaset_diffspeaker", "puppet_codetalker_prior", "puppet_mask")
 """Those that are parsed in the quick suite: every corpus, trainer and kind of model; others differ by their sizes."""
 
 
@@ -281,7 +281,12 @@ NAMED: dict[str, tuple[list[str], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", NAMED)
+QUICK_NAMES = ("the first of several files", "the option", "no file", "a list of loggers")
+
+
+@pytest.mark.parametrize(
+    "case", [name if name in QUICK_NAMES else pytest.param(name, marks=pytest.mark.slow) for name in NAMED]
+)
 def test_runs_carry_the_name_of_their_experiment(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -315,6 +320,7 @@ def test_configs_are_short() -> None:
     assert all(len(path.read_text().splitlines()) <= 40 for path in CONFIGS.rglob("*.yaml"))
 
 
+@pytest.mark.slow
 def test_sub_configs_and_interpolation_with_a_flag_over_a_file(
     fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -418,6 +424,7 @@ def test_the_rows_of_the_sequences_add_up_to_the_scores(
         assert np.mean([float(row["fdd"]) for row in rows]) == pytest.approx(float(total["fdd"]), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_wandb_gets_the_sequences_and_the_protocol(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

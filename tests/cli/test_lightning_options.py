@@ -28,12 +28,7 @@ Fit = Callable[..., int]
 
 QUICK = [
     (["--model.dim=33"], "--model.dim 33"),
-    (["--model.sampler.steps=100000"], "--model.sampler.steps 100000"),
     (["--model.learning_rate=.inf"], "--model.learning_rate"),
-    (["--data.num_workers=-1"], "--data.num_workers -1"),
-    (["--seed_everything=-1"], "--seed_everything -1"),
-    (["--name=../elsewhere"], "--name ../elsewhere"),
-    (["--trainer.max_epochs=-5"], "--trainer.max_epochs -5"),
     (["--trainer.strategy=nope"], "--trainer.strategy nope"),
     (["--trainer.logger.save_dir=/dev/null/x"], "/dev/null/x"),
     (
@@ -42,6 +37,11 @@ QUICK = [
     ),
 ]
 SLOW = [
+    (["--model.sampler.steps=100000"], "--model.sampler.steps 100000"),
+    (["--data.num_workers=-1"], "--data.num_workers -1"),
+    (["--name=../elsewhere"], "--name ../elsewhere"),
+    (["--trainer.max_epochs=-5"], "--trainer.max_epochs -5"),
+    (["--seed_everything=-1"], "--seed_everything -1"),
     (["--model.decoder.num_heads=3"], "--model.decoder.num_heads 3"),
     (["--model.protocol=nope"], "--model.protocol nope"),
     (["--data.root=/dev/null"], "/dev/null"),
@@ -171,6 +171,7 @@ def advised(error: str) -> list[str]:
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_the_advice_for_a_corpus_of_ones_own_works(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From the refusal to the animation, by nothing but what the commands print."""
     words = ["adapt", "--checkpoint", str(own), "--person", "C", "-o", "adapted to C.ckpt"]
@@ -186,6 +187,7 @@ def test_the_advice_for_a_corpus_of_ones_own_works(own: Path, capsys: pytest.Cap
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_the_advice_for_scoring_a_corpus_of_ones_own_works(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["test", f"--ckpt_path={own}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
     assert main(words) == 2

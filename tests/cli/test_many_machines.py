@@ -100,6 +100,7 @@ def sweep_words(**chosen: object) -> list[str]:
     return words
 
 
+@pytest.mark.slow
 def test_the_sweep_names_options_that_exist_and_a_score_that_is_logged(capsys: pytest.CaptureFixture[str]) -> None:
     sweep = yaml.safe_load(SWEEP.read_text())
     ends = []

@@ -31,7 +31,9 @@ CORPORA: dict[str, tuple[str, list[str], set[str]]] = {
 }
 
 
-@pytest.mark.parametrize("corpus", CORPORA)
+@pytest.mark.parametrize(
+    "corpus", [name if name == "biwi" else pytest.param(name, marks=pytest.mark.slow) for name in CORPORA]
+)
 def test_paper_configs_train_and_validate(
     corpus: str, hubert_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -233,6 +233,7 @@ def test_what_is_read_stays_under_every_later_name(tmp_path: Path) -> None:
     assert file.read_text() == "new"
 
 
+@pytest.mark.slow
 def test_a_style_is_not_written_over_the_motion_that_it_comes_from(
     checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

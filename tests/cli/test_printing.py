@@ -28,6 +28,7 @@ def test_commands_print_by_one_function(path: Path) -> None:
     assert [call.lineno for call in calls(path, "print") if all(word.arg != "file" for word in call.keywords)] == []
 
 
+@pytest.mark.slow
 def test_json_is_written_without_numbers_that_it_does_not_know() -> None:
     package = Path(facediff.__file__).parent
     writers = ("animation", "cli", "data", "editing", "evaluation", "export", "pipelines", "render")

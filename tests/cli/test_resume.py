@@ -66,6 +66,7 @@ def whole(fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "puppet" / "version_0"
 
 
+@pytest.mark.slow
 def test_a_run_stopped_by_a_signal_continues_in_its_folder(
     fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,12 +175,14 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_checkpoint(
     assert not [path for path in run.rglob("*") if "partial" in path.name]
 
 
+@pytest.mark.slow
 def test_an_unwritable_place_is_one_sentence(fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert fit(f"--trainer.logger.save_dir={tmp_path / 'file'}") == 2
     assert str(tmp_path / "file") in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_fast_dev_run_leaves_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert fit("--trainer.fast_dev_run=1", "--trainer.logger.save_dir=runs") == 0

@@ -13,6 +13,7 @@ spaces = pytest.mark.parametrize("space", ["folded", "vertices"])
 
 
 @spaces
+@pytest.mark.slow
 def test_it_is_chosen_at_test_time(
     checkpoint: Path, tmp_path: Path, space: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -170,6 +170,7 @@ def test_all_vertices_are_used_where_no_stable_ones_are_given() -> None:
     np.testing.assert_allclose(laid.frames, 1000 * known.truth, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_chunks_do_not_show_and_memory_stays_small(tmp_path: Path) -> None:
     """Frames and result lie on disk; what is in memory does not grow with the number of frames."""
     seen = np.tile(person(frames=120).seen, (5, 1, 1))

@@ -150,6 +150,7 @@ def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> N
     assert pauses > 20
 
 
+@pytest.mark.slow
 def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tiny: Tiny) -> None:
     """On test clips: features 0.12 s before the end of what has been heard are those of the whole recording."""
     speech = [tiny.dataset("test_a")[index].audio.numpy() for index in range(4)]
@@ -175,6 +176,7 @@ def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tin
     assert error() < 0.85 * before
 
 
+@pytest.mark.slow
 def test_a_student_of_another_size_learns_from_its_teacher(model: AnimationModel, tiny: Tiny) -> None:
     small = {"class_path": "facediff.registry.audio_encoder.mel", "init_args": {"hidden_dim": 8, "num_layers": 2}}
     model.adopt(tiny.assets())

@@ -76,6 +76,7 @@ def test_a_checkpoint_is_plain_data_and_animates_without_the_corpus(trained: Pat
     assert model.animate(torch.randn(8000), identity="B").vertices.shape == (12, 24, 3)
 
 
+@pytest.mark.slow
 def test_a_reloaded_model_trains_again_saves_and_loads(
     trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
 ) -> None:
@@ -343,6 +344,7 @@ def test_an_interruption_leaves_the_best_checkpoint_alone(
     assert seen == [(tmp_path / "best.ckpt").read_bytes()]
 
 
+@pytest.mark.slow
 def test_scores_do_not_depend_on_the_batch_size(trained: Path, tiny_root: Path, make_trainer: MakeTrainer) -> None:
     model = load_model(trained)
     scores = [

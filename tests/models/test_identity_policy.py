@@ -47,6 +47,7 @@ def test_each_seen_identity_lends_itself_and_its_style(tiny: Tiny) -> None:
 
 
 @pytest.mark.parametrize(("method", "logged"), [("model", "test_b/lve"), ("shuffled", "test_b/shuffled/lve")])
+@pytest.mark.slow
 def test_the_mean_over_identities_is_reported(
     method: str, logged: str, make_model: Make, tiny: Tiny, make_trainer: Callable[..., Trainer]
 ) -> None:

@@ -122,6 +122,7 @@ def test_losses_of_a_batch_are_those_of_its_clips(model: DualPathDiffusion, tiny
     torch.testing.assert_close(whole["face"], sum(single["face"] for single in singles) / 3, rtol=1e-4, atol=0)
 
 
+@pytest.mark.slow
 def test_mixed_precision_learns_as_full_precision_does(
     make_model: Make, tiny: Tiny, make_trainer: Callable[..., pl.Trainer]
 ) -> None:

@@ -94,6 +94,7 @@ def model(
     return made.eval()
 
 
+@pytest.mark.slow
 def test_frames_that_are_given_out_do_not_change(model: DualPathDiffusion) -> None:
     """Each window sees the motion that was given out, and goes on from it."""
     model.choose_low_latency()

@@ -67,6 +67,7 @@ def test_every_registered_metric_is_in_the_table_and_the_files(
     assert [row["sample_diversity:n_samples=2"] == "" for row in rows] == [row["method"] != "model" for row in rows]
 
 
+@pytest.mark.slow
 def test_samples_and_conditions_are_generated_as_documented(
     make_model: Make, rich: Tiny, make_trainer: Callable[..., Trainer]
 ) -> None:

@@ -154,6 +154,7 @@ def test_a_published_model_is_published_again_alike(published: Path, tmp_path: P
     assert (again / "assets.npz").read_bytes() == (published / "assets.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_lightning_loads_a_folder_too(checkpoint: Path, published: Path) -> None:
     one, two = (DualPathDiffusion.load_from_checkpoint(path).state_dict() for path in (checkpoint, published))
     assert all(torch.equal(one[name], two[name]) for name in one)

@@ -288,6 +288,7 @@ def test_a_list_and_a_folder_give_what_each_recording_gives_alone(
         model.animate([])
 
 
+@pytest.mark.slow
 def test_progress_is_reported_to_a_function(model: facediff.Animator) -> None:
     reports: list[tuple[int, int]] = []
     model.animate(TONE, 16000, steps=3, progress=lambda done, total: reports.append((done, total)))

@@ -24,6 +24,7 @@ def talking() -> npt.NDArray[np.float64]:
 
 @pytest.mark.parametrize("coloured", [True, False])
 @pytest.mark.parametrize("view", ["front", "three_quarter"])
+@pytest.mark.slow
 def test_light_per_vertex_looks_like_light_per_sample(
     coloured: bool, view: str, talking: npt.NDArray[np.float64]
 ) -> None:

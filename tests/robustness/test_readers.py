@@ -88,11 +88,12 @@ def decoding_functions() -> set[str]:
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_damaged_file_is_read_or_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
-    law = run(name, 10, 1, tmp_path)
+    law = run(name, 5, 1, tmp_path)
     assert law.broken == []
     assert sum(law.counts.values()) >= 3
 
 
+@pytest.mark.slow
 def test_every_function_that_decodes_files_is_reached_by_a_reader(tmp_path: Path) -> None:
     reached: set[str] = set()
 

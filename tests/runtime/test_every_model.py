@@ -166,6 +166,7 @@ def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:
 
 
 @pytest.mark.parametrize("case", ["style content", "Voca"])
+@pytest.mark.slow
 def test_low_latency_is_that_of_the_model(case: str, tiny_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = ready(case, tiny_root, {})
     runtime = in_eager(model)

@@ -67,6 +67,7 @@ def changes(pictures: np.ndarray) -> np.ndarray:
     return np.array([moved[:half].max(), moved[half:].max()])
 
 
+@pytest.mark.slow
 def test_each_side_shows_what_the_key_says_and_the_sound_is_the_clips(place: Path) -> None:
     options = ["--size", "64", "--quiet", "--workers", "1", "--video", "webm", "--style-references", "truth"]
     options += ["--still-controls", "1", "--same-controls", "0", "--languages", "en", "--clips", "A_one"]
@@ -126,6 +127,7 @@ def test_the_same_seed_gives_the_same_study_and_what_is_there_is_kept(
     assert read_study(place / "study").id != study.id
 
 
+@pytest.mark.slow
 def test_a_corpus_gives_bare_arrays_their_mesh_faces_rate_and_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,6 +243,7 @@ def test_a_full_disk_leaves_no_study_and_the_next_run_continues(
     assert "3 up to date" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_killed_and_started_again_it_is_the_same_study(place: Path) -> None:
     options = StudyOptions(clips=["A_one"], still=1, same=0, repeats=0, size=32, languages=["en"])
     whole = plan_study({name: place / name for name in ("ours", "theirs")}, options, truth=place / "truth").study

@@ -106,6 +106,7 @@ def test_served_from_the_first_click_to_the_report(made: Path, serve: Serve, bro
     assert len(report.raters) == 1
 
 
+@pytest.mark.slow
 def test_from_a_folder_without_a_network_in_a_narrow_window(made: Path, browser: Chromium) -> None:
     study = read_study(made)
     url = (made / PAGE_FOLDER / "index.html").as_uri()
@@ -133,6 +134,7 @@ def test_from_a_folder_without_a_network_in_a_narrow_window(made: Path, browser:
     page.close()
 
 
+@pytest.mark.slow
 def test_answers_wait_while_the_server_is_away(made: Path, serve: Serve, browser: Chromium) -> None:
     page = opened(browser, f"{serve(made)}/")
     begin(page)
@@ -147,6 +149,7 @@ def test_answers_wait_while_the_server_is_away(made: Path, serve: Serve, browser
     page.close()
 
 
+@pytest.mark.slow
 def test_two_raters_at_once_have_numbers_and_answers_of_their_own(made: Path, serve: Serve, program: Path) -> None:
     address, study = serve(made), read_study(made)
     with Chromium(program) as one, Chromium(program) as other:  # two profiles: two people

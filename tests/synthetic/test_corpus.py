@@ -127,6 +127,7 @@ def test_same_seed_same_bytes_and_other_seed_other_motion(corpus: Path, tmp_path
     assert first["vertices_npy/F1_e01.npy"] == digests(corpus)["vertices_npy/F1_e01.npy"]
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_bytes(corpus: Path, tmp_path: Path) -> None:
     generate(tmp_path / "two", only=["F1_e01", "M3_e01"], workers=2, progress=False)
     assert digests(tmp_path / "two")["vertices_npy/M3_e01.npy"] == digests(corpus)["vertices_npy/M3_e01.npy"]

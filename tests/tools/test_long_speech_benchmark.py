@@ -32,6 +32,7 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 def test_every_minute_and_both_ways_of_joining_are_told(
     tool: ModuleType,
     make_model: Callable[..., DualPathDiffusion],

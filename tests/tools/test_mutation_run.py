@@ -161,6 +161,7 @@ def test_what_hangs_is_ended() -> None:
     assert mutation_run.forked(lambda: 3, 60) == 3
 
 
+@pytest.mark.slow
 def test_tested_lines_kill_and_untested_ones_survive(tmp_path: Path) -> None:
     """The whole run on a package in miniature; a second call has nothing left to do."""
     project = tmp_path / "project"

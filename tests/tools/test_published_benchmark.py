@@ -13,6 +13,7 @@ from tests.fakes.processes import run
 SCRIPT = Path(__file__).parents[2] / "tools" / "benchmarks" / "published_methods.py"
 
 
+@pytest.mark.slow
 def test_every_method_is_timed_at_both_sizes_and_the_table_is_markdown() -> None:
     done = run(SCRIPT, "--toy", "--seconds", "0.5", "--steps", "2")
     assert done.returncode == 0, done.stderr

@@ -42,6 +42,7 @@ def motions(model: DualPathDiffusion, data: Tiny, split: str) -> list[tuple[NDAr
     return found
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_numpy(checkpoint: Path, tiny: Tiny, capsys: pytest.CaptureFixture[str]) -> None:
     numbers = checkpoint.with_suffix(".json")
     samplers = [("ddpm", 4), ("ddim", 2)]

@@ -180,7 +180,9 @@ def test_the_manifest_describes_every_file(entry: Path) -> None:
     assert [path.name for path in entry.parent.iterdir()] == ["target"]
 
 
-@pytest.mark.parametrize("form", ["obj", "ply", "flat", "double"])
+@pytest.mark.parametrize(
+    "form", ["obj", *(pytest.param(form, marks=pytest.mark.slow) for form in ("ply", "flat", "double"))]
+)
 def test_every_form_of_motion_gives_the_same(
     files: Path, tmp_path: Path, known: Person, entry: Path, form: str
 ) -> None:

@@ -314,7 +314,7 @@ def slow(work, out):
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_stopped_run_is_resumed_to_equal_bytes(tmp_path: Path, how: signal.Signals) -> None:
     raw, out = write_raw_biwi(tmp_path / "raw", sentences=[f"e{i:02d}" for i in range(1, 12)]), tmp_path / "out"
     (tmp_path / "program.py").write_text(PROGRAM)

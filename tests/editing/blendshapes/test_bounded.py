@@ -91,6 +91,7 @@ def test_keys_are_few_and_within_the_tolerance(tolerance: float) -> None:
     assert values == [0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_built_in_shapes_are_of_the_nearest_speaker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     neutral, _, shapes = puppet_shapes("F2")
     found = read_shapes(Path("puppet"), neutral + [0.02, 0, 0])

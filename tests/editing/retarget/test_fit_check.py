@@ -111,6 +111,7 @@ def test_wrecks_are_named(animation: Animation) -> None:
     assert check_fit(still, carry(still, found, whole), found).good
 
 
+@pytest.mark.slow
 def test_the_command_refuses_and_accepts(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -148,6 +148,7 @@ def test_a_whole_avatar_talks(
     assert moved["Tongue"] == pytest.approx(np.tile(lower[0], (len(moved["Tongue"]), 1)), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_swaying_head_takes_its_parts_along_and_leaves_the_body(animation: Animation) -> None:
     """Eyes and hair stand still on a head that stands still, and not in a head that turns."""
     face = (np.float64(animation.template), animation.triangles.astype(np.int64))

@@ -143,6 +143,7 @@ def test_a_permuted_copy_is_found_vertex_by_vertex(rig: Rig, faces: np.ndarray, 
     assert error(carry_displacements(found, motion), truth) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_coarser_copy_with_vertices_of_its_own(rig: Rig, faces: np.ndarray) -> None:
     """Decimation moves vertices, so the truth is a motion given as a function of place, sampled on both meshes."""
 
@@ -163,6 +164,7 @@ def test_a_coarser_copy_with_vertices_of_its_own(rig: Rig, faces: np.ndarray) ->
     assert error(carry_displacements(found, field(source)), field(coarse)) < LIMIT
 
 
+@pytest.mark.slow
 def test_another_speakers_face_moves_its_own_lips(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
     """Without knowing that the topology is the same, each vertex moves about as its own counterpart does."""
     other = build_rig(Shape(width=0.5, lips=0.7, nose_width=0.6, jaw=0.5, mouth_width=0.5, cheeks=0.5)).neutral
@@ -172,6 +174,7 @@ def test_another_speakers_face_moves_its_own_lips(rig: Rig, faces: np.ndarray, m
     assert error(carry_displacements(found, motion), truth) < 0.1
 
 
+@pytest.mark.slow
 def test_another_axis_up(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
     vertices, triangles, truth = reordered(rig.neutral, faces, motion)
@@ -179,6 +182,7 @@ def test_another_axis_up(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> Non
     assert error(carry_displacements(found, motion), 100 * truth @ turn.T) < 1e-5
 
 
+@pytest.mark.slow
 def test_what_lies_far_away_stands_still(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
     """A hat a metre above the head, and triangles the other way round."""
     hat = rig.neutral[:50] * 0.2 + [0, 1.0, 0]

@@ -76,7 +76,9 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize(
+    "name", [name if name == "lips" else pytest.param(name, marks=pytest.mark.slow) for name in TEXTS]
+)
 def test_every_figure_in_every_format(name: str, own_material: FigureData, tmp_path: Path) -> None:
     material = replace(own_material, remark="tiny: synthetic corpus")
     files = [tmp_path / "new" / f"figure.{suffix}" for suffix in ("png", "pdf", "svg")]

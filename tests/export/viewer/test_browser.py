@@ -162,6 +162,7 @@ def test_keys_buttons_and_the_curve_move_through_time(show: Show) -> None:
     assert page.evaluate("document.getElementById('frame').textContent") == f"frame {standing} / {FRAMES - 1}"
 
 
+@pytest.mark.slow
 def test_it_loops_at_another_speed_and_without_sound(show: Show) -> None:
     page = show([clicks(speech=False)])
     assert page.evaluate("document.getElementById('mute').hidden")
@@ -180,6 +181,7 @@ def test_it_loops_at_another_speed_and_without_sound(show: Show) -> None:
     assert frame_after(page, "null") == FRAMES - 1
 
 
+@pytest.mark.slow
 def test_faces_turn_together_and_come_back(show: Show) -> None:
     page = show([clicks(), clicks(name="other", lower=10)], width=700, height=500)
     pictures = {}
@@ -199,6 +201,7 @@ def test_faces_turn_together_and_come_back(show: Show) -> None:
             assert pictures[name][side] != pictures["before"][side]
 
 
+@pytest.mark.slow
 def test_the_heat_map_is_the_distance_from_the_truth(show: Show) -> None:
     truth, other = clicks(name="truth"), clicks(name="guess", lower=4)
     page = show([truth, other], truth=0)

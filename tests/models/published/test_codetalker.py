@@ -64,6 +64,7 @@ def test_it_animates_as_published(dataset: str, steps: int, loop: str, tmp_path:
         torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_frame_less_where_floating_point_says_so(tmp_path: Path) -> None:
     one, two = codetalker.stage_one("vocaset"), codetalker.stage_two("vocaset")
     model = imported(write(tmp_path, two=two, one=one), "vocaset")
@@ -339,6 +340,7 @@ def test_sizes_that_do_not_go_together_are_named(options: dict[str, Any], named:
         make_method("CodeTalker", **options)
 
 
+@pytest.mark.slow
 def test_a_tiny_one_learns_one_clip_by_heart(make_method: MakeMethod, tiny: Tiny) -> None:
     """Both stages, one after the other; the predictor then generates the clip, and not from its true frames."""
     sample = tiny_clip(tiny)

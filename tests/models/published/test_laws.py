@@ -97,6 +97,7 @@ def test_animation_has_the_methods_own_frames_and_face_and_condition_are_indepen
         model.animate(speech, identity="A", condition=UNSEEN)
 
 
+@pytest.mark.two_methods
 def test_a_stream_gives_every_frame(method: str, make_method: MakeMethod) -> None:
     model = with_assets(make_method(method))
     stream = model.stream(identity="A")
@@ -116,6 +117,7 @@ def test_mixed_precision_gives_numbers(method: str, make_method: MakeMethod) -> 
     assert motion.isfinite().all()
 
 
+@pytest.mark.two_methods
 def test_training_lowers_the_loss_of_one_clip(method: str, make_method: MakeMethod) -> None:
     # The prior that CodeTalker's predictor has here knows no motion, but codes of it can be found.
     more = {"feature_weight": 100.0} if method == "CodeTalker" else {}
@@ -131,6 +133,7 @@ def test_training_lowers_the_loss_of_one_clip(method: str, make_method: MakeMeth
     assert model.losses(batch, torch.Generator().manual_seed(0))["loss"].item() < 0.5 * first
 
 
+@pytest.mark.two_methods
 def test_a_trained_model_is_tested_saved_and_loaded(
     method: str, make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
 ) -> None:

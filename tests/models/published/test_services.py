@@ -83,6 +83,7 @@ def test_two_processes_train_one_model(methods: list[str], tiny_root: Path, prio
         assert made["after"] != made["before"], method
 
 
+@pytest.mark.two_methods
 def test_kept_speech_features_change_no_loss(
     method: str, make_method: MakeMethod, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -113,6 +114,7 @@ def test_speech_features_of_an_encoder_without_a_frozen_part_are_not_kept(
 
 
 @pytest.mark.two_methods
+@pytest.mark.slow
 def test_training_in_16_bits_previews_and_every_policy_of_unseen_speakers(
     method: str, make_method: MakeMethod, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
