@@ -27,11 +27,16 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
     if kind is not None and kind not in KINDS:
         raise FaceDiffError(f'there is no kind "{kind}": {choices(kind, KINDS)}')
     chosen = [entry_kind for entry_kind in KINDS.values() if kind in (None, entry_kind.kind)]
+    bundled = bundled_models() if kind in (None, "model") else []
     if json:
         rows = [
             {"kind": entry_kind.kind, "name": entry.name, "summary": entry.summary, "class": entry.owner}
             for entry_kind in chosen
             for entry in entry_kind
+        ]
+        rows += [
+            {"kind": "bundled_model", "name": name, "summary": summary, "class": owner}
+            for name, summary, owner in bundled
         ]
         tell(*json_format.dumps(rows, indent=2, allow_nan=False).split("\n"))
         return
@@ -43,6 +48,23 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
             if kind is not None:
                 for line in options_of(entry):
                     tell(f"      {line}")
+    if bundled:
+        tell("bundled_model: trained models that come with facediff and animate without --checkpoint")
+        tell(*(f"  {name:<{width}}{summary}" for name, summary, _ in bundled))
+
+
+def bundled_models() -> list[tuple[str, str, str]]:
+    """Name, summary and class of each trained model in the package."""
+    from facediff.runtime.folder import DESCRIPTION
+    from facediff.utils.hub import BUNDLED, is_exported
+    from facediff.utils.plain_files import load_json
+
+    if not is_exported(BUNDLED):
+        return []
+    about = load_json(BUNDLED / DESCRIPTION)
+    kind = "synthetic speech and faces" if about["synthetic"] else "recordings of people"
+    summary = f"{about['model']} of the corpus {about['corpus']}: {kind}, {len(about['faces'])} faces"
+    return [(BUNDLED.name, summary, about["model"])]
 
 
 def options_of(entry: Entry) -> list[str]:

@@ -8,12 +8,14 @@ from typing import Annotated, Literal
 from facediff.cli.options import File, OutputFolder
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
+from facediff.runtime.folder import copy_exported
 from facediff.utils import ranges
+from facediff.utils.hub import model_or_bundled
 from facediff.utils.option import Option
 
 
 def export_model(
-    model: Annotated[Path, Option(metavar="MODEL", reads=True)],
+    model: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
     *,
     output: OutputFolder,
     weights: Literal["float32", "float16", "int8"] = "float32",
@@ -33,7 +35,7 @@ def export_model(
       facediff animate speech.wav --checkpoint puppet-onnx -o speech.glb
 
     Args:
-        model: checkpoint (.ckpt)
+        model: checkpoint (.ckpt); without one, the model that comes with facediff is written as it is
         output: folder to write
         weights: how they are stored: float32, float16, or int8 (the audio encoder's in 8 bits, the others in 16)
         sampler: sampler of the exported model; the checkpoint's own by default
@@ -44,6 +46,17 @@ def export_model(
     """
     if output.exists():
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
+    if model is None:
+        changed = {"sampler": sampler, "steps": steps, "quick-steps": quick_steps, "speech": speech}
+        changed |= {"identities": identities, "weights": None if weights == "float32" else weights}
+        for name, value in changed.items():
+            if value is not None:
+                raise FaceDiffError(
+                    f"--{name}: the model that comes with facediff is exported already; name a checkpoint"
+                )
+        copied = copy_exported(model_or_bundled(None), output)
+        tell(f"wrote {output}: {copied / 1e6:.1f} MB")
+        return
     from facediff.pipelines.export_model import export_model as export
     from facediff.pipelines.export_model import require_onnx
 

@@ -21,6 +21,7 @@ def serve(
     port: Annotated[ranges.Port, Option(metavar="N")] = 8010,
     open: bool = False,  # noqa: A002 - the option's name
     runtime: Annotated[Path | None, Option(metavar="PACKAGE", reads=True)] = None,
+    recordings: Annotated[list[Path] | None, Option(metavar="FILE", many=True, reads=True)] = None,
 ) -> None:
     """Serve a page that animates recordings and the microphone in the browser, until Ctrl-C.
 
@@ -38,6 +39,7 @@ def serve(
         port: to listen at; 0 for any free one
         open: open the page in the browser
         runtime: npm's package onnxruntime-web (.tgz) or a folder with its files, for machines without network
+        recordings: that the page offers to try the model with
     """
     if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
@@ -49,7 +51,7 @@ def serve(
 
     model = model_or_bundled(model)
     read_folder(model)  # before anything is fetched
-    site = make_site(model, web_runtime(runtime, say=tell))
+    site = make_site(model, web_runtime(runtime, say=tell), recordings or ())
     if output is not None:
         size = write_site(site, output)
         tell(f"wrote {output}: {size / 1e6:.1f} MB; offer it by any web server, e.g. python -m http.server -d {output}")

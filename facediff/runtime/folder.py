@@ -7,6 +7,7 @@ where its loop starts from more than noise, ``style.onnx`` of one that takes sty
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
@@ -20,6 +21,7 @@ from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.speech.windows import WindowPlan
 from facediff.utils.arrays import read_arrays
+from facediff.utils.files import atomic_folder
 from facediff.utils.plain_files import load_json
 
 FORMAT = "facediff model"
@@ -302,3 +304,19 @@ def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
             indices = arrays[name]
             if indices.size and not 0 <= int(indices.min()) <= int(indices.max()) < vertices:
                 raise FaceDiffError(f"{path}: {name} names vertices that do not exist; export the model again")
+
+
+def copy_exported(source: Path, folder: Path) -> int:
+    """Copy a folder of ``facediff export-model``, whole or not at all.
+
+    Returns:
+        the bytes of its files.
+
+    Raises:
+        FaceDiffError: if the source is damaged or the folder cannot be written.
+    """
+    description, _ = read_folder(source)
+    with atomic_folder(folder) as staged:
+        for name in (DESCRIPTION, *description.sizes):
+            shutil.copyfile(source / name, staged / name)
+        return sum(path.stat().st_size for path in staged.iterdir())

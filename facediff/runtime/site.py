@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import html
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -23,6 +23,7 @@ from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.export.viewer.page import assemble, script_of
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
 from facediff.runtime.onnxruntime_web import LICENCE
+from facediff.speech.inputs import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
 from facediff.speech.windows import LOW_LATENCY
 from facediff.utils.files import atomic_folder
@@ -76,19 +77,28 @@ Site = Mapping[str, bytes | Path]
 """The files of a site by their paths in it: what is made, and where the others lie."""
 
 
-def make_site(folder: Path, runtime: Mapping[str, Path]) -> Site:
+def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Path] = ()) -> Site:
     """The site of an exported model.
 
     Args:
         folder: of ``facediff export-model``.
         runtime: ONNX Runtime's files, as :func:`facediff.runtime.onnxruntime_web.web_runtime` gives them.
+        recordings: that a visitor can try the model with, listed by their names.
 
     Raises:
-        FaceDiffError: if the folder holds no model, or one without triangles.
+        FaceDiffError: if the folder holds no model, or one without triangles; if a recording cannot be read, or two
+            have one name.
     """
     description, arrays = read_folder(folder)
+    examples: dict[str, bytes | Path] = {}
+    for path in recordings:
+        read_recording(path)
+        if f"recordings/{path.name}" in examples:
+            raise FaceDiffError(f"--recordings {path}: two have this name; rename one")
+        examples[f"recordings/{path.name}"] = path
     files: dict[str, bytes | Path] = {
-        PAGE: page(folder.resolve().name, description, arrays).encode(),
+        **examples,
+        PAGE: page(folder.resolve().name, description, arrays, [path.name for path in recordings]).encode(),
         "worker.js": script_of(WORKER).encode(),
         "capture.js": script_of(("capture",)).encode(),
         "_headers": headers_file().encode(),
@@ -101,8 +111,8 @@ def make_site(folder: Path, runtime: Mapping[str, Path]) -> Site:
     return files
 
 
-def page(title: str, description: Description, arrays: Arrays) -> str:
-    """The page of a model.
+def page(title: str, description: Description, arrays: Arrays, recordings: Sequence[str] = ()) -> str:
+    """The page of a model, with the names of recordings to try.
 
     Raises:
         FaceDiffError: if the model has no triangles.
@@ -125,6 +135,7 @@ def page(title: str, description: Description, arrays: Arrays) -> str:
         "millimetres": millimetres(face),
         "inward": not np.array_equal(outward(face), face.triangles),
         "delays": DELAYS,
+        "recordings": recordings,
         "rests": description.voice_gate != OFF,
         "gates": {"usual": gate_facts(USUAL_GATE), "quick": gate_facts(QUICK_GATE)},
     }

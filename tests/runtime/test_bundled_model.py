@@ -53,6 +53,24 @@ def test_the_lively_style_moves_more_than_the_calm_one(capsys: pytest.CaptureFix
         assert moves[1] > 1.1 * moves[0]
 
 
+def test_it_is_written_as_a_folder_and_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "face"
+    assert main(["export-model", "-o", str(folder), "--steps", "4"]) == 2
+    assert "--steps" in capsys.readouterr().err
+    assert not folder.exists()
+    assert main(["export-model", "-o", str(folder)]) == 0
+    for path in folder.iterdir():
+        assert path.read_bytes() == (hub.BUNDLED / path.name).read_bytes()
+    wanted = facediff.load(hub.BUNDLED).animate(SPEECH, identity="F1", seed=1).vertices
+    np.testing.assert_array_equal(facediff.load(folder).animate(SPEECH, identity="F1", seed=1).vertices, wanted)
+    capsys.readouterr()
+    assert main(["components", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in rows if row["kind"] == "bundled_model"] == ["puppet"]
+    assert main(["components", "model"]) == 0
+    assert "bundled_model:" in capsys.readouterr().out
+
+
 def test_without_it_a_checkpoint_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

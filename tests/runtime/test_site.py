@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
+from urllib.parse import quote
 
 import numpy as np
 import pytest
+import soundfile
 
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
@@ -89,6 +92,26 @@ def test_folder_holds_the_site(site: Site, tmp_path: Path) -> None:
     assert size == sum(path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file())
     with pytest.raises(FaceDiffError, match="out"):
         write_site(site, tmp_path / "out")
+
+
+def test_recordings_are_offered_by_their_names(runtime: dict[str, Path], serve: Serve, tmp_path: Path) -> None:
+    face, examples = write_exported(tmp_path / "face"), [tmp_path / "good morning.wav", tmp_path / "ü.wav"]
+    for path in examples:
+        soundfile.write(path, np.sin(np.arange(8000) / 9) / 2, 16_000)
+    site = make_site(face, runtime, examples)
+    address = serve(site)
+    [facts] = re.findall(r'id="facts">(.*?)</script>', ask(address)[2].decode())
+    assert json.loads(facts)["recordings"] == ["good morning.wav", "ü.wav"]
+    for path in examples:
+        assert ask(f"{address}/recordings/{quote(path.name)}")[2] == path.read_bytes()
+    (tmp_path / "other").mkdir()
+    twin = tmp_path / "other" / "ü.wav"
+    twin.write_bytes(examples[1].read_bytes())
+    with pytest.raises(FaceDiffError, match=r"other/ü\.wav"):
+        make_site(face, runtime, [*examples, twin])
+    twin.write_bytes(b"no sound")
+    with pytest.raises(FaceDiffError, match=r"other/ü\.wav"):
+        make_site(face, runtime, [twin])
 
 
 def test_folder_that_is_interrupted_leaves_nothing(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

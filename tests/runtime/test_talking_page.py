@@ -43,7 +43,8 @@ def web_files(web_runtime_package: Path) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def site(folder: Path, web_files: dict[str, Path]) -> dict[str, bytes | Path]:
     """The site of the tiny model; what a test changes in it is seen by the pages that are open."""
-    return dict(make_site(folder, web_files))
+    recording = record(folder.parent / "an example.wav", 1.2)
+    return dict(make_site(folder, web_files, [recording]))
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +136,17 @@ def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> No
     assert page.evaluate("facediff.page.animated.names.identity") == "B"
     page.evaluate("(document.getElementById('again').click(), document.getElementById('cancel').click())")
     page.wait_for("!facediff.page.job && !facediff.page.animated")
+
+
+def test_an_example_of_the_site_is_animated_as_a_chosen_file(page: Page) -> None:
+    assert page.evaluate("[...document.getElementById('example').options].map((option) => option.text)") == [
+        "an example",  # the list's title
+        "an example",
+    ]
+    page.evaluate("document.getElementById('example').selectedIndex = 1")
+    page.evaluate("document.getElementById('example').dispatchEvent(new Event('change'))")
+    page.wait_for("facediff.finished || facediff.errors.length")
+    assert page.evaluate("[facediff.page.animated.name, facediff.page.animated.frames]") == ["an example", 30]
 
 
 @pytest.mark.parametrize("rate", [44_100, 48_000, 8000])

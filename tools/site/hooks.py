@@ -7,12 +7,15 @@
 - A notebook becomes a page with its text and code, and is offered as it is.
 - The API reference has a page per module that mkdocs.yml lists, made from docstrings of the names that it exports.
 - Search works in pages that were opened as files, where browsers start no web workers: `iframe_worker.js`.
+- The bundled model talks on a page of its own, as `facediff serve -o` writes it; the home page links to it. Where ONNX
+  Runtime for browsers cannot be fetched, the site has neither.
 - What a strict build of MkDocs does not notice fails it too: `checks.py`.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import posixpath
 import re
 import sys
@@ -38,6 +41,9 @@ LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#|/)([^)\s#]+)(#[^)\s]*)?(?=\))")
 
 ELSEWHERE = "project"
 """Folder of the site with the files of the repository that are not in docs/."""
+
+TALKING = "talk"
+"""Folder of the site with the page on which the bundled model talks."""
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -66,6 +72,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     files.append(File.generated(config, "api/README.md", content=api_index(config.extra["api"])))
     files.append(File.generated(config, "assets/iframe-worker.js", abs_src_path=str(HERE / "iframe_worker.js")))
     files.append(File.generated(config, "assets/site.css", abs_src_path=str(HERE / "site.css")))
+    for name, content in talking_site().items():
+        source = {"content": content} if isinstance(content, bytes) else {"abs_src_path": str(content)}
+        files.append(File.generated(config, name, inclusion=InclusionLevel.NOT_IN_NAV, **source))
     waiting = [file for file in files.documentation_pages() if file.abs_src_path]
     while waiting:
         file = waiting.pop()
@@ -84,6 +93,10 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:  # noqa: ANN40
     """Links to files of the repository become links to where the site has them."""
     if not page.file.abs_src_path:
         return markdown
+    if page.file.src_uri == "README.md" and talking_site():
+        markdown = markdown.replace(
+            "\n", f"\n\n[Try it]({TALKING}/index.html): a face that says what you say, in this browser.\n", 1
+        )
     folder = Path(page.file.abs_src_path).relative_to(ROOT).parent.as_posix()
     here = posixpath.dirname(page.file.src_uri)
 
@@ -109,6 +122,28 @@ def on_post_build(config: MkDocsConfig) -> None:
     """Links in raw HTML, and whatever a page would fetch from elsewhere, are reported."""
     for problem in checks.broken(Path(config.site_dir)):
         log.warning("%s", problem)
+
+
+@cache
+def talking_site() -> dict[str, bytes | Path]:
+    """The files of the page on which the bundled model talks, by their paths in the site."""
+    from facediff.errors import FaceDiffError
+    from facediff.runtime.onnxruntime_web import web_runtime
+    from facediff.runtime.site import make_site
+    from facediff.utils.hub import BUNDLED
+
+    given = os.environ.get("FACEDIFF_WEB_RUNTIME")
+    try:
+        runtime = web_runtime(Path(given) if given else None, say=log.info)
+    except FaceDiffError as error:
+        log.info("no talking page: %s", error)
+        return {}
+    made = dict(make_site(BUNDLED, runtime, sorted((ROOT / "docs" / "examples").glob("*.wav"))))
+    headers = made.pop("_headers")
+    assert isinstance(headers, bytes)
+    files: dict[str, bytes | Path] = {f"{TALKING}/{name}": content for name, content in made.items()}
+    # Hosts of static files read this one at the root of a site only.
+    return {**files, "_headers": headers.replace(b"/*", f"/{TALKING}/*".encode(), 1)}
 
 
 def site_path(folder: str, link: str) -> str:

@@ -101,7 +101,7 @@ class TalkingPage {
     options("identity", about.faces);
     options("style", about.styles);
     for (const id of ["style", "seed", "expressivity"]) find(id).closest("label").hidden = !this.offers(id);
-    find("identity").value = about.identities.length && about.faces.includes(about.identities[0]) ? about.identities[0] : about.faces[0];
+    find("identity").value = about.identities.find((name) => about.faces.includes(name)) ?? about.faces[0];
     this.wear();
     const usual = about.windows;
     this.delays = this.facts.delays.map((each) => ({ ...usual, past: 0, ...each })).filter((each) => each.seconds < usual.seconds);
@@ -147,7 +147,7 @@ class TalkingPage {
   settle() {
     const busy = Boolean(this.job), hears = Boolean(this.listening), ready = Boolean(this.about);
     find("cancel").hidden = !busy;
-    find("open").disabled = !ready || busy || hears;
+    for (const id of ["open", "example"]) find(id).disabled = !ready || busy || hears;
     find("again").disabled = !ready || busy || hears || !this.recording;
     find("microphone").disabled = !ready || busy;
     find("microphone").setAttribute("aria-pressed", String(hears));
@@ -167,6 +167,13 @@ class TalkingPage {
     audio.src = URL.createObjectURL(file);
     this.recording = { name: file.name.replace(/\.[^.]*$/, ""), samples };
     await this.animate();
+  }
+
+  /** Animate a recording that lies next to the page. */
+  async openExample(name) {
+    const answer = await fetch(`recordings/${encodeURIComponent(name)}`);
+    if (!answer.ok) throw new Error(`recordings/${name}: the server answers ${answer.status}; write the site anew with facediff serve`);
+    await this.open(new File([await answer.blob()], name));
   }
 
   /** The samples of a recording, averaged to one channel, at the rate of the model. */
@@ -499,6 +506,13 @@ class TalkingPage {
       const [file] = find("file").files;
       find("file").value = "";
       if (file) this.open(file).catch(report);
+    });
+    find("example").append(...this.facts.recordings.map((name) => new Option(name.replace(/\.[^.]*$/, ""), name)));
+    find("examples").hidden = !this.facts.recordings.length;
+    find("example").addEventListener("change", () => {
+      const name = find("example").value;
+      find("example").value = "";
+      if (name) this.openExample(name).catch(report);
     });
     find("identity").addEventListener("change", () => {
       this.pause();
