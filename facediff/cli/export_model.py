@@ -47,7 +47,7 @@ def export_model(
     if output.exists():
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
     if model is None:
-        changed = {"sampler": sampler, "steps": steps, "quick-steps": quick_steps, "speech": speech}
+        changed: dict[str, object] = {"sampler": sampler, "steps": steps, "quick-steps": quick_steps, "speech": speech}
         changed |= {"identities": identities, "weights": None if weights == "float32" else weights}
         for name, value in changed.items():
             if value is not None:

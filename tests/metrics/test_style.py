@@ -215,3 +215,5 @@ def test_a_speaker_without_recordings_is_left_out() -> None:
         metric.update(torch.rand(1, 5, 4, 3), [0])
     with pytest.raises(ValueError, match="two speakers"):
         fm.SpeakerGallery(known.means[:2], (3, 3))
+    with pytest.raises(ValueError, match="finite"):
+        fm.SpeakerGallery(known.means.clone().index_fill_(0, torch.tensor(1), torch.nan), known.speakers)

@@ -99,10 +99,9 @@ def test_min_snr_draws_steps_in_proportion_to_their_weight() -> None:
     expected = torch.where(snr < 5, snr, torch.full_like(snr, 5.0))
     counts = torch.bincount(process.draw_steps(40_000, torch.device("cpu"), min_snr=5.0), minlength=10)
     torch.testing.assert_close(counts / 40_000, expected / expected.sum(), atol=0.01, rtol=0)
-    drawn = [
-        process.draw_steps(9, torch.device("cpu"), torch.Generator().manual_seed(3), min_snr=5.0) for _ in range(2)
-    ]
-    assert torch.equal(*drawn)
+    for how in ({"min_snr": 5.0}, {"weights": torch.arange(1.0, 11.0)}, {}):
+        drawn = [process.draw_steps(9, torch.device("cpu"), torch.Generator().manual_seed(3), **how) for _ in range(2)]
+        assert torch.equal(*drawn), how
 
 
 def test_steps_are_even_in_log_snr_where_noise_hides_part_of_the_motion() -> None:

@@ -170,6 +170,8 @@ def test_the_encoders_do_not_see_what_is_not_the_face(tmp_path: Path) -> None:
     batch = next(iter(data.val_dataloader()))
     same = model.distance_to(batch, other, motion, mask, None)
     assert float(same) == 0.0
+    model.assets.regions["face"] = torch.tensor([3, 5, 20])
+    assert model.lower_face().tolist() == [3, 5]
 
 
 def test_plain_distances_by_hand() -> None:
