@@ -140,9 +140,13 @@ def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list
         dataset = data.dataset(split)
         count = min(COMPARED, len(dataset))
         errors = []
-        for sample in (dataset[i * len(dataset) // count] for i in range(count)):
+        for i in range(count):
+            sample = dataset[i * len(dataset) // count]
             truth = sample.motion + sample.template
-            animations = [model.animate(sample.audio, 16_000, identity=sample.identity_name) for model in models]
+            # A seed for each clip: samples that share their noise err in the same direction.
+            animations = [
+                model.animate(sample.audio, 16_000, identity=sample.identity_name, seed=i) for model in models
+            ]
             motions = [
                 *(torch.from_numpy(animation.vertices) for animation in animations),
                 sample.template.expand_as(truth),
