@@ -34,11 +34,7 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
             for entry_kind in chosen
             for entry in entry_kind
         ]
-        rows += [
-            {"kind": "bundled_model", "name": name, "summary": summary, "class": owner}
-            for name, summary, owner in bundled
-        ]
-        tell(*json_format.dumps(rows, indent=2, allow_nan=False).split("\n"))
+        tell(*json_format.dumps(rows + bundled, indent=2, allow_nan=False).split("\n"))
         return
     width = max((len(entry.name) for entry_kind in chosen for entry in entry_kind), default=0) + 2
     for entry_kind in chosen:
@@ -50,21 +46,20 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
                     tell(f"      {line}")
     if bundled:
         tell("bundled_model: trained models that come with facediff and animate without --checkpoint")
-        tell(*(f"  {name:<{width}}{summary}" for name, summary, _ in bundled))
+        tell(*(f"  {row['name']:<{width}}{row['summary']}" for row in bundled))
 
 
-def bundled_models() -> list[tuple[str, str, str]]:
-    """Name, summary and class of each trained model in the package."""
-    from facediff.runtime.folder import DESCRIPTION
+def bundled_models() -> list[dict[str, str]]:
+    """The trained models in the package, as rows of the list."""
+    from facediff.runtime.folder import read_folder
     from facediff.utils.hub import BUNDLED, is_exported
-    from facediff.utils.plain_files import load_json
 
     if not is_exported(BUNDLED):
         return []
-    about = load_json(BUNDLED / DESCRIPTION)
-    kind = "synthetic speech and faces" if about["synthetic"] else "recordings of people"
-    summary = f"{about['model']} of the corpus {about['corpus']}: {kind}, {len(about['faces'])} faces"
-    return [(BUNDLED.name, summary, about["model"])]
+    about, _ = read_folder(BUNDLED)
+    kind = "synthetic speech and faces" if about.synthetic else "recordings of people"
+    summary = f"{about.model} of the corpus {about.corpus}: {kind}, {len(about.faces)} faces"
+    return [{"kind": "bundled_model", "name": BUNDLED.name, "summary": summary, "class": about.model}]
 
 
 def options_of(entry: Entry) -> list[str]:

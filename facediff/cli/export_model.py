@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 from facediff.cli.options import File, OutputFolder
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
-from facediff.runtime.folder import copy_exported
 from facediff.utils import ranges
 from facediff.utils.hub import model_or_bundled
 from facediff.utils.option import Option
@@ -54,6 +53,8 @@ def export_model(
                 raise FaceDiffError(
                     f"--{name}: the model that comes with facediff is exported already; name a checkpoint"
                 )
+        from facediff.runtime.folder import copy_exported
+
         copied = copy_exported(model_or_bundled(None), output)
         tell(f"wrote {output}: {copied / 1e6:.1f} MB")
         return

@@ -90,20 +90,20 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
             have one name.
     """
     description, arrays = read_folder(folder)
-    examples: dict[str, bytes | Path] = {}
+    examples: dict[str, Path] = {}
     for path in recordings:
         read_recording(path)
-        if f"recordings/{path.name}" in examples:
+        if path.name in examples:
             raise FaceDiffError(f"--recordings {path}: two have this name; rename one")
-        examples[f"recordings/{path.name}"] = path
+        examples[path.name] = path
     files: dict[str, bytes | Path] = {
-        **examples,
-        PAGE: page(folder.resolve().name, description, arrays, [path.name for path in recordings]).encode(),
+        PAGE: page(folder.resolve().name, description, arrays, list(examples)).encode(),
         "worker.js": script_of(WORKER).encode(),
         "capture.js": script_of(("capture",)).encode(),
         "_headers": headers_file().encode(),
         "onnxruntime/LICENCE.txt": LICENCE.encode(),
     }
+    files |= {f"recordings/{name}": path for name, path in examples.items()}
     files |= {f"onnxruntime/{name}": path for name, path in runtime.items()}
     # A page takes styles by their names: what encodes them from motion is left out.
     graphs = [graph for graph in description.graphs if graph != "style"]
@@ -150,9 +150,9 @@ def gate_facts(text: str) -> dict[str, float]:
     return {**{name: getattr(gate, name) for name in GATE_OPTIONS}, "ahead": gate.look_ahead}
 
 
-def headers_file() -> str:
-    """The headers in the form in which several hosts of static files take them from the site itself."""
-    lines = ["/*", *(f"  {name}: {value}" for name, value in {**SERVED, **HEADERS}.items())]
+def headers_file(pages: str = "/*") -> str:
+    """The headers of some pages in the form in which several hosts of static files take them from a site's root."""
+    lines = [pages, *(f"  {name}: {value}" for name, value in {**SERVED, **HEADERS}.items())]
     return "\n".join(lines) + "\n"
 
 

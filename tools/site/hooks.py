@@ -15,7 +15,6 @@
 from __future__ import annotations
 
 import json
-import os
 import posixpath
 import re
 import sys
@@ -129,21 +128,18 @@ def talking_site() -> dict[str, bytes | Path]:
     """The files of the page on which the bundled model talks, by their paths in the site."""
     from facediff.errors import FaceDiffError
     from facediff.runtime.onnxruntime_web import web_runtime
-    from facediff.runtime.site import make_site
+    from facediff.runtime.site import headers_file, make_site
     from facediff.utils.hub import BUNDLED
 
-    given = os.environ.get("FACEDIFF_WEB_RUNTIME")
     try:
-        runtime = web_runtime(Path(given) if given else None, say=log.info)
+        runtime = web_runtime(say=log.info)
     except FaceDiffError as error:
         log.info("no talking page: %s", error)
         return {}
-    made = dict(make_site(BUNDLED, runtime, sorted((ROOT / "docs" / "examples").glob("*.wav"))))
-    headers = made.pop("_headers")
-    assert isinstance(headers, bytes)
-    files: dict[str, bytes | Path] = {f"{TALKING}/{name}": content for name, content in made.items()}
-    # Hosts of static files read this one at the root of a site only.
-    return {**files, "_headers": headers.replace(b"/*", f"/{TALKING}/*".encode(), 1)}
+    site = make_site(BUNDLED, runtime, sorted((ROOT / "docs" / "examples").glob("*.wav")))
+    # Hosts of static files read headers at the root of a site only.
+    headers = {"_headers": headers_file(f"/{TALKING}/*").encode()}
+    return {f"{TALKING}/{name}": content for name, content in site.items() if name not in headers} | headers
 
 
 def site_path(folder: str, link: str) -> str:
