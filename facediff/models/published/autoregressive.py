@@ -126,8 +126,12 @@ class OffsetModel(AutoregressiveModel):
         super().__init__(**options)
         self.teacher_forcing = teacher_forcing
 
-    def squared_errors(self, batch: Batch) -> tuple[Float[Tensor, "batch frames coordinates"], Int[Tensor, " batch"]]:
-        """Squared errors of all coordinates of scaled motion, and the frames of each clip that are compared."""
+    def predicted_and_true(
+        self, batch: Batch
+    ) -> tuple[
+        Float[Tensor, "batch frames coordinates"], Float[Tensor, "batch frames coordinates"], Int[Tensor, " batch"]
+    ]:
+        """Scaled motion, as predicted in training and true, and the frames of each clip that are compared."""
         frames = self.trained_frames(batch)
         self.check_length(frames, batch.names[0])
         style, memory = self.conditions(batch, frames)
@@ -138,7 +142,7 @@ class OffsetModel(AutoregressiveModel):
             # The published training: every frame follows generated ones and gradients pass through the whole chain. It
             # is slow, but the network meets its own errors, as it will in inference.
             predicted = self.network.generate(style, memory, self.loop)
-        return (predicted - truth).square(), frames
+        return predicted, truth, frames
 
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None

@@ -28,6 +28,7 @@ from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_m
 from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
 from facediff.models.published.base import SpeakerTable, masked_mean
 from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
+from facediff.models.published.squared_errors import mean_squared_error
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
 
@@ -316,8 +317,8 @@ class CodeTalker(AutoregressiveModel):
             # The target of the features is the code itself, not the token that it replaced: what is decoded later are
             # codes.
             true_codes = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
-        error = masked_mean((self.motion_of(features, frames) - truth).square(), frames)
-        distance = masked_mean((features - true_codes).square(), frames)
+        error = mean_squared_error(self.motion_of(features, frames), truth, frames)
+        distance = mean_squared_error(features, true_codes, frames)
         return {"reconstruction": error, "features": distance, "loss": error + self.feature_weight * distance}
 
     def motion_of(self, features: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:

@@ -33,7 +33,7 @@ from facediff.models.published.autoregressive import (
     periodic_positions,
     read_period,
 )
-from facediff.models.published.base import LongSpeech, SpeakerTable, masked_mean, whole_model, zeros
+from facediff.models.published.base import LongSpeech, SpeakerTable, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
@@ -44,6 +44,7 @@ from facediff.models.published.diffusion import (
 )
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.published.squared_errors import squared_errors
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.frame_clock import FrameClock
 from facediff.utils.ranges import Range
@@ -221,14 +222,16 @@ class DiffSpeaker(DiffusionModel):
         predicted = self.network.motion_out(
             self.network(self.network.motion_in(noisy), step, self.conditions(batch, frames))
         )
-        error = (predicted - clean) * mask
-        change = error[:, 1:] - error[:, :-1]
         if self.loss_mean == "frames":
-            position, velocity = masked_mean(error.square(), frames), masked_mean(change.square(), frames - 1)
+            position, velocity = squared_errors(predicted, clean, frames)
+            entries, pairs = frames.sum(), (frames - 1).sum()
         else:
             # Published: the mean over all entries, padding included, in which errors are zero. A short clip next to a
             # long one counts less; loss_mean=frames removes that.
-            position, velocity = error.square().mean(), change.square().sum() / max(1, change.numel())
+            position, velocity = squared_errors(predicted * mask, clean, torch.full_like(frames, clean.shape[1]))
+            entries, pairs = torch.as_tensor(mask.numel()), torch.as_tensor(mask[:, 1:].numel())
+        position = position / (entries * clean.shape[2])
+        velocity = velocity / (pairs * clean.shape[2]).clamp_min(1)
         return {"reconstruction": position, "velocity": velocity, "loss": position + velocity}
 
     # Sampling.

@@ -23,8 +23,8 @@ from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.layers import Layers, Share, Width, all_states
-from facediff.models.published.base import SpeakerTable, masked_mean, whole_model, zeros
+from facediff.models.layers import Layers, Share, Width, all_states, frame_mask
+from facediff.models.published.base import SpeakerTable, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
@@ -170,8 +170,9 @@ class FaceDiffuser(DiffusionModel):
         audio = network.audio_map(self.hear(batch, frames))
         hidden = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
         # δ = 1 as published. Motion in raw units never has errors of that size, so that this is half the squared error.
-        error = F.huber_loss(network.motion_out(hidden) + rest, clean, reduction="none")
-        return masked_mean(error, frames)
+        mask = frame_mask(frames, longest)[..., None]
+        predicted = torch.where(mask, network.motion_out(hidden) + rest, clean)
+        return F.huber_loss(predicted, clean, reduction="sum") / (frames.sum() * clean.shape[2])
 
     def rest(self, template: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch 1 coordinates"]:
         """What is noised where the face does not move: the template, or nothing."""

@@ -21,8 +21,9 @@ from facediff.models.published.autoregressive import (
     decoder_sizes,
     read_period,
 )
-from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.base import SpeakerTable
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.published.squared_errors import mean_squared_error
 from facediff.models.speech_networks import Wav2Vec2Encoder
 
 
@@ -62,8 +63,7 @@ class FaceFormer(OffsetModel):
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The mean squared error of all coordinates."""
-        squares, frames = self.squared_errors(batch)
-        error = masked_mean(squares, frames)
+        error = mean_squared_error(*self.predicted_and_true(batch))
         return {"reconstruction": error, "loss": error}
 
 

@@ -35,6 +35,7 @@ from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
 from facediff.models.published.base import DirectModel, masked_mean
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, backbone_config, register
+from facediff.models.published.squared_errors import squared_errors
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
 
@@ -179,10 +180,10 @@ class SelfTalk(DirectModel):
         longest = int(frames.max())
         truth = (batch.motion * self.scale).flatten(2)[:, :longest]
         motion = self.network(self.hear(batch, frames), frames)
-        error = motion - truth
+        position, change = squared_errors(motion, truth, frames)
         terms = {
-            "reconstruction": masked_mean(error.square(), frames),
-            "velocity": masked_mean(error.diff(dim=1).square(), (frames - 1).clamp_min(0)),
+            "reconstruction": position / (frames.sum() * truth.shape[2]),
+            "velocity": change / ((frames - 1).clamp_min(0).sum() * truth.shape[2]).clamp_min(1),
         }
         loss = self.vertex_weight * terms["reconstruction"] + self.velocity_weight * terms["velocity"]
         if self.text is not None and self.reader is not None:

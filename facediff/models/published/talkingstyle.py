@@ -25,9 +25,10 @@ from facediff.models.published.autoregressive import (
     decoder_sizes,
     read_period,
 )
-from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.base import SpeakerTable
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
+from facediff.models.published.squared_errors import mean_squared_error
 from facediff.models.speech_networks import Wav2Vec2Encoder
 
 StyleAttention = Literal["one_key", "components"]
@@ -89,8 +90,10 @@ class TalkingStyle(OffsetModel):
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The mean squared error of all coordinates and that of the mouth."""
-        error, frames = self.squared_errors(batch)
-        whole, mouth = masked_mean(error, frames), masked_mean(error[..., self.mouth_columns()], frames)
+        predicted, truth, frames = self.predicted_and_true(batch)
+        columns = self.mouth_columns()
+        whole = mean_squared_error(predicted, truth, frames)
+        mouth = mean_squared_error(predicted[..., columns], truth[..., columns], frames)
         loss = (1.0 - self.mouth_weight) * whole + self.mouth_weight * mouth
         return {"reconstruction": whole, "mouth": mouth, "loss": loss}
 

@@ -24,8 +24,9 @@ from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
 from facediff.models.graphs import Spoken
 from facediff.models.layers import Width, exporting, frame_mask, sliding
-from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
+from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
+from facediff.models.published.squared_errors import squared_errors
 from facediff.speech.frame_clock import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
@@ -177,11 +178,11 @@ class Voca(DirectModel):
         frames = self.trained_frames(batch)
         coefficients = self.coefficients(self.hear(batch, frames), self.identity_weights(batch), frames)
         truth = (batch.motion * self.scale).flatten(2)[:, : coefficients.shape[1]]
-        error = self.network.expression(coefficients) - truth
-        # Distances are sums over the three coordinates; the first frame is its own frame before.
-        reconstruction = 3.0 * masked_mean(error.square(), frames)
-        change = F.pad(error.diff(dim=1), (0, 0, 1, 0))
-        velocity = 3.0 * masked_mean(change.square(), frames)
+        # Distances are sums over the three coordinates; the first frame is its own frame before, so that changes count
+        # in as many frames as positions.
+        count = frames.sum() * self.n_vertices
+        position, change = squared_errors(self.network.expression(coefficients), truth, frames)
+        reconstruction, velocity = position / count, change / count
         loss = reconstruction + self.velocity_weight * velocity
         return {"reconstruction": reconstruction, "velocity": velocity, "loss": loss}
 
