@@ -112,7 +112,7 @@ def panels_by_section(panels: ModuleType, clips: Sequence[str], terms: Sequence[
             *(
                 panels.BarPlot(
                     title=f"{metric}, {words}",
-                    metrics=[f"{split}/{method}{metric}" for method in ("", *(f"{name}/" for name in METHODS[1:]))],
+                    metrics=[f"{split}/{'' if name == 'model' else f'{name}/'}{metric}" for name in METHODS],
                 )
                 for split, words in SPLITS.items()
                 for metric in METRICS

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from facediff.benchmark.plan import (
+    MEAN_SUFFIX,
     MOST_CELLS,
     Before,
     BenchmarkPlan,
@@ -143,7 +144,7 @@ def rows_of(plan: BenchmarkPlan) -> list[Row]:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise FaceDiffError(f"{plan.file}: two rows are called {twice!r}; give the method or the variant another name")
-    if plan.baseline and plan.baseline not in names:
+    if plan.baseline and plan.baseline.removesuffix(MEAN_SUFFIX) not in names:
         raise FaceDiffError(
             f"{plan.file}: baseline: there is no row {plan.baseline!r}: {choices(plan.baseline, names)}"
         )

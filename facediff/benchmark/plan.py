@@ -36,6 +36,9 @@ VARIANT_KEYS = ("label", "options", "published")
 REFERENCES = ("still", "mean_face", "shuffled")
 """Rows that a test scores next to the model: see :data:`facediff.models.evaluation.METHODS`."""
 
+MEAN_SUFFIX = ".mean"
+"""What follows a method's name in that of its further row, the mean of ``model.test_samples`` samples."""
+
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,60}")
 OPTION = re.compile(r"(model|data|trainer)(\.\w+)*|(seed_everything|name)")
 LARGEST_SEED = 2**32 - 1
@@ -126,7 +129,7 @@ class BenchmarkPlan:
         metrics: further metrics by name.
         columns: scores that tables show; all of the protocol and the metrics if empty.
         seeds: of the training runs.
-        baseline: the row that all others are compared with; the first one if empty.
+        baseline: the row that all others are compared with, ``NAME.mean`` for a mean of samples; the first if empty.
         weights: the checkpoint of a training that is scored.
         threads: of each training and test; digits may depend on it, so that it is part of the plan.
         workers: cells that run at a time; as many as processors divided by threads if None.

@@ -187,6 +187,27 @@ def compared(
     return {name: (comparison, adjusted.get(name)) for name, comparison in differences.items()}
 
 
+def hears(own: RowScores, shuffled: RowScores, sign: int, bootstrap: Bootstrap) -> bool:
+    """Whether a method's score is better with the sentence's own speech than with another's, and not by chance alone.
+
+    Both are of the same training runs, so that runs are paired. With one run alone, sentences decide.
+
+    Args:
+        own: scores with the sentences' own speech.
+        shuffled: of the same runs with other sentences' speech.
+        sign: 1 where lower is better, −1 where higher is.
+        bootstrap: its level decides, its seed is the permutations'.
+    """
+    gap = sign * (shuffled.mean - own.mean)
+    common = [clip for clip in own.clips if clip in shuffled.clips]
+    if gap <= 0 or own.values is None or shuffled.values is None or not common:
+        return gap > 0
+    gaps = shuffled.shares(common) - own.shares(common)
+    gaps = gaps[~np.isnan(gaps)]
+    p, _ = both_chances(gaps, [own.runs - shuffled.runs], bootstrap.level)
+    return (sign_flip(gaps, seed=bootstrap.seed) if p is None else p) < 1 - bootstrap.level
+
+
 def marked(rows: Mapping[str, RowScores], better: str | None, bootstrap: Bootstrap) -> dict[str, str]:
     """Which rows are ``best`` and ``second``, each only where its difference from every row behind it is significant.
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from facediff.benchmark.plan import MEAN_SUFFIX
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
-from facediff.benchmark.statistics import Difference, RowScores, compared, marked
+from facediff.benchmark.statistics import Difference, RowScores, compared, hears, marked
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils import ranges
 
@@ -202,26 +203,32 @@ def _table(
     groups = {name: group for name, group in groups.items() if any(_row_of(result, split, "model") for result in group)}
     first = next(iter(groups.values()))[0]
     columns = _columns(outline, [result for group in groups.values() for result in group], split)
-    chosen = next((name for name in (baseline, outline.baseline) if name in groups), next(iter(groups)))
+    wanted = [name for name in (baseline, outline.baseline) if name]
+    chosen = next((name for name in wanted if name.removesuffix(MEAN_SUFFIX) in groups), next(iter(groups)))
+    compared_with = chosen.removesuffix(MEAN_SUFFIX)
     rows = []
     for name, group in groups.items():
         label = outline.rows[name][0]
         rows.append(_row(name, label, group, split, "model", columns, bootstrap))
+        if any(_row_of(result, split, "sample_mean") for result in group):
+            title = f"{label}, mean of samples"
+            rows.append(_row(f"{name}{MEAN_SUFFIX}", title, group, split, "sample_mean", columns, bootstrap))
     for reference in outline.references:
-        # A face that does not move is the same in every run; shuffled speech is the baseline's.
-        group = (
-            groups[chosen]
-            if reference == "shuffled"
-            else [result for result in results if _row_of(result, split, reference)][:1]
-        )
-        if any(_row_of(result, split, reference) for result in group):
-            label = REFERENCE_LABELS[reference].format(row=outline.rows[chosen][0])
-            rows.append(_row(reference, label, group, split, reference, columns, bootstrap))
+        # A face that does not move is the same in every run; shuffled speech is each method's own.
+        still = [result for result in results if _row_of(result, split, reference)][:1]
+        of_rows = groups if reference == "shuffled" else {"": still}
+        for name, group in of_rows.items():
+            if any(_row_of(result, split, reference) for result in group):
+                label = REFERENCE_LABELS[reference].format(row=outline.rows[name][0] if name else "")
+                title = f"{name}.{reference}" if name else reference
+                rows.append(_row(title, label, group, split, reference, columns, bootstrap))
+    if all(row.name != chosen for row in rows):  # the mean of a method that draws no samples
+        chosen = compared_with
     rows = _with_comparisons(rows, columns, chosen, bootstrap)
     scored = _row_of(first, split, "model") or {}
     clips = {clip for row in rows for scores in row.scores.values() for clip in scores.clips}
     regions = dict(scored.get("regions") or {})
-    frames = sum(_frames(group, split) for group in [groups[chosen]])
+    frames = sum(_frames(group, split) for group in [groups[compared_with]])
     manifests = {str(result.provenance.get("manifest")) for result in results if result.provenance}
     published = shown_tables(
         outline.published,
@@ -245,7 +252,7 @@ def _table(
         frames=frames,
         sequences=len(clips),
         regions=regions,
-        notes=_notes(rows, columns, len(clips), manifests),
+        notes=[*_notes(rows, columns, len(clips), manifests), *_deaf(rows, columns, bootstrap)],
         published=published,
     )
 
@@ -292,7 +299,8 @@ def _row(
     cost = Cost() if method != "model" else _cost(runs)
     seeds = tuple(() if fixed else (result.seed for result in runs))
     clips = max((len(column_scores.clips) for column_scores in scores.values()), default=0)
-    return TableRow(name, label, seeds, method != "model", scores, intervals, cost=cost, clips=clips)
+    reference = method not in ("model", "sample_mean")
+    return TableRow(name, label, seeds, reference, scores, intervals, cost=cost, clips=clips)
 
 
 def _scores(
@@ -364,6 +372,24 @@ def _with_comparisons(
         )
         for row in rows
     ]
+
+
+def _deaf(rows: Sequence[TableRow], columns: Mapping[str, Mapping[str, str | None]], bootstrap: Bootstrap) -> list[str]:
+    """Which methods another sentence's speech serves as well as the own one, score by score."""
+    shuffled = {row.name.removesuffix(".shuffled"): row for row in rows if row.name.endswith(".shuffled")}
+    notes = []
+    for column, facts in columns.items():
+        sign = {"lower": 1, "higher": -1}.get(str(facts.get("better")))
+        pairs = [(row, shuffled[row.name]) for row in rows if row.name in shuffled]
+        pairs = [(own, other) for own, other in pairs if column in own.scores and column in other.scores]
+        deaf = [
+            own.label
+            for own, other in pairs
+            if sign is not None and not hears(own.scores[column], other.scores[column], sign, bootstrap)
+        ]
+        if deaf:
+            notes.append(f"by {column}, another sentence's speech does as well as the own: {', '.join(deaf)}")
+    return notes
 
 
 def _notes(

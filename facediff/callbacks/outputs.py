@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import WandbLogger
 
 from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_media, worst_clips
 from facediff.models import AnimationModel
+from facediff.models.evaluation import METHODS
 from facediff.models.inference import Prediction
 from facediff.registry import checks_arguments
 from facediff.utils.files import atomic
@@ -22,13 +23,7 @@ from facediff.utils.plain_files import write_json, write_rows
 from facediff.utils.ranges import Range
 from facediff.utils.tables import format_table
 
-METHOD_NAMES = {
-    "model": "model",
-    "usual_style": "model, the style that animate takes",
-    "still": "still face",
-    "mean_face": "speaker's mean face",
-    "shuffled": "model, shuffled speech",
-}
+METHOD_NAMES = {name: label.format(model="model") for name, label in METHODS.items()}
 
 
 class EpochLines(Callback):

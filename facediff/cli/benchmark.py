@@ -140,12 +140,13 @@ def report(
         page: a Markdown page whose marked blocks get the tables of the plans that they name
     """
     from facediff.benchmark.outline import read_outline
+    from facediff.benchmark.plan import MEAN_SUFFIX
 
     if page is not None and not page.is_file():
         raise FaceDiffError(f"--page {page}: no such file; expected a Markdown page with marked blocks")
     for folder in folders:
         rows = read_outline(folder).rows
-        if baseline is not None and baseline not in rows:
+        if baseline is not None and baseline.removesuffix(MEAN_SUFFIX) not in rows:
             raise FaceDiffError(f"--baseline {baseline}: {folder} has no such row: {choices(baseline, rows)}")
     for folder in folders:
         written = write_and_tell(folder, baseline, bootstrap, level, seed, output)

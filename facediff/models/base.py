@@ -119,6 +119,9 @@ class AnimationModel(PersonStyles, ABC):
             style vectors of stretches of ``data.reference_frames``. Checkpoints then keep every speaker's vector.
         validation_samples: samples of each validation clip for ``val/energy``, the score by which the bundled trainers
             choose the best checkpoint; with 1 it is a distance, which a mean face may win.
+        test_samples: samples of each test clip by a model that draws them; with more than one, a test has a row of
+            their mean too, which has the lower squared error by nature (a sample's is twice a mean's if it is drawn
+            from the right distribution).
         score_by: clip attributes, such as ``[emotion,intensity]``, by which test scores are printed and written too.
     """
 
@@ -141,6 +144,7 @@ class AnimationModel(PersonStyles, ABC):
         unseen_identity: IdentityPolicy = "style_only",
         style_source: StyleSource = "reference",
         validation_samples: Annotated[int, Range(1, 1000)] = 2,
+        test_samples: Annotated[int, Range(1, 1000)] = 1,
         score_by: Sequence[str] = (),
     ) -> None:
         super().__init__()
@@ -159,6 +163,7 @@ class AnimationModel(PersonStyles, ABC):
         self.protocol = protocol
         self.metrics = list(metrics)
         self.validation_samples = validation_samples
+        self.test_samples = test_samples
         self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.style_source: StyleSource = style_source
@@ -322,6 +327,9 @@ class AnimationModel(PersonStyles, ABC):
         styles = {name: self.default_style(name) for name in self.styled_identities()}
         for name, view in conditioned(batch, self.unseen_identity, self.identities, styles):
             self.evaluation.score(self, split, view, name)
+            if self.samples and self.test_samples > 1:
+                drawn = torch.stack([self.generate(view, seed=seed) for seed in range(self.test_samples)])
+                self.evaluation.update(split, "sample_mean", drawn.mean(0), view, name)
             if view.decoy_audio is not None:
                 decoy = replace(view, audio=view.decoy_audio, features=None)
                 self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)

@@ -105,10 +105,17 @@ def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]
     return views
 
 
-METHODS = ("model", "usual_style", "still", "mean_face", "shuffled")
-"""Methods that are scored: the model; the model with the style that ``animate`` takes where none is given; a face that
-never moves from its template, or from the mean of its speaker's training clips; the model given another sentence's
-speech."""
+METHODS = {
+    "model": "{model}",
+    "sample_mean": "{model}, mean of samples",
+    "usual_style": "{model}, the style that animate takes",
+    "still": "still face",
+    "mean_face": "speaker's mean face",
+    "shuffled": "{model}, shuffled speech",
+}
+"""Methods that are scored, and what tables call them: one sample of the model; the mean of several, where a test is
+asked for them; the model with the style that ``animate`` takes where none is given; a face that never moves from its
+template, or from the mean of its speaker's training clips; the model given another sentence's speech."""
 
 ENERGY_REGIONS = ("lips", "upper_face")
 """Regions by whose energy scores the best checkpoint is chosen, and whose smoothness is scored."""
@@ -198,7 +205,7 @@ class Evaluation:
         self._check_attributes()
         self._prepare_energies(model, regions, device)
         self._speakers = sorted(assets.templates)
-        methods = METHODS if self.splits != ["val"] else METHODS[:1]
+        methods = list(METHODS) if self.splits != ["val"] else ["model"]
         self.metrics = {
             split: {
                 method: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for method in methods
@@ -437,8 +444,8 @@ class Evaluation:
         groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
         for row in rows:
             groups.setdefault((row["method"], *(row[name] or "" for name in self.score_by)), []).append(row)
-        table = []
-        for key in sorted(groups, key=lambda key: (METHODS.index(key[0]), key[1:])):
+        table, methods = [], list(METHODS)
+        for key in sorted(groups, key=lambda key: (methods.index(key[0]), key[1:])):
             members, line = groups[key], dict(zip(("method", *self.score_by), key, strict=True))
             means: dict[str, float | None] = {}
             for name, pooling in pooled.items():
@@ -476,7 +483,8 @@ class Evaluation:
             shares: list[Any] = [None] * torch.distributed.get_world_size()
             torch.distributed.all_gather_object(shares, rows)
             rows = [row for share in shares for row in share]
-        rows = sorted(rows, key=lambda row: (row["split"], METHODS.index(row["method"]), row["clip"], row["identity"]))
+        methods = list(METHODS)
+        rows = sorted(rows, key=lambda row: (row["split"], methods.index(row["method"]), row["clip"], row["identity"]))
         keys = dict.fromkeys(key for row in rows for key in row)
         # NaN, which alone differs from itself, is a clip that a metric leaves out.
         return [{key: None if row.get(key) != row.get(key) else row.get(key) for key in keys} for row in rows]

@@ -14,6 +14,7 @@ from typing import Any
 
 from facediff.errors import FaceDiffError
 from facediff.models.checkpoint_content import IMPORTED, CheckpointContent
+from facediff.models.evaluation import METHODS
 from facediff.registry import COMPONENTS, corpus
 from facediff.utils.hub import ASSETS, CONFIG, WEIGHTS
 from facediff.utils.licences import KNOWN, Licence, commercial_use
@@ -28,13 +29,6 @@ SPLITS = {
     "test_b": "test B, unseen speakers",
     "test_c": "test C, unseen voices",
     "val": "validation",
-}
-METHODS = {
-    "model": "this model",
-    "usual_style": "this model, the style that animate takes",
-    "still": "still face",
-    "mean_face": "speaker's mean face",
-    "shuffled": "this model, shuffled speech",
 }
 ABOUT = {
     *("split", "method", "unseen_identity", "protocol", "frames", "sequences", "cut_prediction", "cut_truth"),
@@ -292,11 +286,12 @@ def score_section(model: CheckpointContent, facts: Facts) -> str:
             "`facediff publish --scores test_scores.csv` puts them here."
         )
     first, names = facts.scores[0], scored(facts.scores)
+    called = {name: label.format(model="this model") for name, label in METHODS.items()}
     header = ["split", "method", *(name.upper() for name in names), "frames", "sequences"]
     rows = [
         [
             SPLITS.get(row["split"], text(row["split"])),
-            METHODS.get(row["method"], text(row["method"])),
+            called.get(row["method"], text(row["method"])),
             *(f"{float(row[name]):.4g}" if row[name] else "" for name in names),
             text(row["frames"]),
             text(row.get("sequences", "")),

@@ -62,6 +62,33 @@ def test_a_method_that_a_still_face_beats_is_noted() -> None:
     assert any("no method is better than this reference: still face" in note for note in report.tables[0].notes)
 
 
+def test_the_mean_of_samples_is_a_row_that_others_are_compared_with() -> None:
+    """Of the methods that draw samples alone; a method is found by the mean's name where it has none."""
+    nan = float("nan")
+    found = results(effects=(0.0, 0.2, 1.2), of_runs=0.01, further={"sample_mean": (-0.5, nan, nan)})
+    for baseline, chosen in (("method_0.mean", "method_0.mean"), ("method_1.mean", "method_1")):
+        (table,) = report_of(outline(baseline=baseline), found, resamples=100).tables
+        assert [row.name for row in table.rows] == ["method_0", "method_0.mean", "method_1", "method_2", "still"]
+        assert table.baseline == chosen
+        gap = table.row("method_2").differences["lve"][0].value
+        assert gap == pytest.approx(table.row("method_2").scores["lve"].mean - table.row(chosen).scores["lve"].mean)
+        assert not table.row("method_0.mean").reference
+        assert table.row("method_0.mean").marks == {"lve": "best", "fdd": "best"}
+
+
+def test_a_method_that_ignores_its_speech_is_named() -> None:
+    """Each method's own and shuffled speech are compared in the same training runs."""
+    found = results(effects=(0.0, 0.6, 1.2), of_runs=0.2, further={"shuffled": (0.1, 0.0, -0.1)})
+    for seeds in (1, 3):
+        some = [result for result in found if result.seed is not None and result.seed < seeds]
+        (table,) = report_of(outline(references=("still", "shuffled")), some, resamples=100).tables
+        assert [row.label for row in table.rows if row.reference] == [
+            *("still face", "Method 0, shuffled speech", "Method 1, shuffled speech", "Method 2, shuffled speech")
+        ]
+        said = "by lve, another sentence's speech does as well as the own: Method 1, Method 2"
+        assert said in table.notes
+
+
 def test_all_forms_are_written_and_hold_the_same_numbers(tmp_path: Path) -> None:
     report = made()
     files = write_report(report, tmp_path)

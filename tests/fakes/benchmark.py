@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -28,8 +29,12 @@ def results(
     of_sentences: float = 0.2,
     seed: int = 0,
     corpus: str = "tiny",
+    further: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> list[Result]:
-    """A result for each method and seed: 1 + effect + chance of the run + difficulty + chance of the sentence."""
+    """A result for each method and seed: 1 + effect + chance of the run + difficulty + chance of the sentence.
+
+    ``further`` are what ``test`` scores besides, by name: by how much it is off the method's own score, for each.
+    """
     rng = np.random.default_rng(seed)
     difficulty = rng.normal(0, 0.3, clips)
     frames = rng.integers(20, 60, clips)
@@ -45,13 +50,20 @@ def results(
                 for method in ("model", "still")
                 for n in range(clips)
             ]
+            for method, offsets in further.items():
+                off = offsets[place] + rng.normal(0, 0.05, clips)
+                sequences += [
+                    row | {"method": method} | {name: float(row[name]) + off[n] for name in COLUMNS}  # type: ignore[arg-type]
+                    for n, row in enumerate(sequences[:clips])
+                    if offsets[place] == offsets[place]
+                ]
             found.append(_result(place, run, sequences, corpus))
     return found
 
 
 def _result(place: int, run: int, sequences: list[dict[str, object]], corpus: str) -> Result:
     scores = []
-    for method in ("model", "still"):
+    for method in dict.fromkeys(str(row["method"]) for row in sequences):
         own = [row for row in sequences if row["method"] == method]
         weights = {"lve": [row["frames"] for row in own], "fdd": [1.0] * len(own)}
         pooled = {name: float(np.average([row[name] for row in own], weights=weights[name])) for name in COLUMNS}
@@ -80,7 +92,14 @@ def _result(place: int, run: int, sequences: list[dict[str, object]], corpus: st
     )
 
 
-def outline(*, rows: int = 3, seeds: int = 3, corpus: str = "tiny", baseline: str = "method_0") -> ReportOutline:
+def outline(
+    *,
+    rows: int = 3,
+    seeds: int = 3,
+    corpus: str = "tiny",
+    baseline: str = "method_0",
+    references: tuple[str, ...] = ("still",),
+) -> ReportOutline:
     """The outline that :func:`results` belong to."""
     return ReportOutline(
         name="made",
@@ -89,7 +108,7 @@ def outline(*, rows: int = 3, seeds: int = 3, corpus: str = "tiny", baseline: st
         protocol="paper",
         columns=(),
         baseline=baseline,
-        references=("still",),
+        references=references,
         rows={f"method_{place}": (f"Method {place}", "") for place in range(rows)},
         corpora={corpus: "Tiny"},
         published=(),

@@ -71,6 +71,24 @@ def test_the_mean_over_identities_is_reported(
     assert {row["identity"] for row in rows} == {"A", "B"}
 
 
+def test_the_mean_of_samples_is_a_row_where_it_is_asked_for(
+    make_model: Make, tiny: Tiny, make_trainer: Callable[..., Trainer]
+) -> None:
+    model = make_model(motion_scale="none", test_samples=3)
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    scores: dict[str, float] = {}
+    for part in make_trainer().test(model, datamodule=tiny, verbose=False):
+        scores |= part
+    assets, errors = tiny.assets(), []
+    for i in range(len(tiny.dataset("test_a"))):
+        batch = collate([tiny.dataset("test_a")[i]])
+        with torch.inference_mode():
+            made = torch.stack([model.eval().generate(batch, seed=seed) for seed in range(3)]).mean(0)
+        errors.append((made - batch.motion)[0][:, assets.regions["lips"]].double().square().sum(-1).amax(-1))
+    assert scores["test_a/sample_mean/lve"] == pytest.approx(float(torch.cat(errors).mean()), rel=1e-4)
+    assert scores["test_a/sample_mean/lve"] < scores["test_a/lve"]
+
+
 def test_what_animate_gives_is_a_row_of_its_own(
     make_model: Make, tiny: Tiny, make_trainer: Callable[..., Trainer]
 ) -> None:
