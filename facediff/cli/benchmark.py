@@ -128,7 +128,7 @@ def report(
 
     For example:
       facediff benchmark report benchmarks/quick
-      facediff benchmark report benchmarks/puppet_table1 benchmarks/puppet_table3 --page tables.md
+      facediff benchmark report benchmarks/convergence benchmarks/puppet_table3 --page tables.md
 
     Args:
         folders: folders of benchmarks, such as benchmarks/quick

@@ -42,7 +42,7 @@ REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--tr
 
 FREE = (
     *("sampler", "sampling_space", "expressivity", "speech_guidance", "identity_guidance", "style_guidance"),
-    *("unseen_identity", "protocol", "metrics", "validation_samples", "score_by"),
+    *("unseen_identity", "protocol", "metrics", "validation_samples", "test_samples", "score_by"),
 )
 """Constructor arguments of a model that may differ from its checkpoint's; no weights depend on them."""
 
