@@ -207,7 +207,8 @@ class Puppet(SpeechMotionDataModule):
         )
         stored = None if edition or root is None else edition_of(self.root)
         self.edition = facts if stored is None else EDITIONS[stored](seed, drawn_speakers, people)
-        if isinstance(self.edition, FirstEdition) and (people or drawn_speakers > FIRST_MOST_DRAWN):
+        asks_people = people_voices or recordings is not None  # whether or not such a voice is installed
+        if isinstance(self.edition, FirstEdition) and (asks_people or drawn_speakers > FIRST_MOST_DRAWN):
             raise FaceDiffError(
                 f"data.edition: the first has no voices of people and {FIRST_MOST_DRAWN} drawn speakers at most; "
                 f"choose the second, or leave data.people_voices and data.recordings out"
