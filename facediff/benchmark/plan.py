@@ -127,7 +127,8 @@ class BenchmarkPlan:
         description: what they are of.
         protocol: by which all is scored.
         metrics: further metrics by name.
-        columns: scores that tables show; all of the protocol and the metrics if empty.
+        columns: scores and costs that tables show; all scores of the protocol and the metrics if none is named, and all
+            costs.
         seeds: of the training runs.
         baseline: the row that all others are compared with, ``NAME.mean`` for a mean of samples; the first if empty.
         weights: the checkpoint of a training that is scored.

@@ -20,6 +20,9 @@ REFERENCE_LABELS = {
     "mean_face": "speaker's mean face",
     "shuffled": "{row}, shuffled speech",
 }
+COSTS = ("weights", "rtf", "training", "memory")
+"""What a table can say of a method besides its scores."""
+
 SPLIT_LABELS = {
     "test_a": "test A, seen speakers",
     "test_b": "test B, unseen speakers",
@@ -36,7 +39,7 @@ class ReportOutline:
         title: of the tables.
         description: what they are of.
         protocol: by which all was scored.
-        columns: scores that are shown; all if empty.
+        columns: scores and :data:`COSTS` that are shown; all scores if none is named, and all costs.
         baseline: the row that others are compared with; the first if empty.
         references: rows that were not trained.
         rows: label, and name in papers' tables, by row.
@@ -112,6 +115,7 @@ class Table:
     label: str
     split: str
     synthetic: bool
+    costs: tuple[str, ...]  # of COSTS
     columns: Mapping[str, str | None]  # score to ``lower``, ``higher``, ``zero`` or None
     rows: list[TableRow]
     baseline: str
@@ -246,6 +250,7 @@ def _table(
         label=outline.corpora[corpus],
         split=split,
         synthetic=any(result.synthetic for result in results),
+        costs=tuple(name for name in outline.columns if name in COSTS) or COSTS,
         columns={name: facts.get("better") for name, facts in columns.items()},
         rows=rows,
         baseline=chosen,

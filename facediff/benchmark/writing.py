@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,12 @@ from facediff.reporting.statistics import Interval
 from facediff.utils.files import atomic
 from facediff.utils.plain_files import write_rows
 
-TITLES = {"mve": "MVE", "lve": "LVE", "fdd": "FDD", "fdd_absolute": "FDD, absolute", "fdd_signed": "FDD, signed"}
+TITLES = {
+    **{"mve": "MVE", "lve": "LVE", "fdd": "FDD", "fdd_absolute": "FDD, absolute", "fdd_signed": "FDD, signed"},
+    "rtf": "RTF",
+}
+MOST_DIGITS = 4
+"""Decimals of papers' tables, and of numbers of which no interval says how sure they are."""
 BEGIN, END = (
     "<!-- benchmark {name}: begin, written by `facediff benchmark report` -->",
     "<!-- benchmark {name}: end -->",
@@ -61,33 +66,55 @@ def write_report(report: BenchmarkReport, folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Scale:
-    """The power of ten that a column is given in, so that its numbers have no zeros in front."""
+    """The power of ten that a column is given in, and its decimals: those that the narrowest interval leaves known."""
 
     exponent: int
+    digits: int = MOST_DIGITS
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Scale:
-        """That of the smallest number; none for numbers that read well as they are."""
+    def of(
+        cls,
+        values: Sequence[float],
+        intervals: Iterable[Interval | None] = (),
+        deviations: Iterable[float | None] = (),
+    ) -> Scale:
+        """The power of ten of the smallest number; none for numbers that read well as they are.
+
+        Half the narrowest interval is shown with two significant digits and the smallest deviation with one, and all
+        numbers with as many decimals.
+        """
         magnitudes = [abs(value) for value in values if value]
-        if not magnitudes or (min(magnitudes) >= 0.01 and max(magnitudes) < 1000):
-            return cls(0)
-        return cls(math.floor(math.log10(min(magnitudes))))
+        plain = not magnitudes or (min(magnitudes) >= 0.01 and max(magnitudes) < 1000)
+        exponent = 0 if plain else _magnitude(min(magnitudes))
+        widths = [(interval.high - interval.low) / 2 for interval in intervals if interval is not None]
+        places = [1 - _magnitude(width) for width in widths if width > 0 and math.isfinite(width)]
+        places += [-_magnitude(deviation) for deviation in deviations if deviation]
+        return cls(exponent, min(max(exponent + max(places), 0), MOST_DIGITS) if places else MOST_DIGITS)
 
-    def number(self, value: float | None, digits: int = 4, sign: str = "") -> str:
-        """A number without its power of ten."""
-        return NONE if value is None else f"{value / 10.0**self.exponent:{sign}.{digits}f}"
+    def number(self, value: float | None, digits: int | None = None, sign: str = "") -> str:
+        """A number without its power of ten, with the column's decimals if none are given."""
+        decimals = self.digits if digits is None else digits
+        return NONE if value is None else f"{value / 10.0**self.exponent:{sign}.{decimals}f}"
 
-    def interval(self, interval: Interval | None, digits: int = 3, sign: str = "") -> str:
+    def interval(self, interval: Interval | None, sign: str = "") -> str:
         """An interval in brackets."""
         if interval is None:
             return NONE
-        return between(interval.low, interval.high, lambda end: self.number(end, digits, sign))
+        return between(interval.low, interval.high, lambda end: self.number(end, sign=sign))
+
+
+def _magnitude(value: float) -> int:
+    return math.floor(math.log10(abs(value)))
 
 
 def scales(table: Table) -> dict[str, Scale]:
     """The scale of each column."""
     return {
-        column: Scale.of([row.scores[column].mean for row in table.rows if column in row.scores])
+        column: Scale.of(
+            [row.scores[column].mean for row in table.rows if column in row.scores],
+            [row.intervals.get(column) for row in table.rows],
+            [row.scores[column].deviation for row in table.rows if column in row.scores],
+        )
         for column in table.columns
     }
 
@@ -108,18 +135,16 @@ def arrow(better: str | None) -> str:
     return {"lower": " ↓", "higher": " ↑", "zero": " →0"}.get(str(better), "")
 
 
-def cost_cells(row: TableRow) -> list[str]:
-    """Weights, speed, training time and memory."""
+def cost_cells(row: TableRow, costs: Sequence[str]) -> list[str]:
+    """Those of weights, speed, training time and memory that a table shows."""
     cost = row.cost
-    return [
-        NONE if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M",
-        NONE if cost.factor is None else f"{cost.factor:.3g}",
-        NONE if cost.training is None else f"{cost.training:.0f} s",
-        NONE if cost.memory is None else f"{cost.memory / 2**30:.2f} GiB",
-    ]
-
-
-COSTS = ("weights", "RTF", "training", "memory")
+    cells = {
+        "weights": NONE if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M",
+        "rtf": NONE if cost.factor is None else f"{cost.factor:.3g}",
+        "training": NONE if cost.training is None else f"{cost.training:.0f} s",
+        "memory": NONE if cost.memory is None else f"{cost.memory / 2**30:.2f} GiB",
+    }
+    return [cells[name] for name in costs]
 
 
 def mean_and_deviation(row: TableRow, column: str, scale: Scale) -> str:
@@ -183,11 +208,11 @@ def main_table(table: Table, *, printed: bool = False, level: float | None = Non
         if level is not None:
             starred = [row.significant(column, level) for column in table.columns]
             cells = [cell + "*" * star for cell, star in zip(cells, starred, strict=True)]
-        cells += [scale[column].number(figures.get(row.name, {}).get(column)) for column in paper]
-        rows.append([row.label, *cells, NONE if not row.seeds else str(len(row.seeds)), *cost_cells(row)])
+        cells += [scale[column].number(figures.get(row.name, {}).get(column), MOST_DIGITS) for column in paper]
+        rows.append([row.label, *cells, NONE if not row.seeds else str(len(row.seeds)), *cost_cells(row, table.costs)])
         marks |= {(place, number): row.marks.get(column, "") for number, column in enumerate(table.columns, 1)}
     head = ["", *(head_of(column, scale[column]) + arrow(better) for column, better in table.columns.items())]
-    head += [*(f"{title_of(column)}, printed" for column in paper), "runs", *COSTS]
+    head += [*(f"{title_of(column)}, printed" for column in paper), "runs", *map(title_of, table.costs)]
     references = frozenset(place for place, row in enumerate(table.rows) if row.reference)
     return ReportTable(head, rows, marks, references, caption)
 
@@ -276,7 +301,8 @@ def latex_tables(report: BenchmarkReport) -> str:
     return latex(
         main_table(
             table,
-            caption=f"{outline.title}: {table.title}. Protocol {outline.protocol}; mean ± standard deviation over "
+            caption=f"{outline.title}: {table.title}. {'Synthetic data. ' if table.synthetic else ''}"
+            f"Protocol {outline.protocol}; mean ± standard deviation over "
             f"training runs; {table.sequences} sentences, {table.frames} frames.",
         )
         for table in report.tables
@@ -320,7 +346,8 @@ def _csv_rows(table: Table, report: BenchmarkReport) -> Iterator[dict[str, Any]]
         for column, scores in row.scores.items():
             difference, adjusted = row.differences.get(column, (NOTHING, None))
             yield {
-                **{"corpus": table.corpus, "split": table.split, "row": row.name, "label": row.label},
+                **{"corpus": table.corpus, "synthetic": table.synthetic, "split": table.split},
+                **{"row": row.name, "label": row.label},
                 **{"score": column, "protocol": report.outline.protocol, "mean": scores.mean},
                 **{"deviation_over_runs": scores.deviation, "runs": len(row.seeds)},
                 "seeds": " ".join(str(seed) for seed in row.seeds if seed is not None),

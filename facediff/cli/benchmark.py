@@ -63,6 +63,7 @@ def benchmark(
     from facediff.benchmark.outline import outline_of, read_results, write_outline
     from facediff.benchmark.published import find_published
     from facediff.benchmark.running import estimate, pending, remember, run_cells
+    from facediff.benchmark.tables import COSTS
     from facediff.evaluation.evaluator import find_protocols
     from facediff.metrics.by_name import parse_all
     from facediff.utils.files import locked
@@ -75,8 +76,10 @@ def benchmark(
         raise FaceDiffError(f"{definition.file}: {error}") from error
     scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *definition.metrics]
     for column in definition.columns:
-        if column not in scores:
-            raise FaceDiffError(f"{definition.file}: columns: there is no score {column!r}: {choices(column, scores)}")
+        # A metric of several scores gives each its own name behind, as difference_ratio does for lips and upper face.
+        if not (column in (*scores, *COSTS) or column.startswith(tuple(f"{name}_" for name in definition.metrics))):
+            known = [*scores, *COSTS]
+            raise FaceDiffError(f"{definition.file}: columns: there is no score {column!r}: {choices(column, known)}")
     cells = cells_of(definition)
     folder = output / definition.name
     left = pending(cells, folder, retry_failed=retry_failed)

@@ -15,10 +15,22 @@ import pytest
 from facediff.benchmark import report_of
 from facediff.benchmark.outline import read_outline, read_results, write_outline
 from facediff.benchmark.tables import BenchmarkReport
-from facediff.benchmark.writing import BEGIN, END, document, latex_tables, plots, replace_block, text, write_report
+from facediff.benchmark.writing import (
+    BEGIN,
+    END,
+    Scale,
+    document,
+    latex_tables,
+    main_table,
+    plots,
+    replace_block,
+    text,
+    write_report,
+)
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.reporting.documents import html_page, markdown
+from facediff.reporting.statistics import Interval
 from tests.fakes.benchmark import outline, results
 
 
@@ -100,11 +112,39 @@ def test_all_forms_are_written_and_hold_the_same_numbers(tmp_path: Path) -> None
     assert float(row["mean"]) == mean
     assert row["mark"] == "best"
     for form in (markdown(document(report)), latex_tables(report), html_page("", document(report)), text(report)):
-        assert f"{mean:.4f}" in form
+        assert f"{mean:.3f}" in form
     tex = latex_tables(report)
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
     assert all(f"\\{rule}rule" in tex for rule in ("top", "mid", "bottom"))
-    assert rf"\textbf{{{mean:.4f}" in tex
+    assert rf"\textbf{{{mean:.3f}" in tex
+    # A table that leaves its page still says what it is of.
+    assert row["synthetic"] == "True"
+    assert "Synthetic data." in tex
+
+
+@pytest.mark.parametrize(
+    ("halves", "deviations", "shown"),
+    [
+        ((0.8e-6, 2e-6), (), "3.42 [2.62, 4.22]"),
+        ((0.031e-6,), (), "3.417 [3.386, 3.448]"),
+        ((0.8e-6,), (None, 0.0, 0.004e-6), "3.417 [2.617, 4.217]"),
+        ((), (), "3.4170"),
+    ],
+)
+def test_decimals_end_where_intervals_and_deviations_do(
+    halves: Sequence[float], deviations: Sequence[float | None], shown: str
+) -> None:
+    intervals = [Interval(3.417e-6 - half, 3.417e-6 + half) for half in halves]
+    scale = Scale.of([3.417e-6, 8e-6], [None, *intervals], deviations)
+    assert " ".join([scale.number(3.417e-6), *map(scale.interval, intervals[:1])]) == shown
+
+
+def test_costs_are_columns_too() -> None:
+    found = dataclasses.replace(outline(), columns=("lve", "weights"))
+    (table,) = report_of(found, results(), resamples=20).tables
+    shown = main_table(table)
+    assert list(shown.head) == ["", "LVE ↓", "runs", "weights"]
+    assert {len(row) for row in shown.rows} == {4}
 
 
 def test_the_page_needs_no_network_and_shows_hostile_names_as_they_are() -> None:
