@@ -155,18 +155,21 @@ def serve(
     *,
     host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[ranges.Port, Option(metavar="N")] = 8000,
+    name: Annotated[str | None, Option(metavar="HOST")] = None,
     max_raters: Annotated[ranges.Raters | None, Option(metavar="N")] = None,
     open: bool = False,  # noqa: A002 - the option's name
 ) -> None:
     """Serve a study to raters, until Ctrl-C. Answers go to STUDY/answers.sqlite, and nowhere else.
 
     By default only this machine can open the page; --host 0.0.0.0 lets everybody in who reaches this machine, without
-    encryption: put a web server with HTTPS in front of it.
+    encryption: put a web server with HTTPS in front of it, and give its name by --name.
 
     Args:
         study: folder that `facediff study make` has finished
         host: address to listen at
         port: to listen at; 0 for any free one
+        name: name under which a web server in front offers the page, such as study.lab.example; requests under other
+            names are refused
         max_raters: raters that are let in (default: any number)
         open: open the page in the browser
     """
@@ -181,7 +184,7 @@ def serve(
 
             webbrowser.open(address)
 
-    raters = run(study, host=host, port=port, most_raters=max_raters, ready=ready).raters()
+    raters = run(study, host=host, port=port, name=name, most_raters=max_raters, ready=ready).raters()
     finished = sum(rater.finished is not None for rater in raters)
     tell(f"{study}: {len(raters)} raters, {finished} of them finished; `facediff study report {study}` analyses them")
 

@@ -6,12 +6,13 @@ checked by :mod:`facediff.study.answers`, and only the videos that the study nam
 
 from __future__ import annotations
 
+import re
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.study.answers import (
     LONGEST_CODE,
     MOST_RATERS,
@@ -25,7 +26,16 @@ from facediff.study.answers import (
 from facediff.study.definition import DATABASE, PAGE_FOLDER, VIDEO_FOLDER, Study, read_study
 from facediff.study.page import PAGE
 from facediff.study.store import AnswerStore, FullError
-from facediff.utils.server import RefusedError, WithHeaders, read_body, require_server, run_server
+from facediff.utils.server import (
+    LOOPBACK,
+    OwnPagesOnly,
+    RefusedError,
+    WithHeaders,
+    names_of,
+    read_body,
+    require_server,
+    run_server,
+)
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -36,13 +46,22 @@ MOST_BYTES = 32_768
 """Of a body; the longest comment in any script, and more."""
 
 
-def make_app(folder: Path, study: Study, store: AnswerStore) -> Starlette:
+def make_app(
+    folder: Path,
+    study: Study,
+    store: AnswerStore,
+    *,
+    hosts: tuple[str, ...] | None = LOOPBACK,
+    public_name: str | None = None,
+) -> Starlette:
     """The ASGI application.
 
     Args:
         folder: the study's folder.
         study: what it asks.
         store: where answers go.
+        hosts: names under which the page is served; None for any.
+        public_name: name under which a web server in front offers it.
     """
     from starlette.applications import Starlette
     from starlette.concurrency import run_in_threadpool
@@ -115,7 +134,7 @@ def make_app(folder: Path, study: Study, store: AnswerStore) -> Starlette:
             Route("/api/answers", taking(answer), methods=["POST"]),
             Route("/api/finish", taking(finish), methods=["POST"]),
         ],
-        middleware=[Middleware(WithHeaders)],
+        middleware=[Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts, public_name=public_name)],
     )
 
 
@@ -124,6 +143,7 @@ def serve(
     *,
     host: str = "127.0.0.1",
     port: int = 8000,
+    name: str | None = None,
     most_raters: int | None = None,
     ready: Callable[[str], object] | None = None,
 ) -> AnswerStore:
@@ -133,18 +153,26 @@ def serve(
         folder: the study's folder; answers go into ``answers.sqlite`` there.
         host: address to listen at; by default nobody but this machine reaches it.
         port: to listen at; 0 for any free one.
+        name: of the host as which a web server in front offers the page; requests under any other are refused.
         most_raters: raters that the study takes; no limit if None.
         ready: called with the page's address as soon as it can be opened.
 
     Raises:
-        FaceDiffError: if the study is not complete, or the address cannot be used.
+        FaceDiffError: if the study is not complete, or the address or the name cannot be used.
         MissingExtraError: if the server's packages are not installed.
     """
+    if name is not None and not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?", name):
+        raise OptionError("name", "is no name of a host; expected one such as study.lab.example", name)
     require_server("serving a study")
     study = check_folder(folder)
     store = AnswerStore(folder / DATABASE, study, most_raters=most_raters or MOST_RATERS)
     with suppress(KeyboardInterrupt):
-        run_server(lambda _: make_app(folder, study, store), host=host, port=port, ready=ready)
+        run_server(
+            lambda _: make_app(folder, study, store, hosts=names_of(host), public_name=name),
+            host=host,
+            port=port,
+            ready=ready,
+        )
     return store
 
 

@@ -50,7 +50,7 @@ def names_of(host: str) -> tuple[str, ...] | None:
     return tuple(dict.fromkeys((*LOOPBACK, host)))
 
 
-def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None) -> bool:
+def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, public_name: str | None = None) -> bool:
     """Whether a request is for a server under one of its own names, and no page from elsewhere sends it.
 
     A page from elsewhere can let its own name point to this machine; its requests then carry that name as their host.
@@ -59,19 +59,22 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None) ->
         host: of the request, with its port.
         origin: of the page whose script sends it; None if none does.
         hosts: names under which the page is served; None if any may be right, as where all addresses are listened at.
+        public_name: name under which a web server in front offers the page, by HTTP or HTTPS; no other name but
+            ``hosts`` and this is right then.
 
     Example:
         >>> is_own_page("localhost:80", "http://localhost:80", LOOPBACK), is_own_page("evil.example", None, LOOPBACK)
         (True, False)
     """
-    if origin is not None and origin.lower() != f"http://{host.lower()}":
-        return False
-    if hosts is None:
-        return True
+    own = {name.lower() for name in (*(hosts or LOOPBACK), *([public_name] if public_name else []))}
     try:
-        return (urlsplit(f"//{host}").hostname or "") in {name.lower() for name in hosts}
+        name, page = urlsplit(f"//{host}").hostname or "", urlsplit(origin or "")
+        public = public_name is not None and page.scheme in ("http", "https") and page.hostname == public_name.lower()
     except ValueError:
         return False
+    if origin is not None and not public and origin.lower() != f"http://{host.lower()}":
+        return False
+    return (hosts is None and public_name is None) or name in own
 
 
 class WithHeaders:
@@ -98,17 +101,19 @@ class OwnPagesOnly:
     Args:
         app: the ASGI application.
         hosts: as :func:`is_own_page` takes them.
+        public_name: as :func:`is_own_page` takes it.
     """
 
-    def __init__(self, app: Any, hosts: Collection[str] | None) -> None:  # noqa: ANN401 - any ASGI application
+    def __init__(self, app: Any, hosts: Collection[str] | None, public_name: str | None = None) -> None:  # noqa: ANN401 - any ASGI application
         self.app = app
         self.hosts = hosts
+        self.public_name = public_name
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
         """Answer a request."""
         headers = {name.lower(): value.decode("latin-1") for name, value in scope.get("headers", [])}
         host, origin = headers.get(b"host", ""), headers.get(b"origin")
-        if is_own_page(host, origin, self.hosts):
+        if is_own_page(host, origin, self.hosts, self.public_name):
             await self.app(scope, receive, send)
             return
         body = b'{"error": "only the page that this server shows may ask it"}'

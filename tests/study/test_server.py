@@ -19,8 +19,10 @@ from facediff.errors import FaceDiffError
 from facediff.study import serve as serve_study
 from facediff.study import simulate
 from facediff.study.definition import DATABASE, Study
-from facediff.study.server import MOST_BYTES, check_folder
+from facediff.study.server import MOST_BYTES, check_folder, make_app
 from facediff.study.store import AnswerStore
+from facediff.utils.server import LOOPBACK
+from tests.fakes.serving import servers
 from tests.fakes.study import SCORES, small_study, write_study
 from tests.study.conftest import Serve
 
@@ -38,10 +40,12 @@ def address(study: Study, tmp_path: Path, serve: Serve) -> str:
     return serve(write_study(tmp_path / "study", study))
 
 
-def ask(url: str, content: object = None, *, raw: bytes | None = None, kind: str = JSON) -> tuple[int, Any]:
+def ask(
+    url: str, content: object = None, *, raw: bytes | None = None, kind: str = JSON, **headers: str
+) -> tuple[int, Any]:
     """Status and answer; a POST if there is anything to send."""
     body = raw if raw is not None else None if content is None else json.dumps(content).encode()
-    headers = {"Content-Type": kind} if body is not None else {}
+    headers |= {"Content-Type": kind} if body is not None else {}
     request = urllib.request.Request(url, body, headers)  # noqa: S310 - our own server
     try:
         with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
@@ -59,9 +63,9 @@ def given(asked: Study, number: int, place: int = 0, **changed: object) -> dict[
     return {**content, "seconds": 2.5, "plays": 1, "at": "2026-01-01T00:00:00.000Z", **changed}
 
 
-def begin(address: str, study: Study, **changed: object) -> tuple[int, Any]:
+def begin(address: str, study: Study, headers: dict[str, str] | None = None, **changed: object) -> tuple[int, Any]:
     content = {"study": study.id, "rater": TOKEN, "language": "en", "code": "", "agreed": True, **changed}
-    return ask(f"{address}/api/raters", content)
+    return ask(f"{address}/api/raters", content, **(headers or {}))
 
 
 def test_a_rater_answers_and_finishes_and_repeats_change_nothing(address: str, study: Study, tmp_path: Path) -> None:
@@ -128,6 +132,44 @@ def test_bodies_of_other_kinds_and_sizes_are_refused(address: str, study: Study)
     )
     begin(address, study)
     assert ask(url, given(study, 0, trial=trial_of_another))[0] == 400
+
+
+FOREIGN = [
+    {"Host": "evil.example"},  # a page from elsewhere has let its name point to this machine
+    {"Host": "evil.example", "Origin": "http://evil.example"},
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "https://[evil"},
+    {"Host": "127.0.0.1.evil.example"},
+    {"Host": ""},
+]
+
+
+@pytest.mark.parametrize("headers", FOREIGN)
+def test_pages_from_elsewhere_can_neither_read_nor_answer(
+    headers: dict[str, str], address: str, study: Study, tmp_path: Path
+) -> None:
+    assert begin(address, study, headers)[0] == 403
+    assert ask(f"{address}/", **headers)[0] == 403
+    assert not AnswerStore(tmp_path / "study" / DATABASE, study).raters()
+    assert begin(address, study, {"Origin": address})[0] == 200
+
+
+@pytest.mark.parametrize("hosts", [LOOPBACK, None])
+def test_a_web_server_in_front_is_let_in_by_its_name(
+    hosts: tuple[str, ...] | None, study: Study, tmp_path: Path
+) -> None:
+    folder = write_study(tmp_path / "study", study)
+    name, public = "study.lab.example", "https://study.lab.example"
+    with servers() as running:
+        store = AnswerStore(folder / DATABASE, study)
+        address = running.start(make_app(folder, study, store, hosts=hosts, public_name=name))[0]
+        for headers in ({"Host": name, "Origin": public}, {"Host": f"{name}:443"}, {"Origin": f"{public}:8443"}):
+            assert begin(address, study, headers)[0] == 200
+        for headers in ({"Host": "evil.example"}, {"Host": name, "Origin": "https://evil.example"}):
+            assert begin(address, study, headers)[0] == 403
+    with pytest.raises(FaceDiffError, match=r"name https://a: is no name of a host"):
+        serve_study(folder, name="https://a")
 
 
 def test_the_page_and_its_videos_are_served_in_parts_and_nothing_else(address: str, study: Study) -> None:
