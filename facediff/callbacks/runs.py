@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections.abc import Mapping, Sequence
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
 from facediff.errors import FaceDiffError
-from facediff.utils.files import atomic
+from facediff.utils.files import LockedError, atomic, locked
 from facediff.utils.hub import check_model_source, check_training_source, model_path
 
 STATE_KEY = "facediff_training_state"
@@ -26,6 +28,9 @@ JOB_FILE = "slurm_job_id"
 
 LAST = Path("checkpoints", "last.ckpt")
 """The newest state of a run, in its folder."""
+
+LOCK = "fit.lock"
+"""In the folder of a run while it trains."""
 
 CONFIG = "config.yaml"
 """The config of a run, in its folder."""
@@ -171,6 +176,38 @@ def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any]
     state = content.get(STATE_KEY, {})
     trainer.loggers = resumable(trainer.loggers, run, state.get("versions", ()), content.get("global_step", 0))
     return run is not None
+
+
+@contextmanager
+def locked_run(trainer: Trainer, *, new: bool) -> Iterator[None]:
+    """Keep a second ``fit`` out of the run's folder while the block runs.
+
+    Args:
+        trainer: with loggers that have not been used yet.
+        new: whether the run is a new one: where another process has just taken the number that its loggers would
+            take, it gets the next.
+
+    Raises:
+        FaceDiffError: if another process trains in the folder.
+    """
+    logger, checkpoints = trainer.logger, trainer.checkpoint_callbacks
+    if not trainer.is_global_zero or (logger is None and not checkpoints):
+        yield
+        return
+    if isinstance(logger, WandbLogger) and logger._id is None:  # the folder is known from now on, not once it uploads
+        logger._id = logger._wandb_init["id"] = os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
+    counts = new and isinstance(logger, CSVLogger | TensorBoardLogger) and logger._version is None
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(locked(run_folder(trainer) / LOCK, "facediff fit"))
+            except LockedError:
+                if not counts:
+                    raise
+                logger._version = None  # type: ignore[union-attr] # it looks for a free number again
+            else:
+                break
+        yield
 
 
 # The loggers of a run that is continued.

@@ -14,7 +14,7 @@ import urllib.error
 import urllib.request
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from traceback import walk_tb
@@ -33,7 +33,7 @@ from omegaconf import OmegaConf
 from facediff import registry
 from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
-from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, resumable, share_folder
+from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, locked_run, resumable, share_folder
 from facediff.cli.configs import guard_configs
 from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
@@ -63,6 +63,7 @@ def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> F
         with (
             parsing([name, *arguments], lambda *, _root_: _root_[name]["name"]),
             warnings.catch_warnings(),
+            ExitStack() as until_end,
         ):
             for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
                 warnings.filterwarnings("ignore", message)
@@ -73,6 +74,7 @@ def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> F
                 save_config_kwargs={"overwrite": True},
                 command=name,
                 experiment=experiment,
+                until_end=until_end,
             )
     except Exception as error:
         # jsonargparse wraps what a constructor raises; our own sentence is the useful one.
@@ -267,7 +269,8 @@ PARSED: dict[str, Any] = {
 class FaceDiffCLI(LightningCLI):
     """LightningCLI whose experiment has a name, and whose model takes its sizes from the data module."""
 
-    def __init__(self, *values: Any, command: str, experiment: str, **options: Any) -> None:  # noqa: ANN401 - as upstream
+    def __init__(self, *values: Any, command: str, experiment: str, until_end: ExitStack, **options: Any) -> None:  # noqa: ANN401 - as upstream
+        self.until_end = until_end
         self.command = command
         self.experiment = experiment
         super().__init__(*values, **options)
@@ -334,7 +337,9 @@ class FaceDiffCLI(LightningCLI):
         path = find_checkpoint(trainer, self._get(self.config_init, "ckpt_path"))
         content = read_checkpoint(path) if path is not None and path.is_file() else {}
         self.model.check_training(resumed=bool(content))
-        if continue_run(trainer, path, content, sys.argv):
+        continues = continue_run(trainer, path, content, sys.argv)
+        self.until_end.enter_context(locked_run(trainer, new=not continues))
+        if continues:
             self.config[str(self.subcommand)].ckpt_path = None  # the config that is saved describes the whole run
         else:
             share_folder(trainer.loggers)

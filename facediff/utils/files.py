@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import platform
 import re
 import secrets
 import shutil
@@ -17,8 +18,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import IO
+from weakref import WeakSet
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, printable
 from facediff.utils.destinations import destination, refuse_protected
 
 ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
@@ -437,7 +439,12 @@ def _new_folders(folder: Path) -> Iterator[None]:
 def locked(path: Path, command: str) -> Iterator[None]:
     """Keep a second process out of a folder while the block runs; the lock of a killed process does not count.
 
-    The lock file lies in the folder and is removed at the end; errors call the other process ``command``.
+    The lock file lies in the folder, says who holds it, and is removed at the end; errors call the other process
+    ``command``.
+
+    Raises:
+        LockedError: if another process is at work.
+        FaceDiffError: if the folder cannot be written.
     """
     with ExitStack() as stack:
         with _writing(path.parent):
@@ -447,16 +454,46 @@ def locked(path: Path, command: str) -> Iterator[None]:
         yield
 
 
-def _lock_file(path: Path, command: str) -> IO[str]:
+class LockedError(FaceDiffError):
+    """Another process is at work in a folder."""
+
+
+_HELD: WeakSet[IO[bytes]] = WeakSet()
+"""Locks of this process. Forked ones, such as the workers of loaders, may outlive it and must not keep them."""
+
+
+def _close_held() -> None:
+    for stream in list(_HELD):
+        stream.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_held)
+
+
+def _lock_file(path: Path, command: str) -> IO[bytes]:
     while True:
         # Neither emptied nor followed as a link: a name in the folder must not destroy a file elsewhere.
-        stream = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666), "w")
-        locked = _lock(stream.fileno())
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        stream = os.fdopen(descriptor, "r+b", buffering=0)
+        locked = _lock(descriptor)
         if locked is False:
+            holder = printable(stream.read(200).decode(errors="replace"))
             stream.close()
-            raise FaceDiffError(f"{path.parent}: another `{command}` is at work here; wait until it has ended")
+            raise LockedError(
+                f"{path.parent}: another `{command}`{f' ({holder})' if holder else ''} is at work here; wait until it "
+                f"has ended"
+            )
         # The previous holder may have removed the file between our opening and locking it.
-        if locked is None or (path.exists() and os.path.samestat(os.fstat(stream.fileno()), path.stat())):
+        if locked is None or (path.exists() and os.path.samestat(os.fstat(descriptor), path.stat())):
+            _HELD.add(stream)
+            if stream.read(7) in (b"", b"process"):
+                stream.seek(0)
+                stream.truncate()
+                job = os.environ.get("SLURM_JOB_ID")
+                stream.write(
+                    f"process {os.getpid()} on {platform.node()}{f', SLURM job {job}' if job else ''}".encode()
+                )
             return stream
         stream.close()
 

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from facediff.callbacks import runs
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
+from facediff.callbacks.runs import LOCK
 from facediff.models import DualPathDiffusion
+from facediff.utils.files import LockedError, locked
 from tests.cli.conftest import SMALL
 
 Fit = Callable[..., int]
@@ -176,6 +181,32 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_checkpoint(
 
 
 @pytest.mark.slow
+def test_a_run_that_another_process_trains_is_left_alone(
+    fit: Fit, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "small" / "version_7"
+    shutil.copytree(whole, run)
+    place = [f"--trainer.logger.save_dir={tmp_path}", "--trainer.logger.version=7"]
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
+    for more in (["--ckpt_path=last"], []):
+        with locked(run / LOCK, "facediff fit"):
+            assert fit(*LONGER, *place, *more) == 2
+        assert re.search(r"version_7: another `facediff fit` \(process \d+ on", capsys.readouterr().err)
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()} == before
+
+    def taken(path: Path, command: str) -> AbstractContextManager[None]:
+        if path.parent.name == "version_8":  # another process has chosen the same number, and was quicker
+            path.parent.mkdir(exist_ok=True)
+            raise LockedError("taken")
+        return locked(path, command)
+
+    monkeypatch.setattr(runs, "locked", taken)
+    assert fit("--trainer.max_steps=1", place[0]) == 0
+    assert files(tmp_path / "small" / "version_8") == []
+    assert LOCK not in files(tmp_path / "small" / "version_9")
+    assert (tmp_path / "small" / "version_9" / "checkpoints" / "last.ckpt").is_file()
+
+
 def test_an_unwritable_place_is_one_sentence(fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert fit(f"--trainer.logger.save_dir={tmp_path / 'file'}") == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -206,7 +207,8 @@ def test_the_scratch_folder_of_a_killed_process_is_removed_and_of_a_running_one_
 
 def test_a_lock_keeps_others_out_and_leaves_nothing(tmp_path: Path) -> None:
     lock = tmp_path / "new" / ".lock"
-    with locked(lock, "facediff test"), pytest.raises(FaceDiffError, match="new: another `facediff test`"):
+    who = rf"new: another `facediff test` \(process {os.getpid()} on .*\) is at work here"
+    with locked(lock, "facediff test"), pytest.raises(FaceDiffError, match=who):
         locked(lock, "facediff test").__enter__()
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").touch()
@@ -311,12 +313,47 @@ def test_what_a_killed_process_left_is_removed_and_what_a_living_one_writes_stay
     assert {path.name for path in tmp_path.iterdir()} == {"b.npy", "c.npy"}
 
 
-def test_a_lock_that_is_a_link_destroys_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("hard", [False, True])
+def test_a_lock_that_is_a_link_destroys_nothing(hard: bool, tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("precious")
-    (tmp_path / ".lock").symlink_to(tmp_path / "precious")
-    with pytest.raises(FaceDiffError, match="cannot be written"):
-        locked(tmp_path / ".lock", "facediff test").__enter__()
+    if hard:
+        (tmp_path / ".lock").hardlink_to(tmp_path / "precious")
+        with locked(tmp_path / ".lock", "facediff test"):
+            pass
+    else:
+        (tmp_path / ".lock").symlink_to(tmp_path / "precious")
+        with pytest.raises(FaceDiffError, match="cannot be written"):
+            locked(tmp_path / ".lock", "facediff test").__enter__()
     assert (tmp_path / "precious").read_text() == "precious"
+
+
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from facediff.utils.files import locked
+
+with locked(Path(sys.argv[1]), "facediff test"):
+    worker = os.fork()
+    if worker == 0:
+        time.sleep(60)
+    print(worker, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes can be forked here")
+def test_the_lock_of_a_killed_process_is_free_although_its_workers_live(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", KILLED, str(tmp_path / ".lock")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as killed:
+        assert killed.stdout is not None
+        worker = int(killed.stdout.readline())
+        try:
+            assert killed.wait(60) == -signal.SIGKILL
+            os.kill(worker, 0)  # lives
+            with locked(tmp_path / ".lock", "facediff test"):
+                pass
+        finally:
+            os.kill(worker, signal.SIGKILL)
 
 
 def test_a_folder_that_may_not_be_written_is_refused_before_a_writer_has_its_own_words(
