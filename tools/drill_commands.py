@@ -1,6 +1,6 @@
 """What ``tools/fault_drill.py`` runs: every command that writes, on inputs of a few kilobytes.
 
-A command without an entry in :data:`DRILLS`, :data:`WRITES_NOTHING` or :data:`SERVES` makes a test fail.
+A command without an entry in :data:`DRILLS`, :data:`SERVES` or :data:`WRITES_NOTHING` makes a test fail.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 TINY = "tests.fakes.tiny.Tiny"
+WEB_RUNTIME = "onnxruntime-web"
+"""A folder with files in place of ONNX Runtime for browsers, which comes from the npm registry."""
 RUN = "--trainer.accelerator=cpu --trainer.enable_progress_bar=false --trainer.logger.version=0"
 PAPER = f"ours corpus --method other=theirs --topology {TINY} --width 120"
 SMALL_MODEL = """\
@@ -119,7 +121,14 @@ DRILLS = [
         "author.pth --dataset vocaset --identities A,B,C --templates faces.pkl --audio-config audio.json -o made.ckpt",
         "author.pth --dataset vocaset --identities A,B,D --templates faces.pkl --audio-config audio.json -o made.ckpt",
     ),
+    Drill(
+        "animate",
+        "speech.wav --checkpoint face --quiet -o a.npz",
+        "speech.wav --checkpoint face --quiet --seed 5 -o a.npz",
+        label="exported",
+    ),
     Drill("export-model", "model.ckpt -o face-onnx", once=True),
+    Drill("serve", "face -o site", also=WEB_RUNTIME, once=True),
     Drill("publish", "model.ckpt face --license mit", also="test_scores.csv", once=True),
     Drill(
         "style extract",
@@ -217,11 +226,49 @@ DRILLS = [
 """One or several for each command that writes, except ``fit``, which has a drill of its own."""
 
 WRITES_NOTHING = ("components", "data check")
-SERVES = ("study serve", "serve", "live")
-"""Run until they are stopped. The first writes in transactions of SQLite, and tests/study/test_store.py kills it; what
-the second writes with --output, tests/runtime/test_site.py interrupts; what the third writes are files of receivers,
-which differ from run to run by the lag that they state."""
 FIT = "fit"
+
+
+@dataclass(frozen=True)
+class Served:
+    """A command that serves a page until it is stopped, or until the speech is over.
+
+    Attributes:
+        command: its name in ``facediff.cli.app.COMMANDS``.
+        words: what follows the name, with ``{port}`` for the port.
+        also: inputs that the words do not mention.
+        same: whether the page is the same at each start.
+        answers: the folder of the study whose raters answer meanwhile; empty for none.
+        lines: the file of JSON lines that it writes; empty for none.
+    """
+
+    command: str
+    words: str
+    also: str = ""
+    same: bool = True
+    answers: str = ""
+    lines: str = ""
+
+    def argv(self, port: int) -> list[str]:
+        """The words after ``facediff``."""
+        return [*self.command.split(), *self.words.format(port=port).split()]
+
+    def inputs(self, folder: Path) -> list[Path]:
+        """The inputs that the words mention."""
+        return [path for path in sorted(folder.iterdir()) if path.name in f"{self.words} {self.also}".split()]
+
+
+SERVES = [
+    Served("study serve", "answered --port {port}", answers="answered"),
+    Served("serve", "face --port {port}", also=WEB_RUNTIME),
+    Served(
+        "live",
+        "face long.wav --to browser:{port} --to jsonl:take.jsonl?weights=false&vertices=true",
+        same=False,
+        lines="take.jsonl",
+    ),
+]
+"""Struck while a client asks for the page, and answers the study's questions."""
 
 
 def write_inputs(folder: Path, run: object) -> None:
@@ -232,6 +279,7 @@ def write_inputs(folder: Path, run: object) -> None:
         run: called with the words of a command and the folder to run it in.
     """
     import numpy as np
+    import soundfile
     import trimesh
 
     from facediff.animation import Animation, write_archive
@@ -262,7 +310,13 @@ def write_inputs(folder: Path, run: object) -> None:
     shutil.move(made, folder / "model.ckpt")
     shutil.rmtree(folder / "training")
 
+    run(["export-model", "model.ckpt", "-o", "face"], folder)
+    (folder / WEB_RUNTIME).mkdir()
+    for name in ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.wasm"):
+        (folder / WEB_RUNTIME / name).write_bytes(name.encode())
+
     shutil.copy(corpus / "wav" / "A_e06.wav", folder / "speech.wav")
+    soundfile.write(folder / "long.wav", np.sin(np.arange(3 * 16_000) / 9) * rng.random(3 * 16_000), 16_000)
     (folder / "recordings").mkdir()
     for clip in ("A_e01", "A_e02"):
         shutil.copy(corpus / "wav" / f"{clip}.wav", folder / "recordings" / f"{clip}.wav")

@@ -15,6 +15,8 @@ Faults of a command: ``kill`` (SIGKILL, half of them at the moment of a write, h
 Ctrl-C), ``full`` (a disk with room for a part of what the command writes), ``denied`` (folders that may not be written,
 files that may not be read) and ``damage`` (cut, flipped, empty or grown inputs and earlier outputs). ``fit`` is killed
 and resumed by ``--ckpt_path last`` until it ends; its curve and weights must equal an uninterrupted run's bit for bit.
+Commands that serve are killed and stopped while a client asks for the page and answers the study: what was acknowledged
+must be stored, every line that live has written must be whole, and the next start must serve on the same port.
 
 With ``--dask``, every command that takes ``--scheduler`` does its tasks on a Dask cluster of two workers.
 
@@ -31,6 +33,7 @@ import atexit
 import csv
 import ctypes
 import hashlib
+import http.client
 import importlib
 import json
 import os
@@ -40,11 +43,14 @@ import re
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 import traceback
+import urllib.error
+import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -59,7 +65,7 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from tools.dask_processes import DaskProcesses  # noqa: E402
-from tools.drill_commands import DRILLS, FIT, Drill, write_inputs  # noqa: E402
+from tools.drill_commands import DRILLS, FIT, SERVES, WEB_RUNTIME, Drill, Served, write_inputs  # noqa: E402
 
 COUNTS = ("lost", "corrupt", "wrong", "left over", "ill-mannered")
 FAULTS = ("kill", "stop", "full", "denied", "damage")
@@ -259,7 +265,11 @@ def run_forked(
         prepare()
         count = watch_writes(place, writer, point)
         from facediff.cli import app, demo
+        from facediff.runtime import onnxruntime_web
 
+        if Path(WEB_RUNTIME).exists():
+            files = {path.name: path.resolve() for path in Path(WEB_RUNTIME).iterdir()}
+            onnxruntime_web.web_runtime = lambda *_, **__: files
         if Path("demo.yaml").exists():
             demo.CONFIG = "demo.yaml"
         sys.argv = ["facediff", *words]
@@ -894,6 +904,152 @@ class FitDriller:
         return {"after": self.random.uniform(0, self.whole.seconds)}
 
 
+# Serving
+
+
+class ServeDriller:
+    """Kills and stops a command that serves, while a client is at work.
+
+    Args:
+        served: the command.
+        inputs: the folder of all inputs.
+        scratch: an empty folder.
+        seed: of the moments.
+    """
+
+    SECONDS = 4.0
+    """Longest time until a strike; live speech ends before, sometimes."""
+
+    def __init__(self, served: Served, inputs: Path, scratch: Path, seed: int) -> None:
+        self.served = served
+        self.scratch = scratch
+        self.random = random.Random(f"{seed} {served.command} serves")  # noqa: S311
+        self.scores = {"kill": Score(), "stop": Score()}
+        self.page = ""
+        (scratch / "matplotlib").mkdir()
+        (scratch / "begin" / "work").mkdir(parents=True)
+        for path in served.inputs(inputs):
+            copy(path, scratch / "begin" / "work" / path.name)
+        self.before = tree(scratch / "begin" / "work")
+
+    def drill(self, kills: int, stops: int) -> dict[str, Score]:
+        """All rounds."""
+        for fault, count in (("kill", kills), ("stop", stops)):
+            for index in range(count):
+                number = signal.SIGKILL if fault == "kill" else self.random.choice([signal.SIGTERM, signal.SIGINT])
+                self.round(f"{fault}{index}", number, self.scores[fault])
+        return self.scores
+
+    def round(self, name: str, number: int, score: Score) -> None:
+        """Serve, strike, look, serve again on the same port, and end by Ctrl-C."""
+        place = self.scratch / name
+        copy(self.scratch / "begin", place)
+        port = free_port()
+        score.rounds += 1
+        after = self.random.uniform(0.2, self.SECONDS)
+        what = f"{self.served.command}, {name}, {signal.Signals(number).name} after {after:.2f} s"
+        for again, signalled, seconds in ((False, number, after), (True, signal.SIGINT, self.SECONDS)):
+            log = place / f"client{again:d}.json"
+            client = os.fork()
+            if client == 0:
+                run_client(port, log, self.served.answers)
+            run = execute(self.served.argv(port), place, number=signalled, after=seconds)
+            os.kill(client, signal.SIGTERM)
+            os.waitpid(client, 0)
+            score.struck += run.struck and not again
+            said = (run.out + run.err).strip()[-300:]
+            orderly = () if signalled == signal.SIGKILL else (128 + signalled,)
+            if run.status not in (0, -signalled, *orderly) or "Traceback" in said or "Exception ignored" in said:
+                score.note("ill-mannered", f"{what}: status {run.status}: {said}")
+            told = json.loads(log.read_text()) if log.exists() else {"pages": [], "raters": [], "statuses": []}
+            self.judge(place, told, what, score, again=again)
+        shutil.rmtree(place)
+
+    def judge(self, place: Path, told: dict[str, Any], what: str, score: Score, *, again: bool) -> None:
+        """What the client was told, and what is there now."""
+        if again and not told["pages"]:
+            score.note("wrong", f"{what}: the next start served nothing")
+        if bad := [status for status in told["statuses"] if status != 200]:
+            score.note("wrong", f"{what}: answered {bad[:5]}")
+        for page in told["pages"]:
+            self.page = self.page or page
+            if self.served.same and page != self.page:
+                score.note("wrong", f"{what}: another page")
+        if self.served.answers:
+            from facediff.study import read_study
+            from facediff.study.definition import DATABASE
+            from facediff.study.store import AnswerStore
+
+            folder = place / "work" / self.served.answers
+            stored = {rater.token: rater for rater in AnswerStore(folder / DATABASE, read_study(folder)).raters()}
+            for token, trial in told["raters"]:
+                if token not in stored or trial not in stored[token].answers:
+                    score.note("lost", f"{what}: an answer that was acknowledged")
+        if self.served.lines and (file := place / "work" / self.served.lines).exists():
+            for index, line in enumerate(file.read_text().split("\n")[:-1]):  # a kill may cut the last one
+                with suppress(ValueError):
+                    json.loads(line)
+                    continue
+                score.note("corrupt", f"{what}: line {index} of {self.served.lines}")
+        found = tree(place / "work")
+        for name, mark in self.before.items():
+            if found.get(name) != mark and not (self.served.answers and ".sqlite" in name):
+                score.note("corrupt" if name in found else "lost", f"{what}: {name}")
+        for name in found.keys() - self.before.keys() - {self.served.lines}:
+            if again and not name.endswith(("-wal", "-shm")):
+                score.note("left over", f"{what}: {name}")
+
+
+def free_port() -> int:
+    """A port that nobody listens at."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        return int(listening.getsockname()[1])
+
+
+def run_client(port: int, log: Path, answers: str) -> None:
+    """Ask for the page, and answer as raters do, until this process is ended; what was answered goes to a file."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    told: dict[str, list[Any]] = {"pages": [], "raters": [], "statuses": []}
+
+    def ask(path: str, content: object = None) -> bytes:
+        body = None if content is None else json.dumps(content).encode()
+        request = urllib.request.Request(  # noqa: S310 - our own server
+            f"http://127.0.0.1:{port}{path}", body, {"Content-Type": "application/json"}
+        )
+        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310
+            return bytes(response.read())
+
+    try:
+        study = None
+        if answers:
+            from facediff.study import read_study
+
+            study = read_study(log.parent / "work" / answers)
+        while True:
+            time.sleep(0.05)
+            try:
+                told["pages"].append(hashlib.sha256(ask("/")).hexdigest()[:16])
+                if study is not None:
+                    token = os.urandom(16).hex()
+                    common = {"study": study.id, "rater": token}
+                    begun = {**common, "language": "en", "code": "", "agreed": True}
+                    number = json.loads(ask("/api/raters", begun))["number"]
+                    trial = study.trials_of(number)[0].id
+                    given = {name: "left" for name in ("realism", "style")}
+                    facts = {"trial": trial, "answers": given, "seconds": 1.0, "plays": 1}
+                    ask("/api/answers", {**common, **facts, "at": "2026-01-01T00:00:00.000Z"})
+                    told["raters"].append([token, trial])
+            except urllib.error.HTTPError as error:
+                told["statuses"].append(error.code)
+            except (OSError, http.client.HTTPException):  # not yet, or no longer
+                pass
+            partial = log.with_suffix(".new")
+            partial.write_text(json.dumps(told))
+            partial.rename(log)
+    finally:
+        os._exit(1)
+
+
 # The whole drill
 
 
@@ -1031,6 +1187,14 @@ def main(words: Sequence[str] | None = None) -> int:
             place = folder / f"drill{index}"
             place.mkdir()
             tasks[drill.name] = lambda drill=drill, place=place: drill_one(drill, inputs, place, args)
+        for index, served in enumerate(SERVES):
+            if args.only and not any(text in served.command for text in args.only):
+                continue
+            place = folder / f"serve{index}"
+            place.mkdir()
+            tasks[f"{served.command} (served)"] = lambda served=served, place=place: ServeDriller(
+                served, inputs, place, args.seed
+            ).drill(args.kills, args.stops)
         results = separately(tasks, args.jobs, folder)
     text = table(results)
     text += f"\n\nSeed {args.seed}; small disk: {small_disk()}; {time.monotonic() - started:.0f} s.\n"

@@ -11,17 +11,20 @@ from pathlib import Path
 import pytest
 
 from facediff.cli.app import COMMANDS
+from facediff.study.definition import DATABASE
+from facediff.study.store import AnswerStore
+from tests.fakes.study import small_study, write_study
 from tools import fault_drill
-from tools.drill_commands import DRILLS, FIT, SERVES, WRITES_NOTHING, Drill
-from tools.fault_drill import COUNTS, Driller, Run, Score, damaged, table, tree
+from tools.drill_commands import DRILLS, FIT, SERVES, WRITES_NOTHING, Drill, Served
+from tools.fault_drill import COUNTS, Driller, Run, Score, ServeDriller, damaged, table, tree
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_every_command_is_drilled_or_writes_nothing() -> None:
     drilled = {drill.command for drill in DRILLS}
-    assert drilled | {FIT} | {*WRITES_NOTHING, *SERVES} == set(COMMANDS)
-    assert not drilled & {*WRITES_NOTHING, *SERVES}
+    assert drilled | {FIT} | {*WRITES_NOTHING} | {served.command for served in SERVES} == set(COMMANDS)
+    assert not drilled & {*WRITES_NOTHING}
     assert len({drill.name for drill in DRILLS}) == len(DRILLS)
 
 
@@ -100,6 +103,31 @@ def test_manners(driller: Driller, status: int, error: str, mannered: bool) -> N
     driller.judge_manners(Run(status, "", error, 1.0), (0, 1, 2))
     assert bool(driller.score.counts) != mannered
     assert set(driller.score.counts) <= {"ill-mannered"}
+
+
+@pytest.mark.parametrize(
+    ("told", "lines", "count"),
+    [
+        ({}, '{"a": 1}\n{"b"', ""),  # the last line was cut by a kill
+        ({}, '{"a"\n{"b": 1}\n', "corrupt"),
+        ({"pages": []}, "", "wrong"),
+        ({"pages": ["one", "two"]}, "", "wrong"),
+        ({"statuses": [200, 500]}, "", "wrong"),
+        ({"raters": [["0" * 32, "1" * 16]]}, "", "lost"),
+    ],
+)
+def test_what_a_server_has_said_and_written_is_looked_at(
+    told: dict[str, list[object]], lines: str, count: str, tmp_path: Path
+) -> None:
+    made = ServeDriller.__new__(ServeDriller)
+    made.served, made.page, score = Served("live", "", lines="take.jsonl", answers="answered"), "", Score()
+    (tmp_path / "work").mkdir()
+    asked = small_study(clips=3)
+    AnswerStore(write_study(tmp_path / "work" / "answered", asked) / DATABASE, asked)
+    made.before = tree(tmp_path / "work")
+    write(tmp_path, "take.jsonl", lines)
+    made.judge(tmp_path, {"pages": ["one"], "raters": [], "statuses": [], **told}, "round", score, again=True)
+    assert dict(score.counts) == ({count: 1} if count else {})
 
 
 def test_what_a_clock_wrote_makes_no_difference(tmp_path: Path) -> None:
