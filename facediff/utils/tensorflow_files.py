@@ -3,7 +3,7 @@
 A checkpoint of TensorFlow 1 and 2 is a *bundle*: ``NAME.index`` says where the bytes of every tensor lie in
 ``NAME.data-00000-of-00001``. The index is a sorted table as LevelDB writes one, whose values are messages of Protocol
 Buffers. A frozen graph (``output_graph.pb``) is one such message, whose nodes of the type ``Const`` hold the weights.
-From top to bottom: messages, the checksum, the table, the bundle, the graph. Both formats are public; nothing of a file
+From top to bottom: shapes, the checksum, the table, the bundle, the graph. Both formats are public; nothing of a file
 is run, and every size and place that it states is compared with the file before it is believed.
 """
 
@@ -22,6 +22,15 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.protobuf import (
+    DamagedError,
+    Message,
+    bytes_field,
+    decode_name,
+    integer_field,
+    parse_message,
+    read_varint,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -46,107 +55,6 @@ TYPES = {1: "<f4", 2: "<f8", 3: "<i4", 4: "u1", 5: "<i2", 6: "i1", 9: "<i8", 10:
 
 FLOATS = {1: "<f4", 2: "<f8", 19: "<f2"}
 """Those of them that weights have."""
-
-
-class DamagedError(ValueError):
-    """What is wrong with a file, for the sentence that names it."""
-
-
-# Messages of Protocol Buffers.
-
-Message = dict[int, list["int | memoryview"]]
-"""The values of a message by the number of their field, in their order: whole numbers, or bytes."""
-
-
-def read_varint(view: memoryview, at: int) -> tuple[int, int]:
-    """A whole number of variable length, 7 bits a byte from the lowest on, and where it ends.
-
-    >>> read_varint(memoryview(bytes([0xAC, 0x02])), 0)
-    (300, 2)
-
-    Raises:
-        DamagedError: if it has no end within the bytes, or takes more than 64 bits.
-    """
-    value = 0
-    for number in range(10):
-        if at >= len(view):
-            raise DamagedError("a number in it is cut short")
-        byte = view[at]
-        value |= (byte & 127) << (7 * number)
-        at += 1
-        if byte < 128:
-            if value >> 64:
-                break
-            return value, at
-    raise DamagedError("a number in it takes more than 64 bits")
-
-
-def parse_message(view: memoryview) -> Message:
-    """The fields of a message, which may have been written by any version of its definition.
-
-    Raises:
-        DamagedError: if it is cut short, or is no message.
-        FaceDiffError: if it has more fields than the budget allows.
-    """
-    fields: Message = {}
-    at = count = 0
-    while at < len(view):
-        key, at = read_varint(view, at)
-        field, wire = key >> 3, key & 7
-        value: int | memoryview
-        if not field or wire not in (0, 1, 2, 5):
-            raise DamagedError("it holds something else than messages")
-        if wire == 0:
-            value, at = read_varint(view, at)
-        else:
-            size = {1: 8, 5: 4}.get(wire, 0)
-            if wire == 2:
-                size, at = read_varint(view, at)
-            if size > len(view) - at:
-                raise DamagedError("a message in it is cut short")
-            value = view[at : at + size]
-            at += size
-        fields.setdefault(field, []).append(value)
-        count += 1
-        if count > LIMITS.entries:
-            raise DamagedError("a message in it has more fields than the budget allows")
-    return fields
-
-
-def integer_field(fields: Message, number: int, default: int = 0) -> int:
-    """The whole number of a field; the last one counts if there are several, as the format says.
-
-    Raises:
-        DamagedError: if it is of another type.
-    """
-    value = fields.get(number, [default])[-1]
-    if isinstance(value, memoryview):
-        raise DamagedError("a number in it has another type than expected")
-    return value - (1 << 64) if value >> 63 else value
-
-
-def bytes_field(fields: Message, number: int) -> memoryview:
-    """The bytes of a field, of which the last counts; none if it is absent.
-
-    Raises:
-        DamagedError: if it is of another type.
-    """
-    value = fields.get(number, [memoryview(b"")])[-1]
-    if not isinstance(value, memoryview):
-        raise DamagedError("a message in it has another type than expected")
-    return value
-
-
-def decode_name(view: memoryview) -> str:
-    """The text of a field.
-
-    Raises:
-        DamagedError: if it is no UTF-8.
-    """
-    try:
-        return bytes(view).decode()
-    except UnicodeDecodeError as error:
-        raise DamagedError("a name in it is no text") from error
 
 
 def parse_shape(view: memoryview) -> tuple[int, ...]:
