@@ -8,7 +8,7 @@ where its loop starts from more than noise, ``style.onnx`` of one that takes sty
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_args
@@ -17,11 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.runtime.graph_check import REMEDY, check_graph
 from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.speech.windows import WindowPlan
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
+from facediff.utils.limits import quoted
 from facediff.utils.plain_files import load_json
 
 FORMAT = "facediff model"
@@ -33,6 +35,9 @@ NEEDED = {"sampled": ("speech", "step", "motion"), "direct": ("speech", "motion"
 
 OPTIONAL = {"sampled": ("start", "style"), "direct": ("style",)}
 """Graphs that some folders have besides."""
+
+MOST_STEPS = 1000
+"""Most diffusion steps that a folder may state."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -157,7 +162,7 @@ KINDS: dict[str, type | tuple[type, ...]] = {
 
 
 def read_folder(folder: Path) -> tuple[Description, Arrays]:
-    """Description and arrays of an exported model."""
+    """Description and arrays of an exported model; its graphs are read by :func:`check_graphs`."""
     if not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; {EXPECTED}")
     path = folder / DESCRIPTION
@@ -191,7 +196,17 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
             )
     arrays = read_arrays(folder / ARRAYS)
     _check_arrays(folder / ARRAYS, description, arrays)
+    _check_ends(path, description, arrays)
     return description, arrays
+
+
+def check_graphs(folder: Path, description: Description, names: Iterable[str]) -> int:
+    """Read graphs of a folder before anything runs them, as :func:`~facediff.runtime.graph_check.check_graph` does.
+
+    Returns:
+        how many bytes a node of any of them may have that is computed while it is opened.
+    """
+    return min(check_graph(folder / f"{name}.onnx", description.opset, description.graphs[name]) for name in names)
 
 
 def _check(path: Path, description: Description) -> None:
@@ -224,8 +239,8 @@ def _check(path: Path, description: Description) -> None:
             refuse(name, f"{least} to 10000000")
     for steps, table, least in (("steps", "table", int(sampled)), ("quick_steps", "quick_table", 0)):
         visited, rows = getattr(description, steps), getattr(description, table)
-        if not least <= len(visited) <= 100_000 or not all(isinstance(step, int) and step >= 0 for step in visited):
-            refuse(steps, "steps of the noise process")
+        if not least <= len(visited) <= MOST_STEPS or not all(isinstance(step, int) and step >= 0 for step in visited):
+            refuse(steps, f"{least} to {MOST_STEPS} steps of the noise process")
         if len(rows) != len(visited) or not all(
             isinstance(row, list) and len(row) == 5 and all(isinstance(number, int | float) for number in row)
             for row in rows
@@ -304,6 +319,61 @@ def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
             indices = arrays[name]
             if indices.size and not 0 <= int(indices.min()) <= int(indices.max()) < vertices:
                 raise FaceDiffError(f"{path}: {name} names vertices that do not exist; export the model again")
+
+
+def _check_ends(path: Path, description: Description, arrays: Arrays) -> None:
+    """Refuse graphs whose inputs and outputs are not those of the model that the description and the arrays state."""
+    about, graphs, vertices = description, description.graphs, arrays["templates"].shape[1]
+    try:
+        features = graphs["speech"]["outputs"][0]["shape"][2:]
+    except (KeyError, TypeError, IndexError) as error:
+        raise FaceDiffError(f"{path}: graphs describes no speech features; {REMEDY}") from error
+    style = arrays["styles"].shape[1] if about.style_source == "reference" else 0
+    drawn, decoded = about.drawn or about.state, about.kept if about.decoded == "kept" else about.state
+    frames = ["batch", "frames"]
+    shared: dict[str, list[Any]] = {
+        **{"features": ["float", *frames, *features], "mask": ["bool", *frames], "identity": ["int64", "batch"]},
+        **{"style": ["float", "batch", style], "template": ["float", "batch", vertices, 3]},
+    }
+    loop: dict[str, list[Any]] = {
+        **{"state": ["float", *frames, about.state], "step": ["int64", "batch"]},
+        **{"before": ["float", *frames, about.kept], "share": ["float", *frames]},
+    }
+    heard: dict[str, list[Any]] = {
+        **{"audio": ["float", "batch", "samples"], "mean": ["float", "batch"], "deviation": ["float", "batch"]},
+        **{"samples": ["int64", "batch"], "mask": ["bool", *frames]},
+    }
+    noise, offsets = ["float", *frames, drawn], ["float", *frames, vertices, 3]
+    expected: dict[str, tuple[Mapping[str, list[Any]], list[list[Any]]]] = {
+        "speech": (heard, [shared["features"]]),
+        "start": ({"noise": noise}, [loop["state"]]),
+        "step": ({**shared, **loop}, [loop["state"], loop["before"]]),
+        "motion": ({"sample": ["float", *frames, decoded], "noise": noise}, [offsets]),
+        "style": ({"motion": offsets, "mask": heard["mask"]}, [["float", "batch", style]]),
+    }
+    if about.generation == "direct":
+        expected["motion"] = shared, [offsets]
+    for graph, (inputs, outputs) in expected.items():
+        for key in ("inputs", "outputs") if graph in graphs else ():
+            ends = graphs[graph].get(key) if isinstance(graphs[graph], dict) else None
+            fits = isinstance(ends, list) and len(ends) > 0 and all(isinstance(end, dict) for end in ends)
+            wanted = [inputs.get(str(end.get("name"))) for end in ends or ()] if fits and key == "inputs" else outputs
+            if not fits or len(ends or ()) != len(wanted) or not all(map(_is_end, ends or (), wanted)):
+                raise FaceDiffError(
+                    f"{path}: {key} of the graph {graph} are {quoted(ends)}, expected those of a model with "
+                    f"{about.state} numbers of state, {about.kept} kept and {vertices} vertices; {REMEDY}"
+                )
+
+
+def _is_end(end: Mapping[str, Any], wanted: list[Any] | None) -> bool:
+    """Whether an input or output has a type and a shape; text stands for any length."""
+    shape = end.get("shape")
+    if wanted is None or end.get("type") != wanted[0] or not isinstance(shape, list) or len(shape) + 1 != len(wanted):
+        return False
+    return all(
+        isinstance(size, str) if isinstance(want, str) else type(size) is int and size == want
+        for size, want in zip(shape, wanted[1:], strict=True)
+    )
 
 
 def copy_exported(source: Path, folder: Path) -> int:

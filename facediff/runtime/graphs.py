@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -10,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.runtime.folder import Arrays, Description, read_folder
+from facediff.runtime.folder import Arrays, Description, check_graphs, read_folder
+from facediff.runtime.graph_check import REMEDY
+from facediff.utils.limits import LIMITS, brief
 
 if TYPE_CHECKING:
     import onnxruntime  # type: ignore[import-untyped]
@@ -57,22 +63,26 @@ class ExportedGraphs:
 
         folder = Path(folder)
         description, arrays = read_folder(folder)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.log_severity_level = 3  # warnings are about optimisations that do not apply
-        # Threads that wait by spinning take the processor from whatever else runs: where something does, a frame takes
-        # twice as long.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
 
         def load(name: str) -> onnxruntime.InferenceSession:
             path = folder / f"{name}.onnx"
+            largest = check_graphs(folder, description, [name])
+            options = onnxruntime.SessionOptions()
+            options.intra_op_num_threads = threads
+            options.log_severity_level = 4  # errors are raised; warnings are about optimisations that do not apply
+            # Threads that wait by spinning take the processor from whatever else runs: where something does, a frame
+            # takes twice as long.
+            options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+            options.add_session_config_entry("session.use_env_allocators", "1")
+            options.add_session_config_entry("optimization.constant_folding_max_output_size_in_bytes", str(largest))
             try:
+                limit_memory()
                 return onnxruntime.InferenceSession(
                     path, options, providers=list(providers or ["CPUExecutionProvider"])
                 )
             except Exception as error:  # ONNX Runtime's own errors share no base class
                 raise FaceDiffError(
-                    f"{path}: ONNX Runtime cannot read it ({str(error)[:80]}); export the model again"
+                    f"{path}: ONNX Runtime cannot read it ({brief(error)}); export the model again"
                 ) from error
 
         return cls(description, arrays, load)
@@ -87,9 +97,85 @@ class ExportedGraphs:
         return graph in self.description.graphs
 
     def run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
-        """Results of a graph, which ignores the inputs that it does not declare."""
+        """Results of a graph, which ignores the inputs that it does not declare.
+
+        Raises:
+            FaceDiffError: if it fails, takes more memory or time than the budget, or gives other shapes than declared.
+        """
         if graph not in self._sessions:
             self._sessions[graph] = self._load(graph)
         session = self._sessions[graph]
         declared = {node.name for node in session.get_inputs()}
-        return cast(list[Array], session.run(None, {name: inputs[name] for name in inputs if name in declared}))
+        given = {name: inputs[name] for name in inputs if name in declared}
+        ends, axes = self.description.graphs[graph], dict[str, int]()
+        for end in ends.get("inputs", ()):
+            axes.update(zip(end["shape"], given[end["name"]].shape, strict=False))
+        seconds = LIMITS.computing * max(1, math.ceil(axes.get("frames", 1) / self.frame_rate))
+        what = f"{graph}.onnx of {self.description.model}"
+        try:
+            with limited_time(seconds) as options:
+                results = cast(list[Array], session.run(None, given, options))
+        except Exception as error:  # ONNX Runtime's own errors share no base class
+            if options.terminate:
+                problem = f"computes for more than {seconds:g} s; if you trust it, set FACEDIFF_MAX_COMPUTING higher"
+            elif "requested b" in str(error) or isinstance(error, MemoryError):
+                problem = (
+                    f"needs more memory than {LIMITS.bytes:g} bytes; animate in shorter windows, or, if you trust it, "
+                    f"set FACEDIFF_MAX_BYTES higher"
+                )
+            else:
+                problem = f"cannot be computed ({brief(error)}); {REMEDY}"
+            raise FaceDiffError(f"{what}: {problem}") from error
+        for end, result in zip(ends.get("outputs", ()), results, strict=False):
+            shape = tuple(axes.get(size, size) for size in end["shape"])
+            flat = result.ravel()
+            with np.errstate(all="ignore"):
+                if result.shape == shape and result.dtype == np.float32 and np.isfinite(flat @ flat):
+                    continue
+            raise FaceDiffError(
+                f"{what}: gives {result.dtype} {result.shape} as {end['name']}, expected finite float32 {shape}; "
+                f"{REMEDY}"
+            )
+        return results
+
+
+def limit_memory() -> None:
+    """Let the session that is opened next take no more memory than the budget, what its operators compute included."""
+    import onnxruntime
+
+    kinds = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    limit = onnxruntime.OrtArenaCfg({"max_mem": int(min(LIMITS.bytes, 1 << 62))})
+    # A session keeps the allocator that is registered when it is opened, so that each has a budget of its own.
+    onnxruntime.create_and_register_allocator(onnxruntime.OrtMemoryInfo("Cpu", *kinds), limit)
+
+
+_RUNNING: dict[onnxruntime.RunOptions, float] = {}
+"""Graphs that compute, and until when they may."""
+
+_WATCH: list[threading.Thread] = []
+"""The thread that ends them: one for all, since starting a thread takes longer than the run of a small graph."""
+
+
+@contextmanager
+def limited_time(seconds: float) -> Iterator[onnxruntime.RunOptions]:
+    """Options of a run that ends with an error after so many seconds; an operator that has begun is finished first."""
+    import onnxruntime
+
+    options = onnxruntime.RunOptions()
+    options.log_severity_level = 4  # what is wrong is said by the error
+    _RUNNING[options] = time.monotonic() + seconds
+    if not (_WATCH and _WATCH[0].is_alive()):
+        _WATCH[:] = [threading.Thread(target=_watch, name="facediff graphs", daemon=True)]
+        _WATCH[0].start()
+    try:
+        yield options
+    finally:
+        del _RUNNING[options]
+
+
+def _watch() -> None:
+    while True:
+        time.sleep(min(1.0, LIMITS.computing / 2))
+        for options, end in list(_RUNNING.items()):
+            if time.monotonic() > end:
+                options.terminate = True

@@ -21,7 +21,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.export.viewer.page import assemble, script_of
-from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, check_graphs, read_folder
 from facediff.runtime.onnxruntime_web import LICENCE
 from facediff.speech.inputs import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
@@ -90,6 +90,9 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
             have one name.
     """
     description, arrays = read_folder(folder)
+    # A page takes styles by their names: what encodes them from motion is left out.
+    graphs = [graph for graph in description.graphs if graph != "style"]
+    check_graphs(folder, description, graphs)
     examples: dict[str, Path] = {}
     for path in recordings:
         read_recording(path)
@@ -105,8 +108,6 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
     }
     files |= {f"recordings/{name}": path for name, path in examples.items()}
     files |= {f"onnxruntime/{name}": path for name, path in runtime.items()}
-    # A page takes styles by their names: what encodes them from motion is left out.
-    graphs = [graph for graph in description.graphs if graph != "style"]
     files |= {f"model/{name}": folder / name for name in (DESCRIPTION, ARRAYS, *(f"{graph}.onnx" for graph in graphs))}
     return files
 

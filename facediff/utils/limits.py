@@ -28,6 +28,7 @@ class Limits:
         identities: identities of a checkpoint or corpus, 100 000.
         nesting: depth of lists and dicts, 64.
         entries: entries of a list, a table or an archive, two million.
+        computing: seconds that a graph may compute for each begun second of speech, 60.
     """
 
     bytes: float = 4 * 2**30
@@ -37,6 +38,7 @@ class Limits:
     identities: float = 100_000
     nesting: float = 64
     entries: float = 2_000_000
+    computing: float = 60
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Limits:

@@ -1,20 +1,89 @@
-"""A folder as ``facediff export-model`` writes it, in miniature: all is valid but the graphs."""
+"""A folder as ``facediff export-model`` writes it, in miniature: its graphs have a few nodes, made without PyTorch."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
 
-from facediff.runtime.folder import ARRAYS, DESCRIPTION, NEEDED, Description
+from facediff.pipelines.export_model import OPSET, described_ends
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description
 from facediff.utils.plain_files import write_json
 
-VERTICES, STATE = 6, 8
+VERTICES, STATE, WIDTH = 6, 18, 3
+
+FLOAT, INT, BOOL = TensorProto.FLOAT, TensorProto.INT64, TensorProto.BOOL
+FRAMES = ["batch", "frames"]
+ENDS: dict[str, tuple[dict[str, tuple[int, list[Any]]], dict[str, list[Any]]]] = {
+    "speech": (
+        {"audio": (FLOAT, ["batch", "samples"]), "mean": (FLOAT, ["batch"]), "mask": (BOOL, FRAMES)},
+        {"features": [*FRAMES, WIDTH]},
+    ),
+    "step": (
+        {"features": (FLOAT, [*FRAMES, WIDTH]), "state": (FLOAT, [*FRAMES, STATE]), "step": (INT, ["batch"])},
+        {"prediction": [*FRAMES, STATE], "kept": [*FRAMES, STATE]},
+    ),
+    "motion": ({"sample": (FLOAT, [*FRAMES, STATE])}, {"offsets": [*FRAMES, VERTICES, 3]}),
+}
+
+Graphs = dict[str, onnx.ModelProto]
 
 
-def write_exported(folder: Path, **changes: object) -> Path:
-    """Write the folder; keyword arguments replace what the description says."""
+def node(operator: str, inputs: str, outputs: str, **attributes: Any) -> onnx.NodeProto:  # noqa: ANN401
+    """A node with the names of its inputs and outputs."""
+    return helper.make_node(operator, inputs.split(), outputs.split(), **attributes)
+
+
+def stored(name: str, value: Any) -> onnx.TensorProto:  # noqa: ANN401
+    """A tensor of the file; whole numbers are of 64 bits, others of 32."""
+    array = np.asarray(value)
+    return numpy_helper.from_array(array.astype(np.int64 if array.dtype.kind in "iu" else np.float32), name)
+
+
+def graphs() -> Graphs:
+    """The graphs of a model that samples."""
+    nodes = {
+        "speech": [
+            node("Cast", "mask", "wide", to=FLOAT),
+            node("Unsqueeze", "wide axis", "column"),
+            node("Mul", "column weights", "features"),
+        ],
+        "step": [node("Mul", "state half", "prediction"), node("Identity", "prediction", "kept")],
+        "motion": [node("Reshape", "sample shape", "offsets")],
+    }
+    tensors = {
+        "speech": [stored("axis", [-1]), stored("weights", [0.1, 0.2, 0.3])],
+        "step": [stored("half", [0.5])],
+        "motion": [stored("shape", [0, 0, VERTICES, 3])],
+    }
+    made = {}
+    for name, (inputs, outputs) in ENDS.items():
+        ends = [helper.make_tensor_value_info(key, *value) for key, value in inputs.items()]
+        results = [helper.make_tensor_value_info(key, FLOAT, shape) for key, shape in outputs.items()]
+        graph = helper.make_graph(nodes[name], name, ends, results, tensors[name])
+        made[name] = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=10)
+    return made
+
+
+def write_exported(
+    folder: Path, change: Callable[[Graphs, dict[str, Any]], object] | None = None, **changes: object
+) -> Path:
+    """Write the folder.
+
+    Args:
+        folder: to write.
+        change: of the graphs, which are described as they are then, and of what the description says.
+        changes: what replaces what the description says.
+    """
     folder.mkdir(parents=True)
+    documents = graphs()
+    if change is not None:
+        change(documents, changes)
     rng = np.random.default_rng(0)
     arrays = {
         "templates": rng.normal(0, 0.05, (2, VERTICES, 3)).astype(np.float32),
@@ -23,18 +92,18 @@ def write_exported(folder: Path, **changes: object) -> Path:
         "faces": np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]], np.int32),
     }
     np.savez_compressed(folder / ARRAYS, **arrays)  # type: ignore[arg-type]
-    for graph in NEEDED["sampled"]:
-        (folder / f"{graph}.onnx").write_bytes(b"no graph")
+    for name, document in documents.items():
+        (folder / f"{name}.onnx").write_bytes(document.SerializeToString())
     description = Description(
         model="DualPathDiffusion",
         facediff="0",
         corpus="tiny",
         synthetic=True,
         licences={},
-        opset=20,
+        opset=OPSET,
         precision="float32",
         sizes={path.name: path.stat().st_size for path in folder.iterdir()},
-        graphs={graph: {} for graph in NEEDED["sampled"]},
+        graphs={name: described_ends(document) for name, document in documents.items()},
         sample_rate=16_000,
         frame_rate=25.0,
         unit="m",
@@ -47,10 +116,18 @@ def write_exported(folder: Path, **changes: object) -> Path:
         state=STATE,
         kept=STATE,
         sampler="ddim",
-        steps=[1],
-        table=[[0.0, 1.0, 0.0, 0.0, 0.0]],
-        last_step=1,
+        steps=[3, 0],
+        table=[[0.5, 0.5, 0.0, 0.0, 0.0]] * 2,
+        last_step=0,
         decoded="sample",
     )
     write_json(folder / DESCRIPTION, {**description.content(), **changes})
     return folder
+
+
+def fit_sizes(folder: Path) -> None:
+    """Let ``model.json`` state the sizes that its files have."""
+    path = folder / DESCRIPTION
+    content = json.loads(path.read_text())
+    content["sizes"] = {each.name: each.stat().st_size for each in folder.iterdir() if each != path}
+    path.write_text(json.dumps(content))

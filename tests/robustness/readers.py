@@ -148,47 +148,35 @@ def read_a_benchmark_plan(path: Path) -> object:
     return read_outline(path.parent)
 
 
-def graphs_and_arrays(folder: Path) -> dict[str, int]:
-    """What lies next to an exported model's description; the sizes of the files."""
-    from facediff.runtime.folder import ARRAYS, NEEDED
-
-    for graph in NEEDED["sampled"]:
-        (folder / f"{graph}.onnx").write_bytes(b"graph")
-    arrays = {"templates": np.zeros((1, 4, 3), np.float32), "styles": np.zeros((1, 2), np.float32)}
-    np.savez(folder / ARRAYS, **arrays, rest_weights=np.ones((1, 4), np.float32))
-    return {
-        name: (folder / name).stat().st_size for name in (*(f"{graph}.onnx" for graph in NEEDED["sampled"]), ARRAYS)
-    }
-
-
 def exported_model(path: Path) -> None:
-    from facediff.runtime.folder import NEEDED, Description
+    from tests.fakes.exported import write_exported
 
-    sizes = graphs_and_arrays(path.parent)
-    windows = {"seconds": 4.0, "overlap": 1.0, "before": 2.0, "after": 0.5, "above": 10.0}
-    description = Description(
-        **{"model": "Model", "facediff": "1", "corpus": "tiny", "synthetic": True, "licences": {}, "opset": 20},
-        **{
-            "precision": "float32",
-            "sizes": sizes,
-            "graphs": dict.fromkeys(NEEDED["sampled"], {}),
-            "sample_rate": 16_000,
-            "frame_rate": 25.0,
-        },
-        **{"unit": "m", "identities": ["A"], "faces": ["A"], "styles": ["A"], "windows": windows, "epsilon": 1e-7},
-        **{"equal_lengths": False, "state": 8, "kept": 8, "sampler": "ddim", "steps": [0], "last_step": 0},
-        **{"table": [[0.0, 1.0, 0.0, 0.0, 0.0]], "decoded": "sample"},
-    )
-    path.write_text(json.dumps(description.content(), allow_nan=False))
+    folder = write_exported(path.with_name("exported"))
+    for each in folder.iterdir():
+        each.rename(path.parent / each.name)
+    folder.rmdir()
+    (path.parent / "model.json").rename(path)
 
 
 def read_an_exported_model(path: Path) -> object:
     from facediff.runtime.folder import read_folder
 
-    if path.is_file() and path.name != "model.json":
-        shutil.copy(path, path.with_name("model.json"))
-    graphs_and_arrays(path.parent)
-    return read_folder(path.parent)
+    exported_model(path.with_name("whole.json"))
+    return read_folder(Path(shutil.move(path, path.with_name("model.json"))).parent)
+
+
+def exported_graph(path: Path) -> None:
+    from tests.fakes.exported import graphs
+
+    path.write_bytes(graphs()["step"].SerializeToString())
+
+
+def read_an_exported_graph(path: Path) -> object:
+    from facediff.pipelines.export_model import OPSET, described_ends
+    from facediff.runtime.graph_check import check_graph
+    from tests.fakes.exported import graphs
+
+    return check_graph(path, OPSET, described_ends(graphs()["step"]))
 
 
 def benchmark_cell(path: Path) -> None:
@@ -934,6 +922,7 @@ READERS = {
     "plan": Reader(".yaml", plan, read_plan),
     "benchmark, plan": Reader(".json", benchmark_plan, read_a_benchmark_plan),
     "exported model": Reader(".json", exported_model, read_an_exported_model),
+    "exported graph": Reader(".onnx", exported_graph, read_an_exported_graph),
     "benchmark, cell": Reader(".json", benchmark_cell, read_a_benchmark_cell),
     "provenance": Reader(".json", provenance, read_a_provenance),
     "answers of a rater": Reader(".json", answers, read_the_answers),

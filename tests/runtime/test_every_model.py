@@ -81,7 +81,7 @@ class Session:
     def get_inputs(self) -> list[Any]:
         return [type("Input", (), {"name": name}) for name in self.graph.inputs]
 
-    def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+    def run(self, _: None, inputs: dict[str, np.ndarray], __: object) -> list[np.ndarray]:
         assert {*inputs} == {*self.graph.inputs}
         with torch.inference_mode():
             made = self.graph.module(*(torch.from_numpy(inputs[name]) for name in self.graph.inputs))
