@@ -29,6 +29,7 @@ from facediff.data.manifest import LONGEST
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_array, check_format, check_nesting, check_number, quoted
 from facediff.utils.plain_files import parse_json
+from facediff.utils.units import metres_per_unit
 
 FORMAT = "facediff packed corpus 1"
 RECORD = "facediff"
@@ -52,6 +53,8 @@ BLOB_CHUNK = 1 << 16
 BLOB_SHARD = 1 << 25
 PIECE_SECONDS = 10
 """Seconds of a FLAC stream."""
+MARGIN = 0.99
+"""Share of the tolerance for quantisation; the rest is for the rounding of vertices to single precision."""
 
 REMEDY = "get the packed corpus again, or pack it again"
 DAMAGED = "the packed corpus is damaged, " + REMEDY
@@ -150,7 +153,7 @@ class Record:
         frame_rate: stored motion frames a second.
         tolerance: millimetres by which a coordinate may differ from what was packed; 0 for lossless packing.
         step: what one step of the stored offsets is, in the corpus's unit; 0 for lossless packing.
-        unit: the corpus's unit of length.
+        unit: the corpus's unit of length; any text for lossless packing, which does not use it.
         chunk_seconds: the requested length of a chunk.
         identities: rows of ``templates``.
         clips: every clip, by name.
@@ -178,6 +181,21 @@ class Record:
             plain[name] = [asdict(entry) for entry in plain[name].values()]
         plain["arrays"] = {name: asdict(facts) for name, facts in self.arrays.items()}
         return {"format": FORMAT, **plain}
+
+
+def step_of(tolerance: float, unit: str) -> float:
+    """The step in a corpus's unit whose rounding, by half a step at most, keeps a tolerance in millimetres."""
+    return 2 * MARGIN * tolerance / (1000.0 * metres_per_unit(unit)) if tolerance else 0.0
+
+
+def chunk_frames(frame_rate: float, seconds: float) -> int:
+    """Frames of a chunk of motion."""
+    return max(1, round(frame_rate * seconds))
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether a clip's or an identity's name can be the name of a file in any folder."""
+    return bool(name) and not name.startswith(".") and not set(name) & set("/\\:")
 
 
 def read_record(text: bytes, source: str) -> Record:
@@ -224,6 +242,13 @@ class _Checks:
             raise FaceDiffError(f"{self.source}: {name} is {quoted(text)}; expected {expected}; {REMEDY}")
         return str(text)
 
+    def name(self, plain: Mapping[str, Any], name: str) -> str:
+        """A text that can be the name of a file."""
+        text = self.text(plain, name)
+        if not is_plain_name(text):
+            raise self.refuse(f"{name} is {quoted(text)}; expected a plain name, without / \\ : and no leading dot")
+        return text
+
     def items(self, plain: Mapping[str, Any], name: str) -> list[Any]:
         """A list."""
         entries = plain[name]
@@ -263,7 +288,7 @@ def _record(plain: dict[str, Any], checks: _Checks) -> Record:
     LIMITS.check("bytes", sum(file.bytes for file in files.values()), checks.source)
     identities = checks.items(plain, "identities")
     LIMITS.check("identities", len(identities), checks.source)
-    return Record(
+    record = Record(
         made_by=checks.text(plain, "made_by"),
         corpus=checks.text(plain, "corpus"),
         n_vertices=n_vertices,
@@ -272,11 +297,39 @@ def _record(plain: dict[str, Any], checks: _Checks) -> Record:
         step=checks.number(plain, "step", 0, 1e6),
         unit=checks.text(plain, "unit"),
         chunk_seconds=checks.number(plain, "chunk_seconds", 0, 1e6),
-        identities=tuple(checks.text({"identity": name}, "identity") for name in identities),
+        identities=tuple(checks.name({"identity": name}, "identity") for name in identities),
         clips=dict(sorted(clips.items())),
         files=files,
         arrays=arrays,
     )
+    _check_agreement(record, checks)
+    return record
+
+
+def _check_agreement(record: Record, checks: _Checks) -> None:
+    """Refuse a record whose declarations contradict each other: they determine what the stored numbers mean."""
+    codings = {clip.coding for clip in record.clips.values()}
+    if record.tolerance:
+        try:
+            step = step_of(record.tolerance, record.unit)
+        except FaceDiffError as error:
+            raise checks.refuse(str(error)) from error
+    else:
+        step = 0.0
+    if not math.isclose(record.step, step, rel_tol=1e-6) or (not step and codings & set(QUANTISED)):
+        expected = f"{step:.6g}" if step else "a tolerance above 0, since motion is quantised"
+        what = f"step is {record.step:.6g} at a tolerance of {record.tolerance:g} mm; expected {expected}"
+        raise checks.refuse(what)
+    frames = chunk_frames(record.frame_rate, record.chunk_seconds)
+    for name in sorted({f"motion_{coding}" for coding in codings}):
+        if record.arrays[name].chunk != frames:
+            raise checks.refuse(f"{name} has chunks of {record.arrays[name].chunk} frames; expected {frames}")
+    rows = _rows(record.arrays, "templates")
+    if rows != len(record.identities) or len(set(record.identities)) != rows:
+        raise checks.refuse(f"identities has {len(record.identities)} names; expected {rows} different ones")
+    for clip in record.clips.values():
+        if clip.identity not in record.identities:
+            raise checks.refuse(f"clip {clip.name} is of {clip.identity}, who is none of identities")
 
 
 def _rows(arrays: Mapping[str, ArrayFacts], name: str) -> int:
@@ -321,22 +374,21 @@ def _clip(plain: Mapping[str, Any], checks: _Checks, arrays: Mapping[str, ArrayF
         bits=checks.whole(sound, "bits", 0, 24),
     )
     clip = PackedClip(
-        name=checks.text(plain, "name"),
-        identity=checks.text(plain, "identity"),
+        name=checks.name(plain, "name"),
+        identity=checks.name(plain, "identity"),
         coding=checks.text(plain, "coding", list(CODINGS)),
         dtype=checks.text(plain, "dtype", list(EXACT)),
         first=checks.whole(plain, "first"),
         frames=checks.whole(plain, "frames", 1, LIMITS.frames),
         sound=packed_sound,
     )
-    _relative(f"{clip.name}.npy", checks)
-    if "/" in clip.name:
-        raise checks.refuse(f"has a clip {quoted(clip.name)}, which is no name of a file")
+    if clip.coding in EXACT and clip.dtype != clip.coding:
+        raise checks.refuse(f"clip {clip.name} was {clip.dtype}, but is coded as {clip.coding}")
     facts = arrays.get(f"motion_{clip.coding}")
     if facts is None or clip.first % facts.chunk or clip.first + clip.frames > facts.rows:
         raise checks.refuse(f"clip {clip.name} lies beyond its array")
     LIMITS.check("seconds", samples / packed_sound.rate, f"{checks.source}: clip {clip.name}")
-    if packed_sound.form == "flac" and packed_sound.bits not in (16, 24):
+    if packed_sound.bits not in ((16, 24) if packed_sound.form == "flac" else (0,)):
         raise checks.refuse(f"the speech of clip {clip.name} has {packed_sound.bits} bits")
     count = math.ceil(samples / (PIECE_SECONDS * packed_sound.rate)) if packed_sound.form == "flac" else 1
     if len(packed_sound.pieces) != count or packed_sound.first + sum(packed_sound.pieces) > _rows(arrays, "speech"):

@@ -36,7 +36,10 @@ from facediff.data.packed.layout import (
     PackedFile,
     PackedSound,
     Record,
+    chunk_frames,
+    is_plain_name,
     read_record,
+    step_of,
 )
 from facediff.data.packed.shards import shard_key
 from facediff.data.packed.stores import is_packed
@@ -46,7 +49,7 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.speech.audio import open_sound
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import in_order, run_tasks
-from facediff.utils.limits import LIMITS
+from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.units import metres_per_unit
 
@@ -59,8 +62,6 @@ Exact = Literal["test", "none"]
 LOCK = ".pack.lock"
 PARTS = "parts"
 """Folder in the store with the encoded speech of single clips, while packing runs."""
-MARGIN = 0.99
-"""Share of the tolerance for quantisation; the rest is for the rounding of vertices to single precision."""
 FINEST = 0.001
 """Smallest tolerance in millimetres: single precision rounds the vertices of a face by some hundred-thousandths."""
 BITS = {"PCM_16": 16, "PCM_24": 24, "PCM_S8": 16, "PCM_U8": 16}
@@ -239,10 +240,15 @@ class PackingPlan:
                 raise FaceDiffError(f"{root}: {error}; give it with --unit, or pack with --lossless") from error
             millimetres = 1.0
         rate = float(manifest.get("frame_rate") or view.stored_frame_rate)
-        chunk = max(1, round(rate * chunk_seconds))
-        step = 2 * MARGIN * tolerance / millimetres  # rounding to whole steps errs by half a step at most
+        chunk = chunk_frames(rate, chunk_seconds)
+        step = step_of(tolerance, named)
         coding = "int16" if step * millimetres * np.iinfo(np.int16).max >= ROOM else "int32"
         templates = read_templates(root / "templates.pkl", view.n_vertices)
+        if odd := [name for name in templates if not is_plain_name(name)]:
+            raise FaceDiffError(
+                f"{root / 'templates.pkl'}: has an identity {quoted(odd[0])}; expected plain names, without / \\ : and "
+                f"no leading dot"
+            )
         clips, arrays, left_out, size, seen = {}, {}, [], 0, hashlib.sha256()
         rows = dict.fromkeys(CODINGS, 0)
         kept = scored_clips(root, view) if tolerance and exact == "test" else frozenset()

@@ -8,10 +8,14 @@ from pathlib import Path
 import pytest
 
 from facediff.data.check import check
+from facediff.data.corpus import read_templates
+from facediff.data.packed.packing import pack
 from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.unpacking import unpack
+from facediff.data.prepare.runner import write_templates
 from facediff.errors import FaceDiffError
 from tests.data.packed.damage import RECORD, TINY, change, read_all
+from tests.fakes.tiny import write_tiny
 
 
 @pytest.fixture
@@ -29,15 +33,30 @@ def packed(sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
         (RECORD, "n_vertices", 25),
         (RECORD, "step", "0.1"),
         (RECORD, "step", float("nan")),
+        (RECORD, "step", 0),
+        (RECORD, "step", 0.0001),
+        (RECORD, "tolerance", 0),
+        (RECORD, "tolerance", 0.02),
+        (RECORD, "unit", "parsec"),
+        (RECORD, "unit", "cm"),
+        (RECORD, "frame_rate", 60),
+        (RECORD, "chunk_seconds", 5),
         (RECORD, "clips", {}),
         (RECORD, "arrays", []),
         (RECORD, "identities", [3]),
+        (RECORD, "identities", ["A", "B"]),
+        (RECORD, "identities", ["A", "B", "D"]),
+        (RECORD, "identities", ["A", "A", "A"]),
+        (RECORD, "identities", ["A", "B", "C", "D"]),
+        (RECORD, "identities", ["../../evil", "A", "B"]),
         (f"{RECORD}.clips.0", "first", 1),
         (f"{RECORD}.clips.0", "first", 10**9),
         (f"{RECORD}.clips.0", "frames", 10**5),
         (f"{RECORD}.clips.0", "frames", -1),
         (f"{RECORD}.clips.0", "coding", "object"),
         (f"{RECORD}.clips.0", "name", "../../evil"),
+        (f"{RECORD}.clips.0", "identity", "../../evil"),
+        (f"{RECORD}.clips.0", "identity", "D"),
         (f"{RECORD}.clips.0", "name", "a\nb"),
         (f"{RECORD}.clips.0", "sound", None),
         (f"{RECORD}.clips.0.sound", "pieces", [10**12]),
@@ -69,6 +88,23 @@ def test_a_record_is_not_believed(packed: Path, tmp_path: Path, key: str, field:
     with pytest.raises(FaceDiffError):
         unpack(packed, tmp_path / "back", workers=1)
     assert not (tmp_path / "back").exists()
+
+
+def test_lossless_motion_is_of_the_type_that_it_is_coded_as(tmp_path: Path) -> None:
+    root = write_tiny(tmp_path / "corpus", sentences=1)
+    pack(root, tmp_path / "corpus.zarr", corpus=TINY, lossless=True, unit="furlong", workers=1)
+    read_all(tmp_path / "corpus.zarr")
+    change(tmp_path / "corpus.zarr", f"{RECORD}.clips.0", lambda place: place.__setitem__("dtype", "float64"))
+    with pytest.raises(FaceDiffError, match="float64"):
+        read_all(tmp_path / "corpus.zarr")
+
+
+def test_identities_that_are_no_names_of_files_are_not_packed(tmp_path: Path) -> None:
+    root = write_tiny(tmp_path / "corpus", sentences=1)
+    faces = {name: face.numpy() for name, face in read_templates(root / "templates.pkl").items()}
+    write_templates(root / "templates.pkl", {**faces, "../x": faces["A"]})
+    with pytest.raises(FaceDiffError, match=r"templates\.pkl.*plain names"):
+        pack(root, tmp_path / "corpus.zarr", corpus=TINY, workers=1)
 
 
 @pytest.mark.parametrize("text", [b"", b"[]", b"{", b'{"attributes": 3}', b"\xff", b"[" * 10**5])
