@@ -269,8 +269,10 @@ PARSED: dict[str, Any] = {
 class FaceDiffCLI(LightningCLI):
     """LightningCLI whose experiment has a name, and whose model takes its sizes from the data module."""
 
-    def __init__(self, *values: Any, command: str, experiment: str, until_end: ExitStack, **options: Any) -> None:  # noqa: ANN401 - as upstream
-        self.until_end = until_end
+    def __init__(
+        self, *values: Any, command: str, experiment: str, until_end: ExitStack | None = None, **options: Any
+    ) -> None:  # noqa: ANN401 - as upstream
+        self.until_end = until_end or ExitStack()  # what lasts as long as the subcommand
         self.command = command
         self.experiment = experiment
         super().__init__(*values, **options)
