@@ -270,8 +270,13 @@ class FaceDiffCLI(LightningCLI):
     """LightningCLI whose experiment has a name, and whose model takes its sizes from the data module."""
 
     def __init__(
-        self, *values: Any, command: str, experiment: str, until_end: ExitStack | None = None, **options: Any
-    ) -> None:  # noqa: ANN401 - as upstream
+        self,
+        *values: Any,  # noqa: ANN401 - as upstream
+        command: str,
+        experiment: str,
+        until_end: ExitStack | None = None,
+        **options: Any,  # noqa: ANN401 - as upstream
+    ) -> None:
         self.until_end = until_end or ExitStack()  # what lasts as long as the subcommand
         self.command = command
         self.experiment = experiment
