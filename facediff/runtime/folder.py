@@ -242,10 +242,10 @@ def _check(path: Path, description: Description) -> None:
         if not least <= len(visited) <= MOST_STEPS or not all(isinstance(step, int) and step >= 0 for step in visited):
             refuse(steps, f"{least} to {MOST_STEPS} steps of the noise process")
         if len(rows) != len(visited) or not all(
-            isinstance(row, list) and len(row) == 5 and all(isinstance(number, int | float) for number in row)
+            isinstance(row, list) and len(row) == 5 and all(isinstance(n, int | float) and abs(n) < 1e9 for n in row)
             for row in rows
         ):
-            refuse(table, "five numbers for each step")
+            refuse(table, "five numbers for each step, below 10^9")
     if description.decoded not in ("sample", "kept"):
         refuse("decoded", "sample or kept")
     for name in ("identities", "faces", "styles"):

@@ -81,6 +81,9 @@ OTHERS = (
 OPERATORS = {name: kind for kind in (SAME_SHAPE, NO_LARGER, ELEMENTWISE, OTHERS) for name in kind.split()}
 """All operators that a graph may have, with their kind."""
 
+OPTIONAL = {"Clip": 1, "GRU": 3, "LSTM": 3, "Pad": 2, "RNN": 3, "Slice": 3}
+"""From which place on inputs of an operator may be left out by an empty name; elsewhere that can end the process."""
+
 
 def check_graph(path: Path, opset: int, ends: dict[str, list[dict[str, Any]]]) -> int:
     """Read a graph, and refuse what could cost more than the budget, or is not what ``model.json`` says.
@@ -207,6 +210,8 @@ class _Reading:
                 raise self.refuse(f"{operator} holds another graph or a sparse tensor, expected plain values")
             for tensor in (*_messages(attribute, 5), *_messages(attribute, 10)):
                 self.tensor(parse_message(tensor), operator)
+        if any(not name and place < OPTIONAL.get(operator, len(inputs)) for place, name in enumerate(inputs)):
+            raise self.refuse(f"{operator} lacks an input, expected all that it needs")
         if operator in ("Div", "Mod"):
             self.divisor(operator, inputs[1:2])
         self.growth(operator, inputs)
@@ -218,7 +223,7 @@ class _Reading:
         if not all(name in self.counts for name in given):
             return 0
         shapes = [self.shapes.get(name) for name in given]
-        kind, shape, count = OPERATORS[operator], None, MANY
+        kind, shape, count = OPERATORS[operator] if given else OTHERS, None, MANY
         if kind is SAME_SHAPE:
             shape, count = shapes[0], self.counts[given[0]]
         elif kind is NO_LARGER:

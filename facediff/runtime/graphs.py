@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -74,6 +74,12 @@ class ExportedGraphs:
             # takes twice as long.
             options.add_session_config_entry("session.intra_op.allow_spinning", "0")
             options.add_session_config_entry("session.use_env_allocators", "1")
+            # Where shapes contradict one another, optimisations may end the process. So may the one that is left out:
+            # it merges stored numbers of 16 bits that were not widened on opening, and otherwise has nothing to do.
+            options.add_session_config_entry("session.strict_shape_type_inference", "1")
+            options.add_session_config_entry(
+                "optimization.disable_specified_optimizers", "FuseFp16InitializerToFp32NodeTransformer"
+            )
             options.add_session_config_entry("optimization.constant_folding_max_output_size_in_bytes", str(largest))
             try:
                 limit_memory()
@@ -81,9 +87,7 @@ class ExportedGraphs:
                     path, options, providers=list(providers or ["CPUExecutionProvider"])
                 )
             except Exception as error:  # ONNX Runtime's own errors share no base class
-                raise FaceDiffError(
-                    f"{path}: ONNX Runtime cannot read it ({brief(error)}); export the model again"
-                ) from error
+                raise FaceDiffError(f"{path}: ONNX Runtime cannot read it ({brief(error)}); {REMEDY}") from error
 
         return cls(description, arrays, load)
 
@@ -145,8 +149,10 @@ def limit_memory() -> None:
 
     kinds = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
     limit = onnxruntime.OrtArenaCfg({"max_mem": int(min(LIMITS.bytes, 1 << 62))})
-    # A session keeps the allocator that is registered when it is opened, so that each has a budget of its own.
-    onnxruntime.create_and_register_allocator(onnxruntime.OrtMemoryInfo("Cpu", *kinds), limit)
+    # A session keeps the allocator that is registered when it is opened, so that each has a budget of its own. Where
+    # ONNX Runtime refuses to register a second one, all share the first.
+    with suppress(Exception):
+        onnxruntime.create_and_register_allocator(onnxruntime.OrtMemoryInfo("Cpu", *kinds), limit)
 
 
 _RUNNING: dict[onnxruntime.RunOptions, float] = {}
