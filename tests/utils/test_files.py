@@ -333,9 +333,12 @@ from pathlib import Path
 from facediff.utils.files import locked
 
 with locked(Path(sys.argv[1]), "facediff test"):
+    reader, writer = os.pipe()
     worker = os.fork()
     if worker == 0:
+        os.write(writer, b"runs")
         time.sleep(60)
+    os.read(reader, 4)
     print(worker, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
