@@ -1,0 +1,226 @@
+"""What the numbers of a motion mean: vertices of a mesh, or the channels of a parametric face.
+
+Motion is ``(frames, points, dims)`` in every space. For vertices the points are vertices and each has three
+coordinates; for parameters the points are channels, one number each.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import quoted
+from facediff.utils.plain_options import is_name
+
+Kind = Literal["vertices", "arkit", "flame", "linear"]
+Joint = Literal["head", "neck", "jaw", "left_eye", "right_eye"]
+Form = Literal["axis_angle", "axis_angle_x", "six_d", "quaternion", "euler"]
+
+WIDTHS: dict[str, int] = {"axis_angle": 3, "axis_angle_x": 1, "six_d": 6, "quaternion": 4, "euler": 3}
+"""Channels that a rotation takes, by its form."""
+
+MOST_CHANNELS = 10_000
+
+REGIONS: dict[str, tuple[str, ...]] = {
+    "lips": ("mouth", "jaw", "tongue"),
+    "upper_face": ("brow",),
+    "eyes": ("eyeblink", "eyelook"),
+}
+"""How the names of a region's channels begin, in lower case."""
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """A run of channels that together are one rotation, in radians.
+
+    Attributes:
+        joint: what turns.
+        start: the first channel.
+        form: how it is written: ``axis_angle`` (3 channels), its x alone (1), the first two columns of the matrix
+            (``six_d``, 6), ``quaternion`` (4), or ``euler`` angles (3).
+    """
+
+    joint: Joint
+    start: int
+    form: Form
+
+    @property
+    def channels(self) -> range:
+        """The rotation's channels."""
+        return range(self.start, self.start + WIDTHS[self.form])
+
+
+@dataclass(frozen=True)
+class Space:
+    """The space of a motion; by default that of a mesh's vertices.
+
+    Attributes:
+        kind: which family of faces the channels belong to.
+        channels: their names in order; empty for vertices.
+        version: of the layout or the face model, such as FLAME's ``2020``; coefficients of two versions cannot be
+            exchanged.
+        rig: which displacements give the channels their meaning.
+        rig_hash: the hash of these.
+        rotations: the channels that are rotations.
+        valid_range: smallest and largest value that a channel is defined for, rotations aside; None if there is none.
+        absent: channels of the layout that the source did not have, which is something else than zero.
+        identity: what belongs to a person and is kept apart from motion, such as ``shape 300``.
+
+    Raises:
+        FaceDiffError: if a field has a value that it cannot have, or does not fit the others.
+
+    Example:
+        >>> space = Space("linear", ("jawOpen", "pitch", "yaw", "roll"), rotations=(Rotation("head", 1, "euler"),))
+        >>> space.dims, space.face, space.head, space.index("yaw")
+        (1, (0,), (1, 2, 3), 2)
+        >>> Space.from_state(space.state()) == space
+        True
+    """
+
+    kind: Kind = "vertices"
+    channels: tuple[str, ...] = ()
+    version: str = ""
+    rig: str = ""
+    rig_hash: str = ""
+    rotations: tuple[Rotation, ...] = ()
+    valid_range: tuple[float, float] | None = None
+    absent: tuple[str, ...] = ()
+    identity: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse fields that do not fit each other."""
+        if self.kind not in get_args(Kind):
+            raise _wrong("kind", self.kind, f"one of {', '.join(get_args(Kind))}")
+        for name in ("channels", "absent"):
+            names = getattr(self, name)
+            unique = len({text.casefold() for text in names if isinstance(text, str)}) == len(names)
+            if len(names) > MOST_CHANNELS or not all(map(is_name, names)) or not unique:
+                raise _wrong(name, names, "different names that can be printed, whatever their case")
+        if (self.kind == "vertices") != (not self.channels):
+            raise _wrong("channels", self.channels, f"{'none' if self.is_vertices else 'names'} with {self.kind}")
+        if self.is_vertices and (self.rotations or self.valid_range or self.absent):
+            raise FaceDiffError("space: vertices have no rotations, range or absent channels; leave them out")
+        for name in ("version", "rig", "rig_hash", "identity"):
+            text = getattr(self, name)
+            if text and not is_name(text):
+                raise _wrong(name, text, "a short text that can be printed")
+        taken: set[int] = set()
+        for rotation in self.rotations:
+            fits = rotation.joint in get_args(Joint) and rotation.form in WIDTHS and isinstance(rotation.start, int)
+            if not fits or not 0 <= rotation.start <= len(self.channels) - len(rotation.channels):
+                raise _wrong("rotations", rotation, "a joint, a form, and channels that exist")
+            if taken & set(rotation.channels):
+                raise _wrong("rotations", rotation, "channels that no other rotation takes")
+            taken |= set(rotation.channels)
+        if self.valid_range is not None:
+            low, high = self.valid_range
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise _wrong("valid_range", self.valid_range, "a finite number and a larger one")
+
+    @property
+    def is_vertices(self) -> bool:
+        """Whether the points are vertices of a mesh."""
+        return self.kind == "vertices"
+
+    @property
+    def dims(self) -> int:
+        """Numbers that each point has: 3 coordinates of a vertex, 1 value of a channel."""
+        return 3 if self.is_vertices else 1
+
+    @property
+    def head(self) -> tuple[int, ...]:
+        """Channels that turn the head or the neck."""
+        return self._turning("head", "neck")
+
+    @property
+    def eyes(self) -> tuple[int, ...]:
+        """Channels that turn the eyeballs as rotations; ARKit's ``eyeLook`` shapes are of the face."""
+        return self._turning("left_eye", "right_eye")
+
+    @property
+    def face(self) -> tuple[int, ...]:
+        """All other channels, a jaw's rotation among them."""
+        apart = {*self.head, *self.eyes}
+        return tuple(channel for channel in range(len(self.channels)) if channel not in apart)
+
+    def _turning(self, *joints: Joint) -> tuple[int, ...]:
+        return tuple(channel for turn in self.rotations if turn.joint in joints for channel in turn.channels)
+
+    def index(self, name: str) -> int:
+        """The channel of a name, whatever its case.
+
+        Raises:
+            FaceDiffError: if there is none.
+        """
+        folded = [channel.casefold() for channel in self.channels]
+        if name.casefold() not in folded:
+            raise FaceDiffError(f'space: has no channel "{name}"; its channels are {quoted(list(self.channels))}')
+        return folded.index(name.casefold())
+
+    def region(self, name: str) -> tuple[int, ...]:
+        """The channels of a region by their names: ``lips``, ``upper_face`` or ``eyes``; empty if none is named so."""
+        return tuple(channel for channel, text in enumerate(self.channels) if text.casefold().startswith(REGIONS[name]))
+
+    def state(self) -> dict[str, Any]:
+        """The record as plain containers, fit for checkpoints and JSON."""
+        return {name: _plain(value) for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_state(cls, state: object) -> Space:
+        """The inverse of :meth:`state`; what it is given may come from anybody.
+
+        Raises:
+            FaceDiffError: naming the field that is missing or not valid.
+        """
+        names = {attribute.name for attribute in fields(cls)}
+        if not isinstance(state, dict) or state.keys() != names:
+            odd = sorted(map(str, names ^ state.keys())) if isinstance(state, dict) else state
+            raise _wrong("record", odd, f"exactly the fields {', '.join(sorted(names))}")
+        for name in names - {"channels", "rotations", "valid_range", "absent"}:
+            if not isinstance(state[name], str):
+                raise _wrong(name, state[name], "a text")
+        for name in ("channels", "rotations", "absent"):
+            if not isinstance(state[name], list | tuple):
+                raise _wrong(name, state[name], "a list")
+        span = state["valid_range"]
+        if span is not None and not (_is_list(span, 2) and all(map(_is_number, span))):
+            raise _wrong("valid_range", span, "two numbers, or null")
+        rotations = []
+        for turn in state["rotations"]:
+            keys = {attribute.name for attribute in fields(Rotation)}
+            if not isinstance(turn, dict) or turn.keys() != keys or type(turn["start"]) is not int:
+                raise _wrong("rotations", turn, "a list of joint, start and form")
+            if not isinstance(turn["joint"], str) or not isinstance(turn["form"], str):
+                raise _wrong("rotations", turn, "a list of joint, start and form")
+            rotations.append(Rotation(**turn))
+        return cls(
+            **{
+                **state,
+                "channels": tuple(state["channels"]),
+                "absent": tuple(state["absent"]),
+                "rotations": tuple(rotations),
+                "valid_range": None if span is None else (float(span[0]), float(span[1])),
+            }
+        )
+
+
+VERTICES = Space()
+"""The space of a mesh's vertices."""
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - a field of the record
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _is_list(value: object, length: int) -> bool:
+    return isinstance(value, list | tuple) and len(value) == length
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _wrong(name: str, value: object, expected: str) -> FaceDiffError:
+    return FaceDiffError(f"space: {name} is {quoted(value)}; expected {expected}")
