@@ -83,14 +83,15 @@ class StepGraph(nn.Module):
             features: of the speech.
             mask: True on valid frames.
             identity: indices, −1 for unknown.
-            style: F_dyn.
+            style: style vectors.
             state: the noisy motion.
             step: counted from 0.
             before: what the window before kept, in the frames that this one shares with it.
             share: of this window in each frame, 1 where nothing is shared.
         """
         network, kept = self.model.network, list[Tensor]()
-        tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), style], dim=-1))
+        dynamic = network.heard_style(style, features, mask)
+        tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), dynamic], dim=-1))
 
         def blend(now: Tensor) -> Tensor:
             kept.append(torch.lerp(before, now, share[..., None]))
@@ -135,7 +136,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
     kept = width if preconditioned else dim
     encoder = network.audio_encoder
     speech = speech_graph(model, lambda heard, frames, _: encoder(heard.audio, heard.audio_lengths, frames))
-    style = sum(network.style_encoder.token_dims)
+    style = network.style_dim
     mask = torch.ones(batch, frames, dtype=torch.bool)
     step = Graph(
         "step",

@@ -53,6 +53,8 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
+from facediff.models.speech_style import SpeechStyle
+from facediff.models.styles import vector_of
 from facediff.speech.windows import LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
@@ -109,6 +111,9 @@ class DualPathDiffusion(AnimationModel):
         invented_gain: standard deviation of the logarithm of these gains.
         style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide, and is taken
             from the speech where none is given.
+        style_from_speech: learn what speech says of the style, by a regression beside the training that changes
+            nothing else (:class:`~facediff.models.speech_style.SpeechStyle`); where no style is given, an identity's
+            usual one is then changed as the speech asks.
         speech_dropout: share of training clips whose speech is hidden, together with whatever else may be hidden, so
             that speech can guide.
         speech_guidance: how much more than it has learnt the model follows the speech; 1 or, with ``speech_dropout``,
@@ -157,6 +162,7 @@ class DualPathDiffusion(AnimationModel):
         invented_speakers: Share = 0.0,
         invented_gain: Annotated[float, Range(0, 1)] = 0.1,
         style_dropout: Share = 0.0,
+        style_from_speech: bool = False,
         speech_dropout: Share = 0.0,
         speech_guidance: ranges.GuidanceScale = 1.0,
         identity_guidance: ranges.GuidanceScale = 1.0,
@@ -218,7 +224,10 @@ class DualPathDiffusion(AnimationModel):
             token_form=style_tokens,
             speech_may_hide=speech_dropout > 0,
             style_may_hide=style_dropout > 0,
+            speech_style=SpeechStyle(dim, sum(style.token_dims), len(self.identities)) if style_from_speech else None,
         )
+        if style_from_speech and not style.token_dims:
+            raise ArgumentError({"style_from_speech": True}, "there is no dynamic style; choose a style_encoder")
         for name, weight in self.style_weights.items():
             if weight and not style.token_dims:
                 raise ArgumentError({f"{name}_weight": weight}, "there is no dynamic style; choose a style_encoder")
@@ -490,19 +499,20 @@ class DualPathDiffusion(AnimationModel):
         if weights["style_contrast"]:
             # The reference and the target are clips of one speaker, which makes a positive pair of every clip, also
             # in a batch of one speaker each.
-            own = self.encode_style(batch.motion, batch.mask)
+            own = self.network.dynamic_style(self._scaled(batch.motion), batch.mask)
             terms["style_contrast"] = style_contrast(torch.cat([style, own]), batch.identity_names * 2)
         loss = losses["loss"]
         for name, term in terms.items():
             loss = loss + weights[name] * term
         return {**losses, **terms, "loss": loss}
 
-    def conditions(self, batch: Batch, *, guided: bool = False) -> Conditions:
+    def conditions(self, batch: Batch, *, guided: bool = False, animated: slice = slice(None)) -> Conditions:
         """Everything that is computed once per clip; in training, conditions are hidden now and then.
 
         Args:
             batch: the clips.
             guided: follow the conditions as :meth:`choose_guidance` says; else as the model has learnt to.
+            animated: the frames that are animated, of speech that is encoded with more around them.
         """
         network, identity = self.network, batch.identity
         hidden = self.hide(len(identity)) if self.training else Hidden()
@@ -515,11 +525,11 @@ class DualPathDiffusion(AnimationModel):
             # All views are rows of one batch, so that guidance costs one call of the network per step and not one per
             # view.
             hidden = Hidden(*(self._in_views(name, views, len(batch)) for name in CONDITIONS))
-            conditions = network.conditions(batch, identity, self.style_of(batch), hidden)
+            conditions = network.conditions(batch, identity, self.style_of(batch), hidden, animated)
             return replace(conditions, shares=tuple(views.values()))
         if hidden.speech is None and hidden.style is None:
-            return network.conditions(batch, identity, self.style_of(batch))
-        return network.conditions(batch, identity, self.style_of(batch), hidden)
+            return network.conditions(batch, identity, self.style_of(batch), animated=animated)
+        return network.conditions(batch, identity, self.style_of(batch), hidden, animated)
 
     def hide(self, clips: int) -> Hidden:
         """Which conditions of which training clips are hidden."""
@@ -537,21 +547,30 @@ class DualPathDiffusion(AnimationModel):
         return torch.tensor([name in hidden for hidden in views], device=self.device).repeat_interleave(clips)
 
     def default_style(self, identity: str) -> Reference | Style:
-        """The style that is heard from the speech, for an identity of the training by a model that was trained to.
+        """The style that is heard from the speech, by a model that was trained to.
 
-        With ``style_dropout`` the model knows an identity's motion without a reference. A stored reference would carry
-        its mood into all speech.
+        A stored reference would carry its mood into all speech. With ``style_from_speech``, the usual style of an
+        identity of the training, or else that of its reference, is changed as the speech asks; with ``style_dropout``
+        alone, the model knows the motion of an identity of the training without a reference.
         """
-        learnt = self.network.no_style
+        learnt, speech_style = self.network.no_style, self.network.speech_style
+        if speech_style is not None and speech_style.ready and identity not in self.person_styles:
+            index = self.assets.identity_index(identity)
+            if index >= 0 and (usual := speech_style.usual(index)) is not None:
+                return Style("speech", torch.cat([usual, usual.new_ones(1)]).cpu())
+            vector = vector_of(reference := super().default_style(identity), self)
+            name = reference.name if isinstance(reference, Style) else reference.clip
+            return Style(f"{name}, changed as the speech asks", torch.cat([vector[:-1], vector.new_ones(1)]))
         if learnt is None or identity not in self.assets.identities or identity in self.person_styles:
             return super().default_style(identity)
-        return Style("speech", learnt.detach())
+        return Style("speech", nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))))
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames *numbers"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
-        """F_dyn of reference motions (eq. 2 to 9); of width 0 if the dynamic path is left out."""
-        return self.network.dynamic_style(self._scaled(reference), mask)
+        """F_dyn of reference motions (eq. 2 to 9), which speech does not change; of width 0 without a dynamic path."""
+        style = self.network.dynamic_style(self._scaled(reference), mask)
+        return nn.functional.pad(style, (0, self.network.style_dim - style.shape[1]))
 
     def _scaled(self, motion: Tensor) -> Tensor:
         """Offsets in the network's unit; components of training motion are in it already."""
@@ -590,7 +609,8 @@ class DualPathDiffusion(AnimationModel):
     ) -> tuple[Float[Tensor, "samples frames vertices 3"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
-        conditions = self.conditions(clip, guided=True).frames(window.context, window.context + window.frames)
+        own = slice(window.context, window.context + window.frames)
+        conditions = self.conditions(clip, guided=True, animated=own).frames(own.start, own.stop)
         overlap_blend = WindowOverlap(before, window.kept, window.fixed)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
         of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)

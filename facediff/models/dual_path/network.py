@@ -26,13 +26,14 @@ from facediff.models.folding import (
     unchanged,
 )
 from facediff.models.fusions import Fusion
-from facediff.models.layers import frame_mask
+from facediff.models.layers import exporting, frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.motion_space import Preconditioning
 from facediff.models.speaker_encoders import (
     IdentityEncoder,
     StyleEncoder,
 )
+from facediff.models.speech_style import SpeechStyle
 
 TokenForm = Literal["levels", "single"]
 
@@ -109,6 +110,7 @@ class DualPathNetwork(nn.Module):
         token_form: how F_s is presented to the decoder.
         speech_may_hide: learn what stands for speech that is not given.
         style_may_hide: the same for the dynamic style.
+        speech_style: what speech says of the style; None if that is not asked.
     """
 
     def __init__(
@@ -126,6 +128,7 @@ class DualPathNetwork(nn.Module):
         token_form: TokenForm,
         speech_may_hide: bool = False,
         style_may_hide: bool = False,
+        speech_style: SpeechStyle | None = None,
     ) -> None:
         super().__init__()
         self.coordinates = coordinates
@@ -145,26 +148,58 @@ class DualPathNetwork(nn.Module):
         # Only where they are trained, so that other checkpoints have no weights for them.
         self.no_speech = nn.Parameter(torch.zeros(dim)) if speech_may_hide else None
         self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None
+        self.speech_style = speech_style
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
+
+    @property
+    def style_dim(self) -> int:
+        """Numbers of a style vector: F_dyn, and with :class:`SpeechStyle` how much of what the speech asks is added."""
+        return sum(self.style_encoder.token_dims) + (self.speech_style is not None)
+
+    def heard_style(
+        self,
+        style: Float[Tensor, "batch style_dim"],
+        audio: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of style vectors, changed as the speech asks where they say so.
+
+        Args:
+            style: style vectors.
+            audio: features of the speech that is animated.
+            mask: True on valid frames.
+        """
+        if self.speech_style is None:
+            return style
+        dynamic, share = style[:, :-1], style[:, -1:]
+        # Not asked where nothing is to be added: the map is unknown until training has begun. A graph cannot choose.
+        if not exporting() and not bool(share.any()):
+            return dynamic
+        return dynamic + share * self.speech_style(audio, mask).to(dynamic)
 
     def conditions(
         self,
         batch: Batch,
         identity: Int[Tensor, " batch"],
-        dynamic_style: Float[Tensor, "batch dynamic_dim"],
+        style: Float[Tensor, "batch style_dim"],
         hidden: Hidden = Hidden(),  # noqa: B008 - it cannot be changed
+        animated: slice = slice(None),
     ) -> Conditions:
         """Everything that is computed once per clip.
 
         Args:
             batch: its speech, or cached features of it, and its lengths.
             identity: identity indices, −1 for unknown.
-            dynamic_style: F_dyn, as :meth:`dynamic_style` gives it.
+            style: style vectors, of :attr:`style_dim` numbers.
             hidden: conditions that are not given; for a multiple of the clips, which are then repeated as a whole.
+            animated: the frames that are animated, of speech that is encoded with more around them.
         """
         cached = batch.cached_features or ()
         audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
-        mask, encoded = frame_mask(batch.frame_lengths, audio.shape[1]), dynamic_style
+        mask = frame_mask(batch.frame_lengths, audio.shape[1])
+        encoded = dynamic_style = self.heard_style(style, audio[:, animated], mask[:, animated])
+        if self.training and self.speech_style is not None:
+            self.speech_style.update(audio.detach(), mask, encoded.detach(), identity)
         # Guidance asks for several views of every clip. The speech is encoded once and then repeated, since the audio
         # encoder is the dearest part of the conditions.
         times = max((len(mask) for mask in hidden if mask is not None), default=len(batch)) // len(batch)
@@ -179,8 +214,8 @@ class DualPathNetwork(nn.Module):
             audio = torch.where(hidden.speech[:, None, None], self.no_speech.to(audio), audio)
         if hidden.style is not None and self.no_style is not None:
             dynamic_style = torch.where(hidden.style[:, None], self.no_style.to(dynamic_style), dynamic_style)
-        style = torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1)  # eq. 14
-        return Conditions(audio, self.style_tokens(style), mask, dynamic=encoded)
+        tokens = self.style_tokens(torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1))  # eq. 14
+        return Conditions(audio, tokens, mask, dynamic=encoded)
 
     def dynamic_style(
         self, reference: Float[Tensor, "batch frames *numbers"], mask: Bool[Tensor, "batch frames"]
