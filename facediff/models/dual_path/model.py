@@ -54,7 +54,6 @@ from facediff.models.speaker_encoders import (
     TcnGruTransformer,
 )
 from facediff.models.speech_style import SpeechStyle
-from facediff.models.styles import vector_of
 from facediff.speech.windows import LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
@@ -558,9 +557,13 @@ class DualPathDiffusion(AnimationModel):
             index = self.assets.identity_index(identity)
             if index >= 0 and (usual := speech_style.usual(index)) is not None:
                 return Style("speech", torch.cat([usual, usual.new_ones(1)]).cpu())
-            vector = vector_of(reference := super().default_style(identity), self)
-            name = reference.name if isinstance(reference, Style) else reference.clip
-            return Style(f"{name}, changed as the speech asks", torch.cat([vector[:-1], vector.new_ones(1)]))
+            style = super().default_style(identity)
+            if isinstance(style, Style):
+                return replace(style, vector=torch.cat([style.vector[:-1], style.vector.new_ones(1)]))
+            motion = style.motion.float()[None].to(self.device)
+            with torch.no_grad():
+                vector = self.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool, device=self.device))
+            return Style(style.clip, torch.cat([vector[0, :-1], vector.new_ones(1)]).cpu())
         if learnt is None or identity not in self.assets.identities or identity in self.person_styles:
             return super().default_style(identity)
         return Style("speech", nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))))
