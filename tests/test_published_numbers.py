@@ -101,7 +101,7 @@ def test_paper_configs_have_every_published_number(config: dict[str, Any]) -> No
     found = {path: value_at(config, path) for path in IN_CONFIGS}
     assert {path: value for path, value in found.items() if value != IN_CONFIGS[path]} == {}
     assert config["data"]["class_path"].rpartition(".")[2] == CORPORA[config["corpus"]].__name__
-    assert config["data"]["init_args"].get("split") == ("identity" if config["corpus"] == "mead3d" else None)
+    assert config["data"]["init_args"].get("split") == ("both" if config["corpus"] == "mead3d" else None)
 
 
 def test_paper_configs_average_no_weights(config: dict[str, Any]) -> None:

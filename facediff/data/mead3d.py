@@ -31,6 +31,8 @@ class Mead3D(SpeechMotionDataModule):
     Args:
         split: ``sentence`` is ProbTalk3D's: the 32 training speakers, the last sentences of each emotion are for
             validation and test (test A). ``identity`` is EMOTE's: 32 speakers train, 7 validate, 8 test (test B).
+            ``both`` trains and validates as ``sentence`` does and tests on both: test A, and EMOTE's 8 test speakers
+            as test B. The dual path's paper names none.
         options: those of every data module.
     """
 
@@ -58,7 +60,7 @@ class Mead3D(SpeechMotionDataModule):
         "makes the corpus folder from them."
     )
 
-    def __init__(self, *, split: Literal["sentence", "identity"] = "sentence", **options: Any) -> None:  # noqa: ANN401
+    def __init__(self, *, split: Literal["sentence", "identity", "both"] = "sentence", **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)
         self.split = split
 
@@ -76,11 +78,11 @@ class Mead3D(SpeechMotionDataModule):
         return Clip(name, match[1], f"{emotion}_{match[2]}", attributes)
 
     def split_of(self, clip: Clip) -> str | None:
-        """By speaker (``identity``), or by sentence for the training speakers (``sentence``)."""
+        """By speaker (``identity``), by sentence for the training speakers (``sentence``), or by both."""
         if self.split == "identity":
             groups = {"train": TRAIN, "val": VALIDATION, "test_b": TEST}
             return next((split for split, speakers in groups.items() if clip.identity in speakers), None)
         if clip.identity not in TRAIN:
-            return None
+            return "test_b" if self.split == "both" and clip.identity in TEST else None
         sentences = NEUTRAL_SENTENCES if clip.attributes["emotion"] == "neutral" else EMOTIONAL_SENTENCES
         return next((split for split, numbers in sentences.items() if clip.number in numbers), None)

@@ -305,6 +305,8 @@ class HubertEncoder(AudioEncoder):
         source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
         frozen_layers: Transformer layers kept frozen, together with the convolutions, the feature projection and the
             position convolution below them; −1 freezes all.
+        train_projection: train the feature projection, between the convolutions and the Transformer, all the same;
+            then only the convolutions' result can be kept on disk.
         spec_augment: mask stretches of the features in training, as the pretrained model's configuration says.
         layer_drop: probability of skipping a Transformer layer in training.
         config: the model's configuration as plain data; if given, the weights are not read from ``source`` but left
@@ -324,12 +326,14 @@ class HubertEncoder(AudioEncoder):
         dim: Width,
         source: str = "facebook/hubert-base-ls960",
         frozen_layers: Annotated[int, Range(-1, 256)] = 2,
+        train_projection: bool = False,
         spec_augment: bool = False,
         layer_drop: Share = 0.0,
         config: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.hubert = load_hubert(source, config)
+        self.train_projection = train_projection
         self.hubert.config.apply_spec_augment = spec_augment
         self.hubert.config.layerdrop = layer_drop
         depth = len(self.hubert.encoder.layers)
@@ -348,7 +352,7 @@ class HubertEncoder(AudioEncoder):
         """Freeze what lies below layer ``count``; the names of the frozen modules."""
         # Always frozen: the convolutions have learnt acoustics from hundreds of hours, and a corpus of an hour would
         # overfit them.
-        names = ["feature_extractor", "feature_projection"]
+        names = ["feature_extractor"] if self.train_projection else ["feature_extractor", "feature_projection"]
         if count:
             names += ["encoder.pos_conv_embed", "encoder.dropout", *(f"encoder.layers.{i}" for i in range(count))]
             if not self._normalises_last or count >= len(self.hubert.encoder.layers):
@@ -383,17 +387,23 @@ class HubertEncoder(AudioEncoder):
         return fingerprint(self.frozen_layers, self.hubert.config.to_dict(), parts)
 
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
-        """Hidden states below the first layer that is trained, at 50 steps a second."""
+        """Hidden states below the first part that is trained, at 50 steps a second."""
         return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._lower)
 
     def _lower(self, wave: Tensor) -> Tensor:
-        """The frozen part: convolutions, projection and the frozen layers."""
-        hidden = self.hubert.feature_projection(self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2))
+        """What no gradient reaches: convolutions, and a frozen projection with the frozen layers above it."""
+        features = self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2)
+        if self.train_projection:
+            return features
+        hidden = self.hubert.feature_projection(features)
         return self._layers(hidden, 0, self.frozen_layers) if self.frozen_layers else hidden
 
     def _upper(self, hidden: Tensor) -> Tensor:
-        """The part that is trained."""
-        hidden = self._layers(hidden, self.frozen_layers, len(self.hubert.encoder.layers))
+        """The rest."""
+        if self.train_projection:
+            hidden = self.hubert.feature_projection(hidden)
+        first = 0 if self.train_projection else self.frozen_layers
+        hidden = self._layers(hidden, first, len(self.hubert.encoder.layers))
         return self.hubert.encoder.layer_norm(hidden) if self._normalises_last else hidden
 
     def _layers(self, hidden: Tensor, first: int, last: int) -> Tensor:

@@ -45,6 +45,8 @@ def test_3dmead_by_sentence_and_by_identity(tmp_path: Path) -> None:
     assert {name[:4] for name in found["test_b"]} == {"W040"}
     assert sum(map(len, found.values())) == len(neutral) + len(emotional)
     assert by_identity.hparams["split"] == "identity"
+    both = names_of(MiniMead(root=str(root), split="both"))
+    assert both == {**names_of(data), "test_b": found["test_b"]}
 
 
 def test_3dmead_names_tell_emotion_and_intensity_and_references_share_the_emotion(tmp_path: Path) -> None:

@@ -55,6 +55,17 @@ def test_hubert_keeps_frozen_weights_and_trains_the_others(hubert_source: Path, 
     assert not any("feature_extractor" in name or "feature_projection" in name for name in learning)
 
 
+def test_hubert_trains_its_feature_projection_where_asked(hubert_source: Path) -> None:
+    encoder = HubertEncoder(dim=8, source=str(hubert_source), frozen_layers=2, train_projection=True).train()
+    encoder(*clip(6, batch=2)).square().sum().backward()
+    moved = {name.split(".")[1] for name, value in encoder.named_parameters() if value.grad is not None}
+    assert "feature_projection" in moved
+    assert "feature_extractor" not in moved
+    frozen = [value for name, value in encoder.named_parameters() if "encoder.layers.1." in name]
+    assert frozen
+    assert all(value.grad is None for value in frozen)  # a gradient passes through them and changes nothing
+
+
 def test_hubert_computes_no_gradient_for_the_frozen_convolutions(hubert_source: Path) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).train()
     assert not encoder.hubert.feature_extractor(torch.randn(1, 4000)).requires_grad
@@ -202,9 +213,11 @@ def either_source(request: pytest.FixtureRequest, hubert_source: Path, tmp_path:
     return tmp_path / "large"
 
 
-@pytest.mark.parametrize("frozen", [0, 1, 2, 3, -1])
-def test_hubert_parts_together_are_the_published_model(either_source: Path, frozen: int) -> None:
-    encoder = HubertEncoder(dim=8, source=str(either_source), frozen_layers=frozen).eval()
+@pytest.mark.parametrize(
+    ("frozen", "projection"), [(0, False), (1, False), (2, False), (3, False), (-1, False), (0, True), (2, True)]
+)
+def test_hubert_parts_together_are_the_published_model(either_source: Path, frozen: int, projection: bool) -> None:
+    encoder = HubertEncoder(dim=8, source=str(either_source), frozen_layers=frozen, train_projection=projection).eval()
     audio, lengths, frames = clip(9, batch=2)
     features, steps = encoder.frozen_features(audio, lengths)
     assert steps.tolist() == [18, 18]
@@ -239,4 +252,5 @@ def test_hubert_frozen_key_changes_with_the_features(hubert_source: Path) -> Non
     assert key(lambda e: e.hubert.encoder.layers[1].final_layer_norm.weight.add_(1)) != first
     assert key(lambda e: e.hubert.feature_projection.projection.bias.add_(1)) != first
     assert key(frozen_layers=1) != first
+    assert key(train_projection=True) != first
     assert key(spec_augment=True) is None
