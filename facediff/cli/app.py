@@ -100,6 +100,9 @@ COMMANDS = {
         "facediff.cli.data:import_person", "make a reconstructed video a corpus entry", "prepare"
     ),
     "components": Command("facediff.cli.components:components", "list what can be chosen by name"),
+    "check-install": Command(
+        "facediff.cli.check_install:check_install", "print versions, devices and extras, and try the bundled model"
+    ),
 }
 RENAMED = {"yardsticks": "generation-metrics"}
 """Commands of version 0.1 that have another name now; the error names it."""

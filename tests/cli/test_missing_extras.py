@@ -48,6 +48,7 @@ EXTRAS = {
     "data regions p": "train",
     "data import-person p --audio a.wav --name x --corpus p --output o --frame-rate 25": "prepare",
     "components": "train",
+    "check-install": "",
 }
 """Command lines, and the extra that a base install lacks for them; empty where it lacks nothing."""
 

@@ -1,0 +1,129 @@
+"""``facediff check-install``: what is installed here, what of it works, and what is missing for what."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError, printable, shortened
+
+if TYPE_CHECKING:
+    from facediff.animation import Animation
+
+SHOWN = ("numpy", "onnxruntime", "torch", "torchmetrics", "lightning", "transformers", "scipy", "trimesh")
+"""Packages whose versions a report of a mistake needs."""
+GROUPS = ("all", "dev", "docs", "test", "cli", "audio", "runtime")
+"""Extras that are sums of others, of development, or a part of every installation."""
+SECONDS = 10
+"""Length of the trial animation."""
+
+REQUIREMENT = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^]]*)\])?[^;]*(?:;.*extra\s*==\s*['\"]([^'\"]+)['\"])?")
+
+
+def check_install() -> None:
+    """Print versions, devices and extras, animate ten seconds with the bundled model, and say what is wrong.
+
+    Paste what it prints into the report of a mistake. The exit status is 2 where the base installation does not work.
+    """
+    from facediff.version import __version__
+
+    tell(f"facediff {__version__} in {os.path.dirname(os.path.dirname(os.path.abspath(__file__)))}")
+    tell(f"Python {platform.python_version()} ({sys.executable}) on {platform.platform()}")
+    versions = {name: version for name in SHOWN if (version := version_of(name))}
+    tell("packages: " + ", ".join(f"{name} {version}" for name, version in versions.items()))
+    tell(f"devices: {devices('torch' in versions)}")
+    lacking = {extra: list(missing(extra)) for extra in sorted(extras())}
+    tell("extras that are complete: " + (", ".join(extra for extra, names in lacking.items() if not names) or "none"))
+    for extra, names in lacking.items():
+        if names:
+            tell(f'  "{extra}" lacks {", ".join(names)}: pip install "facediff[{extra}]"')
+    started = time.monotonic()
+    try:
+        animation = trial()
+    except FaceDiffError:
+        raise
+    except Exception as error:  # whatever is wrong here is what is asked for
+        reason = shortened(printable(f"{type(error).__name__}: {error}"))
+        raise FaceDiffError(
+            f"the bundled model does not animate ({reason}); install facediff again in a new virtual environment"
+        ) from error
+    frames, vertices = animation.vertices.shape[:2]
+    tell(
+        f"trial: {SECONDS} s of sound animated by the bundled model in {time.monotonic() - started:.1f} s "
+        f"({frames} frames of {vertices} vertices)"
+    )
+    tell("The base installation works.")
+
+
+def trial() -> Animation:
+    """Animate bursts of a tone.
+
+    Raises:
+        FaceDiffError: if the motion is not finite or of another length.
+    """
+    import numpy as np
+
+    import facediff
+    from facediff.utils import SAMPLE_RATE
+    from facediff.utils.hub import BUNDLED
+
+    seconds = np.arange(SECONDS * SAMPLE_RATE) / SAMPLE_RATE
+    speech = (0.3 * np.sin(2 * np.pi * 140 * seconds) * (np.sin(2 * np.pi * 3 * seconds) > 0)).astype(np.float32)
+    model = facediff.load(BUNDLED)
+    animation: Animation = model.animate(speech, SAMPLE_RATE)
+    if len(animation.vertices) != round(SECONDS * animation.frame_rate) or not np.isfinite(animation.vertices).all():
+        raise FaceDiffError(
+            f"the bundled model gives {animation.vertices.shape} for {SECONDS} s at {animation.frame_rate:g} frames a "
+            f"second; the installation is damaged, install facediff again"
+        )
+    return animation
+
+
+def version_of(package: str) -> str | None:
+    """The installed version of a package; None if there is none."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def devices(with_torch: bool) -> str:
+    """Processors, and what PyTorch can compute on besides them."""
+    processors = f"{os.cpu_count()} processors ({platform.machine()})"
+    if not with_torch:
+        return f"{processors}; graphics cards are used by PyTorch only, which is not installed"
+    try:
+        import torch
+    except (ImportError, OSError) as error:  # a library that it loads is missing
+        return f"{processors}; PyTorch is installed and cannot be imported ({shortened(printable(error))})"
+    if torch.cuda.is_available():
+        cards = ", ".join(torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count()))
+        return f"{processors}, {cards} (CUDA {torch.version.cuda})"
+    return f"{processors}, {'Apple MPS' if torch.backends.mps.is_available() else 'no graphics card for PyTorch'}"
+
+
+def extras() -> list[str]:
+    """The extras that bring a capability."""
+    declared = importlib.metadata.metadata("facediff").get_all("Provides-Extra") or []
+    return [extra for extra in declared if extra not in GROUPS]
+
+
+def missing(extra: str) -> Iterator[str]:
+    """Packages of an extra, and of the extras that it contains, that are not installed."""
+    for requirement in importlib.metadata.requires("facediff") or []:
+        match = REQUIREMENT.match(requirement)
+        if match is None or match[3] != extra:
+            continue
+        name, contained = match[1], match[2]
+        if name == "facediff":
+            for part in (contained or "").split(","):
+                yield from missing(part.strip())
+        elif version_of(name) is None:
+            yield name
