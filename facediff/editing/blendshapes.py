@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.bounded import Problem, minimise, minimise_sparse
-from facediff.editing.shapes import ARKIT, ROTATIONS, ShapeSet, absent_from, beyond_arkit, live_link_name, mirror_pairs
+from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.mesh import triangle_areas
+from facediff.spaces.arkit import ARKIT, ROTATIONS, absent_from, beyond_arkit, live_link_name, mirror_pairs
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.plain_files import json_text, write_table

@@ -22,12 +22,13 @@ from facediff.editing.correspondence import (
 from facediff.editing.face_features import facing, sides_of_pairs
 from facediff.editing.fit_check import check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
-from facediff.editing.shapes import ShapeSet, fitted, read_shape_files
+from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.parts import named_triangles
+from facediff.spaces.shape_files import read_shape_files
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
@@ -280,7 +281,7 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
     The shapes are carried as an animation would be, and the result is checked likewise. Where it fails, or the shapes
     are a whole figure's or look another way, their face is laid onto the animation's first.
     """
-    files = read_shape_files(path)
+    files = built_in_files() if is_built_in(path) else read_shape_files(path)
     if files.neutral is None or files.faces is None:
         raise FaceDiffError(
             f"{path}: transferring shapes to another mesh needs their neutral face with triangles; add it as "

@@ -2,98 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
-from facediff.editing.glb_shapes import read_targets
 from facediff.errors import FaceDiffError, OptionError
-from facediff.mesh import face_size, read_mesh, robust_align
-from facediff.mesh.glb import open_glb
+from facediff.mesh import face_size, robust_align
+from facediff.spaces.arkit import absent_from, arkit_name, beyond_arkit
+from facediff.spaces.shape_files import ShapeFiles, read_shape_files
 
 Array = npt.NDArray[np.float64]
-
-# The 52 names are Apple's (developer documentation of ``ARFaceAnchor.BlendShapeLocation``). Their order and the further
-# columns are those of the CSV files that Epic's app Live Link Face records, as public readers of such files state them.
-
-_EYE = "eyeBlink{0} eyeLookDown{0} eyeLookIn{0} eyeLookOut{0} eyeLookUp{0} eyeSquint{0} eyeWide{0}"
-_FACE = """
-    jawForward jawRight jawLeft jawOpen mouthClose mouthFunnel mouthPucker mouthRight mouthLeft
-    mouthSmileLeft mouthSmileRight mouthFrownLeft mouthFrownRight mouthDimpleLeft mouthDimpleRight
-    mouthStretchLeft mouthStretchRight mouthRollLower mouthRollUpper mouthShrugLower mouthShrugUpper
-    mouthPressLeft mouthPressRight mouthLowerDownLeft mouthLowerDownRight mouthUpperUpLeft mouthUpperUpRight
-    browDownLeft browDownRight browInnerUp browOuterUpLeft browOuterUpRight cheekPuff cheekSquintLeft cheekSquintRight
-    noseSneerLeft noseSneerRight tongueOut
-"""
-ARKIT: tuple[str, ...] = (*_EYE.format("Left").split(), *_EYE.format("Right").split(), *_FACE.split())
-"""The names in the order of the recordings' columns."""
-
-ROTATIONS: tuple[str, ...] = (
-    *(f"Head{axis}" for axis in ("Yaw", "Pitch", "Roll")),
-    *(f"{side}Eye{axis}" for side in ("Left", "Right") for axis in ("Yaw", "Pitch", "Roll")),
-)
-"""Columns that follow the names: rotations of the head and the eyes."""
-
-NEUTRAL = ("neutral", "basis", "rest", "base", "template")
-"""Names (without case and punctuation) of the face at rest in a set of shapes."""
-
-
-def live_link_name(name: str) -> str:
-    """An ARKit name as Live Link Face capitalises it: ``jawOpen`` becomes ``JawOpen``."""
-    return name[:1].upper() + name[1:]
-
-
-def mirror_pairs(names: tuple[str, ...] = ARKIT) -> list[tuple[int, int]]:
-    """Places (left, right) of the names that differ in their side only, for those whose other side is there too."""
-    place = {name: index for index, name in enumerate(names)}
-    return [
-        (index, place[other])
-        for name, index in place.items()
-        if name.endswith("Left") and (other := f"{name.removesuffix('Left')}Right") in place
-    ]
-
-
-def arkit_name(name: str) -> str | None:
-    """The ARKit name that a spelling stands for: ``EyeBlink_L``, ``jaw_open``, ``17 - browInnerUp``; None if none."""
-    # Leading digits number the shapes; what follows a dot, a colon or a bar is the shape's name within a node.
-    spellings = _spellings()
-    for part in (name, re.split(r"[.:|]", name)[-1]):
-        key = plain(part)
-        if arkit := spellings.get(key) or spellings.get(key.lstrip("0123456789")):
-            return arkit
-    return None
-
-
-def plain(name: str) -> str:
-    """A name without case and punctuation."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-@lru_cache(maxsize=1)
-def _spellings() -> dict[str, str]:
-    spellings = {plain(name): name for name in ARKIT}
-    for name in ARKIT:
-        for side in ("Left", "Right"):
-            if name.endswith(side):
-                spellings[plain(name.removesuffix(side)) + side[0].lower()] = name
-    return spellings
-
-
-def absent_from(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of ARKit's that are not among ``names``, in ARKit's order."""
-    return tuple(name for name in ARKIT if name not in names)
-
-
-def beyond_arkit(names: Sequence[str]) -> tuple[str, ...]:
-    """Those of ``names`` that are not ARKit's."""
-    return tuple(name for name in names if name not in ARKIT)
-
 
 ANOTHER_ORDER = 0.3
 """Neutral faces whose vertices lie further apart than this share of the face's size are not in the same order."""
@@ -172,8 +94,11 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
         template: (V, 3) the animation's neutral face.
         unit: the template's unit of length.
     """
-    files = _built_in(np.asarray(template, np.float64) * metres_per_unit(unit)) if is_built_in(path) else None
-    return fitted(files or read_shape_files(path, len(template)), template, unit)
+    if is_built_in(path):
+        files = built_in_files(np.asarray(template, np.float64) * metres_per_unit(unit))
+    else:
+        files = read_shape_files(path, len(template))
+    return fitted(files, template, unit)
 
 
 def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
@@ -246,75 +171,7 @@ def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -
     return replace(shape_set, notes=tuple(notes))
 
 
-# Blendshapes on disk: a folder of meshes, or a .glb with named targets.
-
-SUFFIXES = (".obj", ".ply")
-
-
-@dataclass(frozen=True, eq=False)
-class ShapeFiles:
-    """Shapes as read, whatever their topology, unit and axes."""
-
-    path: Path  # the folder or the file
-    first: Path  # the file to name where the topology is wrong
-    names: tuple[str, ...]  # K names as written
-    shapes: npt.NDArray[np.floating]  # (K, V, 3) vertices of each shape
-    neutral: npt.NDArray[np.floating] | None  # (V, 3) the face at rest; None if there is none
-    faces: npt.NDArray[np.integer] | None  # (F, 3) triangles; None if there are none
-    metric: bool = False  # whether lengths are in metres by definition of the format, as in .glb
-    rest: str = ""  # name of the file with the face at rest
-    notes: tuple[str, ...] = ()  # what was done to the shapes since, a sentence each
-
-
-def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
-    """Read a folder of meshes or a .glb.
-
-    Args:
-        path: the folder or file.
-        vertices: of the mesh that they are for, by which the parts of a .glb are chosen; None for all that have shapes.
-    """
-    if is_built_in(path):
-        return _built_in(None)
-    if path.suffix.lower() == ".glb":
-        return _read_glb(path, vertices)
-    if not path.is_dir():
-        raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
-    candidates = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
-    rest = [file for file in candidates if plain(file.stem) in NEUTRAL]
-    if len(rest) > 1:
-        raise FaceDiffError(f"{path}: {rest[0].name} and {rest[1].name} are both the face at rest; keep one of them")
-    shapes = [file for file in candidates if file not in rest]
-    if not shapes:
-        raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
-    files = [*rest, *shapes]
-    meshes = [read_mesh(file, points_allowed=True) for file in files]
-    first = meshes[0]
-    for file, mesh in zip(files, meshes, strict=True):
-        if len(mesh.vertices) != len(first.vertices):
-            raise FaceDiffError(
-                f"{file}: has {len(mesh.vertices)} vertices and {files[0].name} {len(first.vertices)}; expected shapes "
-                f"of one mesh"
-            )
-        if len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces):
-            raise FaceDiffError(
-                f"{file}: its triangles are not those of {files[0].name}; expected shapes of one mesh with the order "
-                f"of its vertices kept"
-            )
-        if not np.isfinite(mesh.vertices).all():
-            raise FaceDiffError(f"{file}: holds NaN or infinity; write it again")
-    points, faces = np.stack([mesh.vertices for mesh in meshes]), meshes[0].faces
-    return ShapeFiles(
-        path,
-        files[0],
-        tuple(file.stem for file in shapes),
-        points[len(rest) :],
-        points[0] if rest else None,
-        faces if len(faces) else None,
-        rest=rest[0].name if rest else "",
-    )
-
-
-def _built_in(template: Array | None) -> ShapeFiles:
+def built_in_files(template: Array | None = None) -> ShapeFiles:
     """The built-in shapes: of the speaker with the face nearest to a template (V, 3) in metres, or the common ones."""
     from facediff.synthetic.known_faces import built_in_shapes, edition_of_mesh, resting_faces
 
@@ -328,12 +185,3 @@ def _built_in(template: Array | None) -> ShapeFiles:
     points = np.stack(list(shapes.values()))
     path = Path(BUILT_IN)
     return ShapeFiles(path, path, tuple(shapes), points, neutral, faces, metric=True, rest=BUILT_IN)
-
-
-def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
-    try:
-        targets = read_targets(open_glb(path), vertices)
-    except (ValueError, IndexError) as error:
-        raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
-    points = targets.neutral + targets.deltas
-    return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, metric=True, rest=path.name)

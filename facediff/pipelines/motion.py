@@ -341,7 +341,8 @@ def solve_weights(
     """Shapes from a folder or a file as they fit an animation, and their weights: :meth:`Animation.blendshapes`."""
     from facediff.editing.blendshapes import solve
     from facediff.editing.retargeting import retarget_shapes
-    from facediff.editing.shapes import ARKIT, check_shapes, read_shapes
+    from facediff.editing.shapes import check_shapes, read_shapes
+    from facediff.spaces.arkit import ARKIT
 
     check_shapes(shapes)
     found = retarget_shapes(shapes, animation) if carry else read_shapes(shapes, animation.template, animation.unit)

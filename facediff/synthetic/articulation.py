@@ -15,9 +15,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from facediff.spaces.arkit import LEFT_AND_RIGHT
 from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.geometry import Array
-from facediff.synthetic.head.rig import LEFT_AND_RIGHT
 from facediff.synthetic.motion import UNHURRIED, rounded, shut_lips
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError, choices
+from facediff.spaces.arkit import ARKIT
 from facediff.synthetic import arkit, corpus, second_edition
 from facediff.synthetic.cast import CAST
 from facediff.synthetic.face import N_VERTICES, build_face
 from facediff.synthetic.geometry import Array, HeadMesh
 from facediff.synthetic.head.mesh import QuadMesh
 from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
-from facediff.synthetic.head.rig import ARKIT, SHAPES, head_shapes
+from facediff.synthetic.head.rig import SHAPES, head_shapes
 from facediff.synthetic.rig import LINEAR_FIELDS
 from facediff.synthetic.speakers import SPEAKERS
 from facediff.utils.files import atomic_folder

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from facediff.editing.shapes import ARKIT
 from facediff.live.frames import LiveFrame, Performance, Receiver, open_receiver
+from facediff.spaces.arkit import ARKIT
 
 VERTICES = 40
 FRAME_RATE = 30.0

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.editing.shapes import ARKIT
 from facediff.errors import FaceDiffError
 from facediff.live.receivers.json_lines import MOST_CLIENTS
+from facediff.spaces.arkit import ARKIT
 from tests.live.conftest import FRAME_RATE, VERTICES, Opened, frame, weights_of
 
 

@@ -18,10 +18,10 @@ from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_message import OscMessage
 from pythonosc.osc_packet import OscPacket
 
-from facediff.editing.shapes import ARKIT
 from facediff.errors import FaceDiffError
 from facediff.live.frames import Performance, open_receiver
 from facediff.live.receivers.sending import Outbox
+from facediff.spaces.arkit import ARKIT
 from tests.live.conftest import FRAME_RATE, Opened, at_rate, frame, weights_of
 
 SIXTY_ONE = 61

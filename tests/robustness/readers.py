@@ -297,7 +297,7 @@ def read_a_mesh(path: Path) -> object:
 
 
 def shape_folder(path: Path) -> object:
-    from facediff.editing.shapes import read_shape_files
+    from facediff.spaces.shape_files import read_shape_files
 
     folder = path.parent / "shapes"
     folder.mkdir()
@@ -314,7 +314,7 @@ def targets(path: Path) -> None:
 
 
 def read_targets(path: Path) -> object:
-    from facediff.editing.shapes import read_shape_files
+    from facediff.spaces.shape_files import read_shape_files
 
     return read_shape_files(path)
 

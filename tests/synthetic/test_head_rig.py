@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.synthetic.head.mesh import QuadMesh
 from facediff.synthetic.head.parts import EYE_CENTRE, EYE_RADIUS, build_head
-from facediff.synthetic.head.rig import ARKIT, LEFT_AND_RIGHT, SHAPES, eyelid_pairs, head_shapes, lip_pairs, turned
+from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs, turned
 
 Array = NDArray[np.float64]
 

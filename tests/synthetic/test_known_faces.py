@@ -12,8 +12,9 @@ from facediff.editing.brows import brows_of
 from facediff.editing.eyes import puppet_eyes
 from facediff.editing.landmarks import NAMES, known_topology, puppet_landmarks
 from facediff.editing.shapes import read_shapes
+from facediff.spaces.arkit import ALPHABETICAL
 from facediff.synthetic.head.parts import build_head
-from facediff.synthetic.head.rig import ARKIT, eyelid_pairs
+from facediff.synthetic.head.rig import eyelid_pairs
 from facediff.synthetic.known_faces import built_in_shapes, known_face, resting_faces
 
 MESH = build_head()
@@ -56,7 +57,7 @@ def test_brows_rise() -> None:
 
 def test_shapes_are_arkits_and_the_speakers_own(tmp_path: Path) -> None:
     neutral, faces, shapes = built_in_shapes("M1")
-    assert tuple(shapes) == ARKIT
+    assert tuple(shapes) == ALPHABETICAL
     assert np.array_equal(faces, MESH.faces)
     assert np.allclose(neutral, resting_faces(2)["M1"], atol=1e-7)
     deltas = np.stack(list(shapes.values())) - neutral

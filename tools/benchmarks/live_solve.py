@@ -21,8 +21,9 @@ from sampling_tables import processor
 from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, solve
 from facediff.editing.live_weights import FrameSolver
-from facediff.editing.shapes import ARKIT, ShapeSet
+from facediff.editing.shapes import ShapeSet
 from facediff.reporting.documents import markdown_table
+from facediff.spaces.arkit import ARKIT
 from facediff.synthetic.arkit import puppet_shapes
 
 VERTICES, FRAME_RATE = 5_023, 30.0

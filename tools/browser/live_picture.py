@@ -16,8 +16,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from facediff.editing.shapes import ARKIT
 from facediff.live import LiveFrame, Performance, Receiver, open_receiver
+from facediff.spaces.arkit import ARKIT
 from facediff.synthetic.arkit import puppet_shapes
 from facediff.synthetic.face import build_face
 from tools.browser.chromium import Chromium, find_chromium

@@ -23,27 +23,17 @@ import time
 import uuid
 from fractions import Fraction
 
-from facediff.editing.shapes import ARKIT, ROTATIONS
 from facediff.errors import FaceDiffError
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
+from facediff.spaces.arkit import ARKIT, ROTATIONS, left_first
 
 VERSION = 6
 LONGEST_NAME = 64
 DAY = 24 * 3600
 
-
-def _swapped(names: tuple[str, ...]) -> tuple[str, ...]:
-    """ARKit's names in the order of the datagram, in which left goes before right for jaw and mouth too."""
-    order = list(names)
-    for left, right in (("jawLeft", "jawRight"), ("mouthLeft", "mouthRight")):
-        first = min(order.index(left), order.index(right))
-        order[first : first + 2] = [left, right]
-    return tuple(order)
-
-
-ORDER = _swapped(ARKIT)
+ORDER = left_first(ARKIT)
 """Names of the 52 weights in the order of the values. The app's recordings (.csv) have another one."""
 
 

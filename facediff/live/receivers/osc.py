@@ -12,11 +12,11 @@ import struct
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 
-from facediff.editing.shapes import ARKIT, live_link_name
 from facediff.errors import FaceDiffError, choices
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
+from facediff.spaces.arkit import ARKIT, live_link_name
 
 MOST_BYTES = 1400
 """Of a datagram: more would be split on the way, and lost where one of its parts is lost."""

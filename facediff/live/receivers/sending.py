@@ -14,9 +14,9 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.shapes import ARKIT
 from facediff.errors import FaceDiffError
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiver
+from facediff.spaces.arkit import ARKIT
 
 Item = TypeVar("Item")
 

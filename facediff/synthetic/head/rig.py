@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from facediff.spaces.arkit import ALPHABETICAL
 from facediff.synthetic.geometry import Array, bump, rise
 from facediff.synthetic.head.layout import EYE_POINTS, MOUTH_HALF_WIDTH, MOUTH_POINTS, MOUTH_Y, contact_line
 from facediff.synthetic.head.mesh import QuadMesh
@@ -24,23 +25,9 @@ from facediff.synthetic.head.parts import (
     lash_places,
 )
 
-LEFT_AND_RIGHT = (
-    *("eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp", "eyeSquint", "eyeWide"),
-    *("mouthSmile", "mouthFrown", "mouthDimple", "mouthStretch", "mouthPress", "mouthLowerDown", "mouthUpperUp"),
-    *("browDown", "browOuterUp", "cheekSquint", "noseSneer"),
-)
-WHOLE = (
-    *("jawForward", "jawLeft", "jawRight", "jawOpen", "mouthClose", "mouthFunnel", "mouthPucker", "mouthLeft"),
-    *("mouthRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper", "browInnerUp"),
-    *("cheekPuff", "tongueOut"),
-)
-ARKIT = tuple(
-    sorted([*WHOLE, *(f"{name}{side}" for name in LEFT_AND_RIGHT for side in ("Left", "Right"))], key=str.lower)
-)
-"""The names of Apple's ARFaceAnchor.BlendShapeLocation, in alphabetical order."""
 TONGUE = ("tongueUp", "tongueForward")
 """Shapes that ARKit lacks and speech needs: the tip at the ridge behind the teeth (t, n, l), and between them (th)."""
-SHAPES = (*ARKIT, *TONGUE)
+SHAPES = (*ALPHABETICAL, *TONGUE)
 
 JAW_DEGREES = 21.0  # Turn of the lower jaw at weight 1
 HINGE = (0.0, 14.0)  # Height and depth of its axis, in front of the ears

@@ -11,8 +11,9 @@ import pytest
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
-from facediff.editing.shapes import ARKIT, read_shapes
+from facediff.editing.shapes import read_shapes
 from facediff.mesh import read_mesh
+from facediff.spaces.arkit import ARKIT
 from facediff.synthetic.arkit import puppet_shapes
 from facediff.synthetic.known_faces import write_puppet_shapes
 

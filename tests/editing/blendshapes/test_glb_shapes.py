@@ -11,9 +11,10 @@ from facediff.animation import Animation
 from facediff.cli.app import main
 from facediff.editing.blendshapes import SolveOptions, solve
 from facediff.editing.retargeting import retarget_shapes
-from facediff.editing.shapes import read_shape_files, read_shapes
+from facediff.editing.shapes import read_shapes
 from facediff.mesh import read_mesh
 from facediff.mesh.glb_scene import placed_parts
+from facediff.spaces.shape_files import read_shape_files
 from tests.editing.retarget.test_avatar_round_trip import opened
 from tests.fakes.avatar import AvatarPart, avatar_parts, write_avatar
 from tests.fakes.heads import talking

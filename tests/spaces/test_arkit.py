@@ -6,7 +6,7 @@ import csv
 
 import pytest
 
-from facediff.editing.shapes import ARKIT, ROTATIONS, arkit_name, live_link_name, mirror_pairs
+from facediff.spaces.arkit import ARKIT, ROTATIONS, arkit_name, live_link_name, mirror_pairs
 
 # The first line of a recording of Live Link Face, as many public readers of such recordings state it.
 HEADER = (

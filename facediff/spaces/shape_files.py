@@ -1,0 +1,117 @@
+"""Blendshapes on disk: a folder of meshes, ICT-FaceKit's folder among them, or a .glb with named targets."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.mesh import read_mesh
+from facediff.mesh.glb import open_glb
+from facediff.mesh.glb_shapes import read_targets
+from facediff.spaces.arkit import plain
+
+NEUTRAL = ("neutral", "basis", "rest", "base", "template", "genericneutralmesh")
+"""Names (without case and punctuation) of the face at rest in a set of shapes."""
+
+ICT_NEUTRAL = "genericneutralmesh"
+"""The face at rest in ICT-FaceKit's folder (FaceXModel); its lengths are centimetres."""
+HALVED = ("browInnerUp", "cheekPuff")
+"""Shapes that ICT-FaceKit has as halves and ARKit as one."""
+SUFFIXES = (".obj", ".ply")
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeFiles:
+    """Shapes as read, whatever their topology, unit and axes."""
+
+    path: Path  # the folder or the file
+    first: Path  # the file to name where the topology is wrong
+    names: tuple[str, ...]  # K names as written
+    shapes: npt.NDArray[np.floating]  # (K, V, 3) vertices of each shape
+    neutral: npt.NDArray[np.floating] | None  # (V, 3) the face at rest; None if there is none
+    faces: npt.NDArray[np.integer] | None  # (F, 3) triangles; None if there are none
+    metric: bool = False  # whether lengths are in metres by definition of the format, as in .glb
+    rest: str = ""  # name of the file with the face at rest
+    notes: tuple[str, ...] = ()  # what was done to the shapes since, a sentence each
+
+
+def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
+    """Read a folder of meshes or a .glb.
+
+    Args:
+        path: the folder or file.
+        vertices: of the mesh that they are for, by which the parts of a .glb are chosen; None for all that have shapes.
+    """
+    if path.suffix.lower() == ".glb":
+        return _read_glb(path, vertices)
+    if not path.is_dir():
+        raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
+    candidates = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+    if any(plain(file.stem) == ICT_NEUTRAL for file in candidates):
+        # Next to its expressions ICT-FaceKit keeps a hundred heads of other people.
+        candidates = [file for file in candidates if not re.fullmatch(r"identity\d+", file.stem)]
+    rest = [file for file in candidates if plain(file.stem) in NEUTRAL]
+    if len(rest) > 1:
+        raise FaceDiffError(f"{path}: {rest[0].name} and {rest[1].name} are both the face at rest; keep one of them")
+    shapes = [file for file in candidates if file not in rest]
+    if not shapes:
+        raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
+    files = [*rest, *shapes]
+    meshes = [read_mesh(file, points_allowed=True) for file in files]
+    first = meshes[0]
+    for file, mesh in zip(files, meshes, strict=True):
+        if len(mesh.vertices) != len(first.vertices):
+            raise FaceDiffError(
+                f"{file}: has {len(mesh.vertices)} vertices and {files[0].name} {len(first.vertices)}; expected shapes "
+                f"of one mesh"
+            )
+        if len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces):
+            raise FaceDiffError(
+                f"{file}: its triangles are not those of {files[0].name}; expected shapes of one mesh with the order "
+                f"of its vertices kept"
+            )
+        if not np.isfinite(mesh.vertices).all():
+            raise FaceDiffError(f"{file}: holds NaN or infinity; write it again")
+    points, faces = np.stack([mesh.vertices for mesh in meshes]), meshes[0].faces
+    names = [file.stem for file in shapes]
+    targets: npt.NDArray[np.floating] = points[len(rest) :]
+    notes: tuple[str, ...] = ()
+    if rest and plain(rest[0].stem) == ICT_NEUTRAL:
+        names, targets, notes = _whole(names, targets, points[0])
+    return ShapeFiles(
+        path,
+        files[0],
+        tuple(names),
+        targets,
+        points[0] if rest else None,
+        faces if len(faces) else None,
+        rest=rest[0].name if rest else "",
+        notes=notes,
+    )
+
+
+def _whole(
+    names: list[str], shapes: npt.NDArray[np.floating], neutral: npt.NDArray[np.floating]
+) -> tuple[list[str], npt.NDArray[np.floating], tuple[str, ...]]:
+    """ICT-FaceKit's shapes, with those that ARKit has whole put together from their halves."""
+    moves, notes = dict(zip(names, shapes, strict=True)), []
+    for name in HALVED:
+        halves = [f"{name}_L", f"{name}_R"]
+        if all(half in moves for half in halves):
+            moves[name] = moves.pop(halves[0]) + moves.pop(halves[1]) - neutral
+            notes.append(f"{name} is the sum of its halves {' and '.join(halves)}")
+    return list(moves), np.stack(list(moves.values())), tuple(notes)
+
+
+def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
+    try:
+        targets = read_targets(open_glb(path), vertices)
+    except (ValueError, IndexError) as error:
+        raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
+    points = targets.neutral + targets.deltas
+    return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, metric=True, rest=path.name)

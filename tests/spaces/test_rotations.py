@@ -1,0 +1,71 @@
+"""Conversions between forms of rotation against SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation, Slerp
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.rotations import convert, slerp
+from facediff.spaces.space import WIDTHS, Form
+
+FORMS: tuple[Form, ...] = ("axis_angle", "six_d", "quaternion", "euler")
+ANGLES = hnp.arrays(np.float64, (4, 3), elements=st.floats(-3.1, 3.1))
+
+
+def reference(rotations: Rotation, form: Form) -> np.ndarray:
+    if form == "axis_angle":
+        return rotations.as_rotvec()
+    if form == "quaternion":
+        return rotations.as_quat(canonical=True, scalar_first=True)
+    if form == "euler":
+        return rotations.as_euler("YXZ")
+    return np.concatenate([rotations.as_matrix()[:, :, 0], rotations.as_matrix()[:, :, 1]], axis=1)
+
+
+@pytest.mark.parametrize("source", FORMS)
+@pytest.mark.parametrize("target", FORMS)
+def test_convert_is_scipys(source: Form, target: Form) -> None:
+    rotations = Rotation.random(200, rng=3)
+    values = convert(reference(rotations, source), source, target)
+    assert np.abs(values - reference(rotations, target)).max() < 1e-6
+
+
+@given(ANGLES)
+def test_convert_keeps_the_rotation_through_every_form(vectors: np.ndarray) -> None:
+    expected = Rotation.from_rotvec(vectors).as_matrix()
+    for form in FORMS:
+        back = convert(convert(vectors, "axis_angle", form), form, "axis_angle")
+        assert np.abs(Rotation.from_rotvec(back).as_matrix() - expected).max() < 1e-6, form
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_convert_near_the_poles(form: Form) -> None:
+    vectors = np.array([[0, 0, 0], [1e-10, 0, 0], [np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi], [np.pi / 2, 0, 0]])
+    back = convert(convert(vectors, "axis_angle", form), form, "six_d")
+    expected = reference(Rotation.from_rotvec(vectors), "six_d")
+    assert np.abs(back - expected).max() < 1e-6
+
+
+def test_convert_of_a_turn_about_x() -> None:
+    angles = np.linspace(-3, 3, 7)[:, None]
+    assert np.allclose(convert(angles, "axis_angle_x", "axis_angle")[:, :1], angles)
+    assert np.allclose(convert(convert(angles, "axis_angle_x", "quaternion"), "quaternion", "axis_angle_x"), angles)
+
+
+def test_convert_refuses_another_width() -> None:
+    with pytest.raises(FaceDiffError, match="six_d"):
+        convert(np.zeros((2, 5)), "six_d", "axis_angle")
+    assert WIDTHS["six_d"] == 6
+
+
+def test_slerp_is_scipys() -> None:
+    ends = Rotation.random(2, rng=1)
+    shares = np.linspace(0, 1, 9)
+    first, second = (np.tile(row, (9, 1)) for row in ends.as_quat(scalar_first=True))
+    own = convert(slerp(first, -second, shares), "quaternion", "six_d")
+    assert np.abs(own - reference(Slerp([0, 1], ends)(shares), "six_d")).max() < 1e-9
