@@ -321,7 +321,7 @@ class ClipPreview:
 def draw_clip(
     model: AnimationModel,
     sample: Sample,
-    motion: Float[Tensor, "frames vertices 3"],
+    motion: Float[Tensor, "frames points dims"],
     folder: Path,
     epochs: int,
     *,

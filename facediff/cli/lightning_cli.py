@@ -40,12 +40,13 @@ from facediff.data import SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
+from facediff.spaces import Space
 from facediff.utils.files import atomic
 from facediff.utils.limits import brief
 from facediff.utils.progress import on_terminal
 from facediff.utils.ranges import Range, mismatch
 
-LINKS = ("n_vertices", "identities", "frame_rate")
+LINKS = ("n_vertices", "identities", "frame_rate", "space")
 """Constructor arguments of a model that the data module knows."""
 
 
@@ -295,7 +296,8 @@ class FaceDiffCLI(LightningCLI):
             help="name of the experiment, and of the folder below runs/ that its runs are in",
         )
         for name in LINKS:
-            parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
+            plain = Space.state if name == "space" else None
+            parser.link_arguments(f"data.{name}", f"model.init_args.{name}", plain, apply_on="instantiate")
 
     def before_instantiate_classes(self) -> None:
         """Check the experiment's name, and decide whether wandb uploads before anything starts it.

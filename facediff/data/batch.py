@@ -1,7 +1,8 @@
 """The data contract: one clip, one batch of clips, and what a checkpoint keeps of a corpus.
 
 Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the speaker's neutral
-template, in the corpus's unit of length. Tensors are padded with zeros; lengths tell which part is valid.
+template, (frames, points, dims): of vertices in the corpus's unit of length, or of the channels of a parametric space
+(:mod:`facediff.spaces`). Tensors are padded with zeros; lengths tell which part is valid.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from facediff.errors import FaceDiffError
+from facediff.spaces import VERTICES, Space
 from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
 from facediff.utils.plain_options import is_name
 
@@ -49,10 +51,10 @@ class Sample:
     """
 
     audio: Float[Tensor, " samples"]
-    motion: Float[Tensor, "frames vertices 3"]
-    template: Float[Tensor, "vertices 3"]
+    motion: Float[Tensor, "frames points dims"]
+    template: Float[Tensor, "points dims"]
     identity: int
-    reference: Float[Tensor, "reference_frames vertices 3"]
+    reference: Float[Tensor, "reference_frames points dims"]
     name: str
     identity_name: str
     sentence: str
@@ -75,11 +77,11 @@ class Batch:
 
     audio: Float[Tensor, "batch samples"]
     audio_lengths: Int[Tensor, " batch"]
-    motion: Float[Tensor, "batch frames vertices 3"]
+    motion: Float[Tensor, "batch frames points dims"]
     frame_lengths: Int[Tensor, " batch"]
-    template: Float[Tensor, "batch vertices 3"]
+    template: Float[Tensor, "batch points dims"]
     identity: Int[Tensor, " batch"]
-    reference: Float[Tensor, "batch reference_frames vertices 3"]
+    reference: Float[Tensor, "batch reference_frames points dims"]
     reference_lengths: Int[Tensor, " batch"]
     names: list[str]
     identity_names: list[str]
@@ -230,7 +232,44 @@ class Reference:
     """
 
     clip: str
-    motion: Float[Tensor, "frames vertices 3"]
+    motion: Float[Tensor, "frames points dims"]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What turns the channels of a corpus into vertices: each speaker's own shapes.
+
+    Attributes:
+        mesh: the same corpus as vertices: neutral faces, triangles, colours, regions, inner lips.
+        deltas: by speaker, what each channel of :attr:`Space.face` moves the vertices by at 1, (K, V, 3).
+    """
+
+    mesh: Assets
+    deltas: dict[str, Float[Tensor, "face vertices 3"]]
+
+    def decode(
+        self, motion: Float[Tensor, "*frames channels 1"], space: Space, identity: str
+    ) -> Float[Tensor, "*frames vertices 3"]:
+        """Offsets of channels as offsets of a speaker's vertices; how the head turns as a whole is left out.
+
+        Raises:
+            FaceDiffError: if the rig knows no such speaker.
+        """
+        if identity not in self.deltas:
+            raise FaceDiffError(
+                f'identity: the rig of {self.mesh.corpus} has no "{identity}"; it has {", ".join(sorted(self.deltas))}'
+            )
+        deltas = self.deltas[identity].to(motion)
+        weights = motion[..., list(space.face), 0]
+        return (weights @ deltas.flatten(1)).view(*weights.shape[:-1], -1, 3)
+
+    def gram(self, weights: Float[Tensor, "vertices 3"]) -> Float[Tensor, "face face"]:
+        """Products D Dᵀ of the weighted deltas D, the mean over speakers, over the number of coordinates.
+
+        For weights w of the channels, wᵀ (D Dᵀ) w is the mean squared coordinate of the vertices that they move.
+        """
+        grams = [(own := (deltas * weights).flatten(1).double()) @ own.T for deltas in self.deltas.values()]
+        return torch.stack(grams).mean(0) / weights.numel()
 
 
 @dataclass(frozen=True)
@@ -246,11 +285,13 @@ class Assets:
         templates: neutral face of every identity.
         faces: triangles; None where the corpus has no mesh file.
         colours: vertex colours (sRGB, 0 to 255) for pictures; None where the mesh file has none.
-        regions: vertex indices by region name: ``lips``, ``upper_face``.
+        regions: vertex (or channel) indices by region name: ``lips``, ``upper_face``.
         inner_lip_pairs: (upper, lower) vertex pairs on the inner lips, for the mouth's opening.
         references: a default style reference for every identity that has one.
         motion_scale: factor that gives the training motion unit variance; None until it has been measured.
         identity_colours: vertex colours of identities that have their own.
+        space: what the numbers of templates and motion mean.
+        rig: turns the channels of a parametric space into vertices; None for vertices, or where it is not known.
     """
 
     corpus: str
@@ -258,7 +299,7 @@ class Assets:
     unit: str
     frame_rate: float
     identities: list[str]
-    templates: dict[str, Float[Tensor, "vertices 3"]]
+    templates: dict[str, Float[Tensor, "points dims"]]
     faces: Int[Tensor, "faces 3"] | None
     regions: dict[str, Int[Tensor, " region"]]
     colours: UInt8[Tensor, "vertices 3"] | None = None
@@ -266,13 +307,44 @@ class Assets:
     references: dict[str, Reference] = field(default_factory=dict)
     motion_scale: float | None = None
     identity_colours: dict[str, UInt8[Tensor, "vertices 3"]] = field(default_factory=dict)
+    space: Space = VERTICES
+    rig: Rig | None = None
 
     @property
     def n_vertices(self) -> int:
-        """Vertices of the topology."""
+        """Points of the motion: vertices of the topology, or channels."""
         return len(next(iter(self.templates.values())))
 
-    def template(self, identity: str) -> Float[Tensor, "vertices 3"]:
+    @property
+    def mesh(self) -> Assets:
+        """The corpus as vertices: these assets, or those of the rig.
+
+        Raises:
+            FaceDiffError: if its motion is channels, and no rig is known.
+        """
+        if self.space.is_vertices:
+            return self
+        if self.rig is None:
+            raise FaceDiffError(
+                f"{self.corpus}: its motion is {self.n_vertices} channels ({self.space.kind}), which no rig turns into "
+                f"vertices; write the channels themselves, to .csv or .npz"
+            )
+        return self.rig.mesh
+
+    def to_vertices(
+        self, motion: Float[Tensor, "*frames points dims"], identity: str
+    ) -> Float[Tensor, "*frames vertices 3"]:
+        """Offsets from the template as offsets of vertices; those of vertices are themselves.
+
+        Raises:
+            FaceDiffError: if there is no rig, or it does not know the speaker.
+        """
+        if self.space.is_vertices:
+            return motion
+        _ = self.mesh
+        return cast(Rig, self.rig).decode(motion, self.space, identity)
+
+    def template(self, identity: str) -> Float[Tensor, "points dims"]:
         """The neutral face of an identity."""
         if identity not in self.templates:
             raise FaceDiffError(
@@ -296,6 +368,11 @@ class Assets:
         """Plain containers and tensors, fit for a checkpoint that is loaded with ``weights_only=True``."""
         state = dict(vars(self))
         state["references"] = {name: (r.clip, r.motion) for name, r in self.references.items()}
+        # Vertices have neither: such checkpoints are those of versions that knew no other space.
+        del state["space"], state["rig"]
+        if not self.space.is_vertices:
+            state["space"] = self.space.state()
+            state["rig"] = None if self.rig is None else {"mesh": self.rig.mesh.state(), "deltas": self.rig.deltas}
         return state
 
     @classmethod
@@ -308,7 +385,8 @@ class Assets:
         """
         expected = {attribute.name for attribute in fields(cls)}
         if isinstance(state, dict):
-            state = {"identity_colours": {}, **state}  # checkpoints of 0.2 and older have none
+            # Checkpoints of 0.2 and older have no colours, and those of vertices no space.
+            state = {"identity_colours": {}, "space": VERTICES.state(), "rig": None, **state}
         if not isinstance(state, dict) or state.keys() != expected:
             odd = sorted(map(str, expected ^ state.keys())) if isinstance(state, dict) else []
             raise FaceDiffError(
@@ -330,24 +408,44 @@ class Assets:
         check_number("assets", "frame_rate", state["frame_rate"], *FRAME_RATES)
         if state["motion_scale"] is not None:
             check_number("assets", "motion_scale", state["motion_scale"], sys.float_info.min)
-        cls._check_tensors(state)
+        space = Space.from_state(state["space"])
+        cls._check_tensors(state, space)
         references = {name: Reference(clip, motion) for name, (clip, motion) in state["references"].items()}
-        return cls(**{**state, "references": references})
+        return cls(**{**state, "references": references, "space": space, "rig": cls._read_rig(state["rig"], space)})
+
+    @classmethod
+    def _read_rig(cls, state: object, space: Space) -> Rig | None:
+        """The rig of a parametric space, after the same checks."""
+        if state is None:
+            return None
+        if space.is_vertices or not isinstance(state, dict) or state.keys() != {"mesh", "deltas"}:
+            raise _bad("rig", state, "none of vertices; else a mesh and deltas")
+        mesh, deltas = cls.from_state(state["mesh"]), state["deltas"]
+        if not mesh.space.is_vertices:
+            raise _bad("rig", state["mesh"], "a mesh of vertices")
+        if not isinstance(deltas, dict) or not deltas or not deltas.keys() <= mesh.templates.keys():
+            raise _bad("rig", deltas, "deltas of speakers who have a template")
+        for name, own in deltas.items():
+            _check_tensor(f"rig[{name}]", own, (len(space.face), mesh.n_vertices, 3))
+        return Rig(mesh, deltas)
 
     @staticmethod
-    def _check_tensors(state: dict[str, Any]) -> None:
+    def _check_tensors(state: dict[str, Any], space: Space) -> None:
         """Refuse tensors of the wrong shape or type, not finite, or with indices of vertices that do not exist."""
         sizes = {len(t) for t in state["templates"].values() if isinstance(t, Tensor) and t.ndim == 2}
         if len(sizes) != 1 or not min(sizes):
             raise _bad("templates", state["templates"], "a neutral face of equally many vertices for every speaker")
         (count,) = sizes
         LIMITS.check("vertices", count, "assets templates")
+        dims = space.dims
+        if not space.is_vertices and (count != len(space.channels) or state["faces"] is not None):
+            raise _bad("templates", count, f"{len(space.channels)} channels, as the space has, and no triangles")
         for name, template in state["templates"].items():
-            _check_tensor(f"templates[{name}]", template, (count, 3))
+            _check_tensor(f"templates[{name}]", template, (count, dims))
         for name, reference in state["references"].items():
             if not isinstance(reference, list | tuple) or len(reference) != 2 or not is_name(reference[0]):
                 raise _bad(f"references[{name}]", reference, "a clip's name and its motion")
-            _check_tensor(f"references[{name}]", reference[1], (None, count, 3))
+            _check_tensor(f"references[{name}]", reference[1], (None, count, dims))
             if not len(reference[1]):
                 raise _bad(f"references[{name}]", reference, "a motion of at least one frame")
         for name in {"lips", "upper_face"} - state["regions"].keys():

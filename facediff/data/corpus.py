@@ -22,12 +22,13 @@ from torch import Tensor
 from facediff.data.manifest import LONGEST
 from facediff.data.manifest import read_manifest as read_manifest
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
-from facediff.data.storage import ClipFolder, ClipMotion, ClipStorage
+from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
+from facediff.spaces import VERTICES, Space
 from facediff.speech.audio import samples_for
 from facediff.utils.arrays import ArrayStore, read_arrays
 from facediff.utils.checksums import sha256
@@ -108,6 +109,7 @@ class Corpus:
         parse: finds identity and sentence in a clip's name.
         people: folders of further speakers with the same topology, as ``facediff data import-person`` writes them.
         storage: where motion and speech of the clips lie; the folder itself if None.
+        space: what the motion's numbers mean; ``n_vertices`` counts its channels where it is not that of vertices.
     """
 
     def __init__(
@@ -120,9 +122,12 @@ class Corpus:
         parse: NameParser = parse_name,
         people: Sequence[Path] = (),
         storage: ClipStorage | None = None,
+        space: Space = VERTICES,
     ) -> None:
         self.root = root
         self.n_vertices = n_vertices
+        self.space = space
+        self.dims = space.dims
         self.frame_rate = frame_rate
         self.parse = parse
         self.people = list(people)
@@ -133,7 +138,8 @@ class Corpus:
                     f"{folder}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl"
                 )
         self._storages: dict[Path, ClipStorage] = {folder: ClipFolder(folder, n_vertices) for folder in people}
-        self._storages[root] = storage or ClipFolder(root, n_vertices)
+        own = ClipFolder(root, n_vertices) if space.is_vertices else ChannelFolder(root, space)
+        self._storages[root] = storage or own
         stored = stored_frame_rate or frame_rate
         self._strides = {folder: self._stride(folder, stored) for folder in (root, *people)}
         self._frames: dict[str, int] = {}
@@ -180,7 +186,9 @@ class Corpus:
 
     @cached_property
     def templates(self) -> dict[str, Tensor]:
-        """Neutral face (V, 3) of every identity, float32."""
+        """Neutral face (V, 3) of every identity, float32; of channels their resting values (C, 1), which are zero."""
+        if not self.space.is_vertices:
+            return {clip.identity: torch.zeros(self.n_vertices, 1) for clip in self.clips.values()}
         templates = read_templates(self.root / "templates.pkl", self.n_vertices)
         for root in self.people:
             name = str(read_manifest(root).get("person"))
@@ -191,7 +199,7 @@ class Corpus:
         return templates
 
     def template(self, clip: Clip) -> Tensor:
-        """Neutral face (V, 3) of a clip's speaker."""
+        """Neutral face (V, dims) of a clip's speaker."""
         if clip.identity not in self.templates:
             raise FaceDiffError(
                 f"{clip.root / 'templates.pkl'}: no template for {clip.identity}, needed by clip {clip.name}; "
@@ -211,14 +219,14 @@ class Corpus:
         return opened
 
     def read_motion(self, clip: Clip, start: int = 0, stop: int | None = None) -> Tensor:
-        """Offsets from the template (T, V, 3), float32; only frames ``start`` to ``stop`` are read."""
+        """Offsets from the template (T, V, dims), float32; only frames ``start`` to ``stop`` are read."""
         opened, stride = self._open(clip), self._strides[clip.root]
         numbers = range(self._frames[clip.name])[start:stop]
         picks = range(numbers.start * stride, numbers.stop * stride, stride)
         return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
 
     def read_spread(self, clip: Clip, count: int, phase: float | None = None) -> Tensor:
-        """Offsets from the template (at most ``count``, V, 3), float32, of evenly spread frames.
+        """Offsets from the template (at most ``count``, V, dims), float32, of evenly spread frames.
 
         The clip is opened once.
 
@@ -254,7 +262,7 @@ class Corpus:
             own = self._storages[root]
             manifest = root / "manifest.json"
             facts += [sha256(manifest) if manifest.is_file() else "", self._strides[root]]
-            facts += [sha256(root / "templates.pkl")]
+            facts += [sha256(root / "templates.pkl") if self.space.is_vertices else self.space]
             facts += [own.version(clip.name) for clip in clips if clip.root == root]
         return hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()
 

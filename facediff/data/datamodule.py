@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from facediff.data.augmentation import Augmenter, read_augmentations
-from facediff.data.batch import Assets, Batch, Reference, Sample, collate
+from facediff.data.batch import Assets, Batch, Reference, Rig, Sample, collate
 from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Clip, Corpus, find_region, parse_name, read_manifest
 from facediff.data.dataset import (
     Aligner,
@@ -36,8 +36,10 @@ from facediff.data.dataset import (
 )
 from facediff.data.measuring import measure_components, measure_scale, measure_windows
 from facediff.data.packed.stores import address_of, is_packed
+from facediff.data.storage import ChannelFolder, ClipStorage
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.registry import defaults, keeps_arguments, plain
+from facediff.spaces import VERTICES, Space
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
 from facediff.utils.plain_options import read_options
 from facediff.utils.ranges import Range
@@ -69,7 +71,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         unit: unit of length; ``unit`` in a prepared folder's ``manifest.json`` overrides it.
         frame_rate: motion frames per second that the models see.
         stored_frame_rate: motion frames per second of circulating copies, where that differs.
-        n_vertices: vertices of its topology.
+        n_vertices: vertices of its topology, or channels of its space.
+        space: what the numbers of its motion mean.
         identities: speakers of the training split, in the order of the identity index.
         mesh_files: files with the faces, in order of preference.
         region_sources: files that list the vertices of the regions, in order of preference.
@@ -128,6 +131,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     frame_rate: ClassVar[float]
     stored_frame_rate: ClassVar[float | None] = None
     n_vertices: int
+    space: Space = VERTICES
     identities: list[str]
     mesh_files: ClassVar[tuple[str, ...]]
     region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
@@ -321,6 +325,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The corpus on disk."""
         if not self.root.is_dir():
             raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
+        if not self.space.is_vertices and (self.packed is not None or self.people):
+            raise FaceDiffError(
+                "data.root: packed corpora and imported speakers hold vertices, and data.space asks for channels; give "
+                "the corpus's folder, without data.people"
+            )
         return Corpus(
             self.root,
             self.n_vertices,
@@ -328,8 +337,22 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             stored_frame_rate=self.stored_frame_rate,
             parse=self.parse_name,
             people=self.people,
-            storage=self.packed,
+            storage=self.packed if self.space.is_vertices else self.channel_folder(),
+            space=self.space,
         )
+
+    def channel_folder(self) -> ClipStorage:
+        """Where the channels of a parametric space lie."""
+        return ChannelFolder(self.root, self.space)
+
+    @property
+    def mesh_corpus(self) -> Corpus | None:
+        """The corpus as vertices: itself, or of channels what their rig makes of them; None where that is not known."""
+        return self.corpus if self.space.is_vertices else None
+
+    def deltas(self) -> dict[str, Tensor]:
+        """What the channels of :attr:`Space.face` move the vertices by at 1, (K, V, 3) by speaker; of channels only."""
+        return {}
 
     @property
     def test_splits(self) -> list[str]:
@@ -426,15 +449,18 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 "omit it, or train on whole clips"
             )
         mouth = np.ones(self.n_vertices, np.float32)
-        sources = self.regions["upper_face"]
-        mouth[find_region(self.root, sources, "upper_face", self.n_vertices, self.region_help).tensor().numpy()] = 0
+        if self.space.is_vertices:
+            sources = self.regions["upper_face"]
+            upper = find_region(self.root, sources, "upper_face", self.n_vertices, self.region_help).tensor()
+        else:
+            upper = channel_regions(self.space)["upper_face"]
+        mouth[upper.numpy()] = 0
         return mouth
 
     def assets(self) -> Assets:
         """The part of a checkpoint that describes this corpus, still without :meth:`motion_scale`."""
         if self._assets is None:
-            corpus = self.corpus
-            mesh = corpus.read_mesh(self.mesh_files)
+            corpus, mesh = self.corpus, self.mesh_corpus
             references = {}
             for identity, clips in sorted(self.reference_policy().candidates.items()):
                 if identity in corpus.templates and self.stores_reference(identity):
@@ -442,29 +468,46 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                     references[identity] = Reference(
                         clip.name, corpus.read_motion(clip, 0, self.reference_frames).half()
                     )
-            self._assets = Assets(
+            # Where no channel is named after a region, as in FLAME's expressions, all of them are of it.
+            assets = Assets(
                 corpus=self.corpus_name,
                 synthetic=self.synthetic,
                 unit=str(read_manifest(self.root).get("unit") or self.unit),
                 frame_rate=self.frame_rate,
                 identities=list(self.identities),
                 templates=dict(corpus.templates),
-                faces=None if mesh is None else torch.from_numpy(mesh.faces),
-                colours=None if mesh is None or mesh.colours is None else torch.from_numpy(mesh.colours),
-                regions={
-                    name: find_region(self.root, sources, name, self.n_vertices, self.region_help).tensor()
-                    for name, sources in self.regions.items()
-                },
-                inner_lip_pairs=corpus.read_pairs(LIP_PAIRS),
+                faces=None,
+                regions=channel_regions(self.space),
                 references=references,
-                identity_colours=corpus.read_colours(),
+                space=self.space,
             )
+            if mesh is corpus:
+                assets = self._with_mesh(assets, corpus)
+            elif mesh is not None:
+                bare = replace(assets, templates=dict(mesh.templates), references={}, space=VERTICES)
+                assets = replace(assets, rig=Rig(self._with_mesh(bare, mesh), self.deltas()))
+            self._assets = assets
         return self._assets
+
+    def _with_mesh(self, assets: Assets, corpus: Corpus) -> Assets:
+        """The same with what a corpus of vertices has: triangles, colours, regions, inner lips."""
+        mesh = corpus.read_mesh(self.mesh_files)
+        return replace(
+            assets,
+            faces=None if mesh is None else torch.from_numpy(mesh.faces),
+            colours=None if mesh is None or mesh.colours is None else torch.from_numpy(mesh.colours),
+            regions={
+                name: find_region(self.root, sources, name, corpus.n_vertices, self.region_help).tensor()
+                for name, sources in self.regions.items()
+            },
+            inner_lip_pairs=corpus.read_pairs(LIP_PAIRS),
+            identity_colours=corpus.read_colours(),
+        )
 
     def eyelid_pairs(self) -> Tensor | None:
         """Pairs of an upper and a lower eyelid vertex (P, 2), to detect blinks; None if the corpus has no list."""
         file = self.eyelid_file or EYELID_PAIRS
-        pairs = self.corpus.read_pairs(file)
+        pairs = None if self.mesh_corpus is None else self.mesh_corpus.read_pairs(file)
         if pairs is None and self.eyelid_file is not None:
             raise FaceDiffError(f"data.eyelid_pairs: {self.root / file}: no such file; expected pairs of vertices")
         return pairs
@@ -483,11 +526,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         Args:
             count: components.
-            weights: factors on the coordinates (3V,) before the decomposition; None for equal weights.
+            weights: factors on the coordinates (n,) before the decomposition, or a matrix (n, n); None for equal
+                weights.
 
         Returns:
-            the mean (3V,), and components (at most ``count``, 3V), each as long as its standard deviation, the largest
-            first.
+            the mean (n,) of all coordinates, and components (at most ``count``, n), each as long as its standard
+            deviation, the largest first.
         """
         return measure_components(self.corpus, self.clips("train"), self.trainer, count, weights)
 
@@ -495,7 +539,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """Covariance of projections of the training motion over the frames of a window, (K, frames, frames).
 
         Args:
-            project: from motion in the corpus's unit (1, T, V, 3) to the projections (1, T, K), linear.
+            project: from motion in the corpus's unit (1, T, V, dims) to the projections (1, T, K), linear.
             frames: length of the window.
 
         Raises:
@@ -575,6 +619,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move every tensor of the batch."""
         return batch.to(device)
+
+
+def channel_regions(space: Space) -> dict[str, Tensor]:
+    """Channels by region; all of them where none is named after it, as in FLAME's expressions. Vertices have none."""
+    if space.is_vertices:
+        return {}
+    return {name: torch.tensor(space.region(name) or range(len(space.channels))) for name in ("lips", "upper_face")}
 
 
 def person_name(folder: Path) -> str:

@@ -63,11 +63,16 @@ def measure_scale(corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None
 def measure_components(
     corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None, count: int, weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Mean (3V,) and principal components (at most ``count``, 3V) of the motion; the arguments as above."""
+    """Mean (n,) and principal components (at most ``count``, n) of the motion's n coordinates; arguments as above.
+
+    ``weights`` are factors on the coordinates (n,), or a matrix (n, n) that is applied to them.
+    """
     weighted = "" if weights is None else hashlib.sha256(weights.detach().cpu().numpy().tobytes()).hexdigest()
 
     def measure() -> npt.NDArray[np.float32]:
-        frames_per_clip = min(FRAMES, max(2, PRINCIPAL_NUMBERS // (3 * corpus.n_vertices * max(1, len(clips)))))
+        frames_per_clip = min(
+            FRAMES, max(2, PRINCIPAL_NUMBERS // (corpus.dims * corpus.n_vertices * max(1, len(clips))))
+        )
         # Clips begin and end in silence. Of a large mesh only two frames of each are read: in every clip at another
         # place, so that together they lie everywhere.
         spread = [
@@ -77,7 +82,9 @@ def measure_components(
         frames = torch.cat(spread).double()
         mean = frames.mean(0)
         frames -= mean
-        if weights is not None:
+        if weights is not None and weights.dim() == 2:
+            frames = frames @ weights.T.cpu().double()
+        elif weights is not None:
             frames *= weights.cpu()
         # The eigenvectors of the frames' products with one another give the same components as those of the
         # covariance, which for a large mesh would not fit into memory. The smaller of the two is decomposed.
@@ -107,7 +114,7 @@ def measure_windows(
     Over windows and not from autocovariances: those of clips of a few seconds leak a hundredth of the power of the slow
     movement into the highest frequencies, more than there is.
     """
-    probe = torch.randn(1, 2, corpus.n_vertices, 3, generator=torch.Generator().manual_seed(0))
+    probe = torch.randn(1, 2, corpus.n_vertices, corpus.dims, generator=torch.Generator().manual_seed(0))
     projected = hashlib.sha256(project(probe).detach().cpu().numpy().tobytes()).hexdigest()
 
     def measure() -> npt.NDArray[np.float64]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,18 +16,23 @@ from torch import Tensor
 
 from facediff import registry
 from facediff import synthetic as puppet
-from facediff.data.corpus import Clip
+from facediff.data.corpus import Clip, Corpus
 from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.data.manifest import read_manifest
+from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, ClipStorage
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
+from facediff.spaces import Rotation, Space
+from facediff.synthetic import corpus as puppet_corpus
 from facediff.synthetic import second_edition
 from facediff.synthetic.cast import MOST_DRAWN, SEEN, UNSEEN, drawn_names
 from facediff.synthetic.face import build_face
 from facediff.synthetic.further_speech import further_speech
+from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.recordings import ALIGNED, speakers_of
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN as FIRST_MOST_DRAWN
+from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.licences import Commercial
 from facediff.utils.ranges import Range
@@ -112,6 +118,59 @@ class SecondEdition:
         return None
 
 
+TURNS = ("Head", "LeftEye", "RightEye")
+"""What turns as a whole in the channels of the second edition, by yaw, pitch and roll each, as in Live Link Face."""
+
+
+def channel_space() -> Space:
+    """The space of the second edition's channels: ARKit's shapes and two of the tongue, head and gaze in radians.
+
+    Yaw is to the face's left, pitch down, roll towards its left shoulder.
+    """
+    named = tuple(f"{turn}{angle}" for turn in TURNS for angle in ("Yaw", "Pitch", "Roll"))
+    identity = f"{puppet_corpus.CORPUS} {second_edition.GENERATOR} {' '.join(SHAPES)}"
+    first = len(SHAPES)
+    return Space(
+        "arkit",
+        (*SHAPES, *named),
+        version="arkit",
+        rig=puppet_corpus.CORPUS,
+        # The shapes follow from the generator, to the last digit only on one machine.
+        rig_hash=hashlib.sha256(identity.encode()).hexdigest()[:16],
+        rotations=(
+            Rotation("head", first, "euler"),
+            Rotation("left_eye", first + 3, "euler"),
+            Rotation("right_eye", first + 6, "euler"),
+        ),
+        valid_range=(0.0, 1.0),
+        identity="rigs of speakers",
+    )
+
+
+class PuppetChannels(ChannelFolder):
+    """Weights, head and gaze of the second edition as channels of :func:`channel_space`."""
+
+    folder = WEIGHTS_FOLDER
+
+    def values(self, name: str) -> npt.NDArray[np.floating]:
+        """Weights, then yaw, pitch and roll of the head and of both eyes, which turn alike; (frames, 63)."""
+        weights, gaze, head = (
+            open_array(self.root / folder / f"{name}.npy", kinds="f")
+            for folder in (WEIGHTS_FOLDER, "gaze_npy", "head_npy")
+        )
+        frames = len(weights)
+        if weights.shape != (frames, len(SHAPES)) or gaze.shape != (frames, 2) or head.shape != (frames, 3):
+            raise FaceDiffError(
+                f"{self.path_of(name)}: weights, gaze and head have the shapes {weights.shape}, {gaze.shape} and "
+                f"{head.shape}; expected equally many frames of {len(SHAPES)}, 2 and 3 numbers; make the corpus again"
+            )
+        pitch, yaw, roll = np.deg2rad(np.asarray(head, np.float64)).T
+        left, up = np.deg2rad(np.asarray(gaze, np.float64)).T
+        eye = (left, -up, np.zeros(frames))
+        turns = np.stack([yaw, pitch, roll, *eye, *eye], axis=1)
+        return np.concatenate([weights, turns], axis=1).astype(np.float32)
+
+
 EDITIONS: dict[int, type[FirstEdition] | type[SecondEdition]] = {1: FirstEdition, 2: SecondEdition}
 
 
@@ -159,6 +218,8 @@ class Puppet(SpeechMotionDataModule):
             and Festival are installed.
         recordings: folder of people's recordings, ``SPEAKER/NAME.wav`` or ``.flac`` with ``NAME.TextGrid``: each drawn
             speaker speaks with those of one person.
+        space: ``vertices``, or ``arkit`` for the second edition's truth as it is kept: ARKit's 52 shapes and two of the
+            tongue, the turns of head and eyes; see docs/parameters.md.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
     """
@@ -188,6 +249,7 @@ class Puppet(SpeechMotionDataModule):
         edition: Literal[1, 2] | None = None,
         people_voices: bool = False,
         recordings: str | None = None,
+        space: Literal["vertices", "arkit"] = "vertices",
         batch_size: Count = 8,
         extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
@@ -214,6 +276,14 @@ class Puppet(SpeechMotionDataModule):
                 f"choose the second, or leave data.people_voices and data.recordings out"
             )
         self.n_vertices = self.edition.n_vertices
+        if space != "vertices":
+            if isinstance(self.edition, FirstEdition):
+                raise FaceDiffError(
+                    f"data.space={space}: the first edition of the built-in corpus has no such weights; choose "
+                    f"data.edition=2"
+                )
+            self.space = channel_space()
+            self.n_vertices = len(self.space.channels)
         self.compared_speakers = (*SEEN, *self.edition.unseen)
         # The first identity is animated unless another is named, so it is one of the cast, not a drawn one.
         self.identities = [*(name for name in self.identities if name not in drawn), *drawn]
@@ -222,6 +292,26 @@ class Puppet(SpeechMotionDataModule):
         """Make the corpus if it does not exist; called on one process only."""
         if self.packed is None:
             self.edition.make(self.root)
+
+    def channel_folder(self) -> ClipStorage:
+        """Weights, head and gaze."""
+        return PuppetChannels(self.root, self.space)
+
+    @cached_property
+    def mesh_corpus(self) -> Corpus | None:
+        """The corpus as vertices."""
+        if self.space.is_vertices:
+            return self.corpus
+        return Corpus(self.root, self.edition.n_vertices, self.frame_rate, parse=self.parse_name)
+
+    def deltas(self) -> dict[str, Tensor]:
+        """The shapes of those of the cast; drawn speakers have theirs in the corpus's folder only."""
+        files = {name: self.root / RIGS_FOLDER / f"{name}.npy" for name in sorted(self.corpus.templates)}
+        return {
+            name: torch.from_numpy(np.array(open_vertices(file, self.edition.n_vertices)[1:], np.float32))
+            for name, file in files.items()
+            if self.stores_reference(name)
+        }
 
     def eyelid_pairs(self) -> Tensor | None:
         """The corpus folder's pairs, or the mesh's own where the folder comes from a version without such a file."""

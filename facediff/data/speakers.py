@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from facediff.data.batch import Assets
 from facediff.data.corpus import Clip
 from facediff.errors import FaceDiffError
 from facediff.metrics import SpeakerGallery
@@ -37,7 +38,7 @@ class MeanFaces:
             raise FaceDiffError(f"{data.root}: no training clip; expected some, to compute the speakers' mean faces")
         self.faces: dict[str, Tensor] = {}
         for speaker, clips in by_speaker.items():
-            total, frames = torch.zeros(data.n_vertices, 3, dtype=torch.float64), 0
+            total, frames = torch.zeros(data.n_vertices, data.space.dims, dtype=torch.float64), 0
             for clip in spread(clips):
                 motion = data.corpus.read_motion(clip)
                 total += motion.sum(0, dtype=torch.float64)
@@ -46,23 +47,25 @@ class MeanFaces:
         self.of_all = torch.stack(list(self.faces.values())).mean(0)
 
     def of(self, speakers: Sequence[str]) -> Tensor:
-        """Their mean faces, offsets (speakers, V, 3)."""
+        """Their mean faces, offsets (speakers, V, dims)."""
         return torch.stack([self.faces.get(speaker, self.of_all) for speaker in speakers])
 
 
-def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str]) -> SpeakerGallery:
+def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str], assets: Assets) -> SpeakerGallery:
     """Recordings outside the evaluated splits of the speakers who have any, each with its speaker's number.
 
     Args:
         data: the corpus.
         speakers: their names, by number.
+        assets: of the corpus; channels are decoded by its rig, where it has one.
     """
     candidates = data.reference_policy().candidates
     means, numbers = [], []
     for number, speaker in enumerate(speakers):
         usable = [clip for clip in candidates.get(speaker, []) if data.find_split(clip) in ("train", None)]
         for clip in spread(usable):
-            means.append(data.corpus.read_motion(clip).mean(0))
+            mean = data.corpus.read_motion(clip).mean(0)
+            means.append(mean if assets.rig is None else assets.to_vertices(mean, speaker))
             numbers.append(number)
     if len({*numbers}) < 2:
         raise FaceDiffError(

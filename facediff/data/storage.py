@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.spaces import Space
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore, in_range, open_array, open_vertices
 from facediff.utils.limits import COORDINATE, LIMITS, quoted
@@ -19,6 +20,9 @@ MOTION_FOLDERS = ("vertices_npy", "vertex")
 
 WEIGHTS_FOLDER, RIGS_FOLDER = "weights_npy", "rigs"
 """Where a corpus keeps motion as weights of shapes, and each speaker's shapes."""
+
+VALUES_FOLDER = "values_npy"
+"""Where a corpus of a parametric space keeps the channels of each clip, (frames, channels)."""
 
 CHUNK = 8
 """Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
@@ -32,7 +36,7 @@ class ClipMotion(Protocol):
         """Stored frames, before any is left out."""
 
     def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Offsets from the template (len(picks), V, 3) of stored frames; numbers past the end are left out."""
+        """Offsets from the template (len(picks), V, dims) of stored frames; numbers past the end are left out."""
 
 
 class ClipStorage(Protocol):
@@ -74,13 +78,17 @@ class ClipFolder:
                 raise FaceDiffError(
                     f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"
                 )
-            if motion_path(self.root, name).is_file():
+            if self.path_of(name).is_file():
                 names.append(name)
         return names
 
+    def path_of(self, name: str) -> Path:
+        """The file with a clip's motion."""
+        return motion_path(self.root, name)
+
     def open(self, name: str) -> ClipMotion:
         """Map a clip's file into memory."""
-        return open_motion(motion_path(self.root, name), self.n_vertices)
+        return open_motion(self.path_of(name), self.n_vertices)
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
@@ -88,8 +96,66 @@ class ClipFolder:
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""
-        facts = motion_path(self.root, name).stat()
+        facts = self.path_of(name).stat()
         return facts.st_size, facts.st_mtime_ns
+
+
+class ChannelFolder(ClipFolder):
+    """The same with channels of a parametric space, ``values_npy/<clip>.npy``.
+
+    Args:
+        root: the folder.
+        space: the space that the channels are of.
+    """
+
+    folder: str = VALUES_FOLDER
+
+    def __init__(self, root: Path, space: Space) -> None:
+        super().__init__(root, len(space.channels))
+        self.space = space
+
+    def path_of(self, name: str) -> Path:
+        """The file with a clip's channels."""
+        return self.root / self.folder / f"{name}.npy"
+
+    def open(self, name: str) -> ClipMotion:
+        """Read a clip's channels."""
+        return ChannelMotion(self.path_of(name), self.values(name), self.space)
+
+    def values(self, name: str) -> npt.NDArray[np.floating]:
+        """A clip's channels (frames, channels) as they are stored."""
+        return open_array(self.path_of(name), kinds="f")
+
+
+class ChannelMotion:
+    """Channels of a clip.
+
+    Args:
+        path: their file, for messages.
+        values: (frames, channels).
+        space: the space that they are of.
+    """
+
+    def __init__(self, path: Path, values: npt.NDArray[np.floating], space: Space) -> None:
+        self.path, self.values = path, values
+        if values.ndim != 2 or not len(values) or values.shape[1] != len(space.channels):
+            raise FaceDiffError(
+                f"{path}: has shape {values.shape}; expected (frames, {len(space.channels)}), the channels of the "
+                f"corpus's space ({space.kind})"
+            )
+        LIMITS.check("frames", len(values), path)
+
+    @property
+    def frames(self) -> int:
+        """Stored frames."""
+        return len(self.values)
+
+    def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Offsets from the resting values (channels, 1) of some frames, (len(picks), channels, 1)."""
+        picks = within(picks, self.frames)
+        motion = np.asarray(self.values[np.array(picks, np.intp)], np.float32)[..., None]
+        refuse_out_of_range(motion, picks, self.path)
+        return motion - template
 
 
 class VertexFile:

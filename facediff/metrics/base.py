@@ -107,6 +107,7 @@ class Clips:
     cut_prediction: int
     cut_truth: int
     n_vertices: int
+    dims: int = 3
 
     def attach(self, name: str, values: Sequence[Any]) -> Clips:
         """The same sequences with one value each in the field ``name``."""
@@ -117,12 +118,12 @@ class Clips:
         """The same sequences with their neutral vertices: (batch, vertices, 3), or (vertices, 3) for all sequences."""
         if template is None:
             return self
-        batch, vertices = len(self.clips), self.n_vertices
-        if template.shape not in ((batch, vertices, 3), (vertices, 3)):
+        batch, vertices, dims = len(self.clips), self.n_vertices, self.dims
+        if template.shape not in ((batch, vertices, dims), (vertices, dims)):
             raise ValueError(
-                f"{name} has shape {tuple(template.shape)}; expected {(batch, vertices, 3)} or {(vertices, 3)}"
+                f"{name} has shape {tuple(template.shape)}; expected {(batch, vertices, dims)} or {(vertices, dims)}"
             )
-        templates = list(template.detach().expand(batch, vertices, 3))
+        templates = list(template.detach().expand(batch, vertices, dims))
         for clip, neutral in zip(self.clips, templates, strict=True):
             if not bool(neutral.isfinite().all()):
                 raise NotFiniteError(f"the template of {clip.name} holds NaN or infinity; repair or omit this clip")
@@ -180,10 +181,10 @@ def align(
     prediction, truth = prediction.detach(), truth.detach()  # scores are read, not optimised: keep no graph
     single = truth.ndim == 3
     for name, motion in (("prediction", prediction), ("truth", truth)):
-        if motion.ndim not in (3, 4) or motion.ndim != truth.ndim or motion.shape[-1] != 3:
+        if motion.ndim not in (3, 4) or motion.ndim != truth.ndim or motion.shape[-1] not in (1, 3):
             raise ValueError(
                 f"{name} has shape {tuple(motion.shape)}; prediction and truth must both be "
-                "(batch, frames, vertices, 3) or both (frames, vertices, 3)"
+                "(batch, frames, vertices, 3) or both (frames, vertices, 3), or so with 1 for channels"
             )
         if motion.shape[-2] == 0:
             raise ValueError(f"{name} has no vertex: shape {tuple(motion.shape)}")
@@ -224,7 +225,7 @@ def align(
         cut_prediction += ours - frames
         cut_truth += theirs - frames
         clips.append(Clip(name, prediction[place, :frames], truth[place, :frames]))
-    return Clips(tuple(clips), cut_prediction, cut_truth, truth.shape[2])
+    return Clips(tuple(clips), cut_prediction, cut_truth, truth.shape[2], truth.shape[3])
 
 
 def _valid_frames(name: str, lengths: Lengths | None, motion: Tensor) -> list[int]:

@@ -45,7 +45,7 @@ def one_pass(
     """Vertex errors, and how much less the prediction varies over time than the truth; float64 scalars.
 
     For each of ``errors`` its mean over frames, and for each of ``uppers``, (region,) int64, the signed deviation; for
-    these a ``template`` (vertices, 3) is given unless prediction and truth (frames, vertices, 3) are offsets from it.
+    these a ``template`` (points, dims) is given unless prediction and truth (frames, points, dims) are offsets from it.
     What is found does not depend on what else is asked for: each vertex goes through the same float64 operations.
     """
     frames, vertices, _ = truth.shape
@@ -73,7 +73,7 @@ def one_pass(
 
 def frames_per_step(motion: Tensor, looked_at: int) -> int:
     """How many frames of so many vertices to widen at a time."""
-    return max(1, (_CHUNK_CPU if motion.device.type == "cpu" else _CHUNK_ELSEWHERE) // (3 * looked_at))
+    return max(1, (_CHUNK_CPU if motion.device.type == "cpu" else _CHUNK_ELSEWHERE) // (motion.shape[-1] * looked_at))
 
 
 class Buffers:
@@ -100,13 +100,19 @@ def widened(motion: Tensor, name: str, buffers: Buffers) -> Tensor:
 
 
 def squared_errors(true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
-    """Σ_c (g_c − p_c)² of every vertex, (frames, vertices) float64, in a buffer."""
+    """Σ_c (g_c − p_c)² of every point, (frames, points) float64, in a buffer."""
     difference = buffers.get("difference", *true.shape)
     torch.sub(widened(true, "difference", buffers), widened(predicted, "predicted", buffers), out=difference)
     difference.mul_(difference)
     # Three strided terms are much faster than a reduction of length three.
-    x, y, z = difference.unbind(-1)
-    return torch.add(x, y, out=buffers.get("errors", *x.shape)).add_(z)
+    first, *rest = difference.unbind(-1)
+    errors = buffers.get("errors", *first.shape)
+    if not rest:
+        return errors.copy_(first)
+    torch.add(first, rest[0], out=errors)
+    for term in rest[1:]:
+        errors.add_(term)
+    return errors
 
 
 def _sum_over_frames(error: ErrorOf, whole: Tensor | None, true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
@@ -125,8 +131,8 @@ def _sum_over_frames(error: ErrorOf, whole: Tensor | None, true: Tensor, predict
 
 def squared_norm(vectors: Tensor) -> Tensor:
     """Σ_c v_c² over the last axis; three strided terms are much faster than a reduction of length three."""
-    x, y, z = vectors.square().unbind(-1)
-    return x + y + z
+    first, *rest = vectors.square().unbind(-1)
+    return sum(rest, first)
 
 
 class Variation:
@@ -139,7 +145,8 @@ class Variation:
 
     def __init__(self, first: Tensor, template: Tensor | None, indices: Tensor, step: int, buffers: Buffers) -> None:
         # All x, then all y, then all z: terms that are adjacent in memory are added much faster than strided ones.
-        self.places = (3 * indices + torch.arange(3, device=indices.device)[:, None]).flatten()
+        self.dims = first.shape[-1]
+        self.places = (self.dims * indices + torch.arange(self.dims, device=indices.device)[:, None]).flatten()
         self.still = None if template is None else template.reshape(-1).index_select(0, self.places).double()
         self.buffers = buffers
         self.count = len(indices)
@@ -148,7 +155,7 @@ class Variation:
         self.squares = torch.zeros_like(self.sums)
 
     def add(self, motion: Tensor) -> None:
-        """Add frames (frames, vertices, 3)."""
+        """Add frames (frames, points, dims)."""
         moved = self._squared_offsets(motion).sub_(self.first)
         self.sums[: len(motion)].add_(moved)
         self.squares[: len(motion)].addcmul_(moved, moved)
@@ -160,11 +167,13 @@ class Variation:
 
     def _squared_offsets(self, motion: Tensor) -> Tensor:
         """(frames, region), in a buffer."""
-        chosen = self.buffers.get("chosen", len(motion), 3 * self.count, dtype=motion.dtype)
+        chosen = self.buffers.get("chosen", len(motion), self.dims * self.count, dtype=motion.dtype)
         torch.index_select(motion.reshape(len(motion), -1), 1, self.places, out=chosen)
         offset = widened(chosen, "offset", self.buffers)
         if self.still is not None:
             offset.sub_(self.still)
-        x, y, z = offset.view(len(motion), 3, self.count).unbind(1)
-        squared = torch.mul(x, x, out=self.buffers.get("squared", len(motion), self.count))
-        return squared.addcmul_(y, y).addcmul_(z, z)
+        first, *rest = offset.view(len(motion), self.dims, self.count).unbind(1)
+        squared = torch.mul(first, first, out=self.buffers.get("squared", len(motion), self.count))
+        for term in rest:
+            squared.addcmul_(term, term)
+        return squared

@@ -21,11 +21,12 @@ from jaxtyping import Bool, Float
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
-from facediff.data import Batch, SpeechMotionDataModule
+from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
-from facediff.errors import FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.channel_weights import ChannelWeights, channel_weights
 from facediff.models.checkpoint_content import MotionScale, StyleSource
 from facediff.models.checkpoint_reading import checked_file
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, with_usual_styles
@@ -35,6 +36,7 @@ from facediff.models.person_styles import PersonStyles
 from facediff.models.pretrained import publish
 from facediff.models.principal import PrincipalComponents, Projection
 from facediff.registry import keeps_arguments
+from facediff.spaces import Space
 from facediff.speech.windows import WindowPlan
 from facediff.utils.licences import merged, network_licences
 from facediff.utils.ranges import Range, Vertices
@@ -43,11 +45,29 @@ Schedule = Literal["constant", "cosine", "exponential", "step"]
 Decay = Annotated[float, Range(0, 1000)]
 
 
-SIZES = ("n_vertices", "identities", "frame_rate")
+SIZES = ("n_vertices", "identities", "frame_rate", "space")
 """Options of a model that follow from its data module, by their name in both."""
 
 DIVERGENCE_INTERVAL = 50
 """Steps between two looks at the loss on an accelerator."""
+
+
+def read_space(space: object, points: int) -> Space:
+    """A space, or its state, or None for vertices.
+
+    Raises:
+        ArgumentError: if it is anything else, or has not as many channels as the motion has points.
+    """
+    try:
+        record = Space() if space is None else space if isinstance(space, Space) else Space.from_state(space)
+    except FaceDiffError as error:
+        raise ArgumentError({"space": space}, str(error)) from error
+    if not record.is_vertices and len(record.channels) != points:
+        raise ArgumentError(
+            {"space": record.kind},
+            f"has {len(record.channels)} channels and the motion {points}; give the corpus's own",
+        )
+    return record
 
 
 def lr_factor(
@@ -95,10 +115,15 @@ class AnimationModel(PersonStyles, ABC):
     in. An option that takes a component has the name of the component's kind (``decoder``, ``audio_encoder`` …).
 
     Args:
-        n_vertices: vertices of the topology; taken from the data module on the command line.
+        n_vertices: points of the motion: vertices of the topology, or channels of its space; taken from the data module
+            on the command line.
         identities: training identities in the order of the identity index; taken from the data module on the command
             line.
         frame_rate: motion frames a second; taken from the data module on the command line.
+        space: what the motion's numbers mean, a :class:`facediff.spaces.Space` or its state; vertices if None; taken
+            from the data module on the command line.
+        channel_weights: what the channels of a parametric space count: by the vertices that the corpus's ``rig`` moves
+            by them, by their standard ``deviation`` (also where there is no rig), or as they are (``none``).
         motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
             leaves it as it is.
         learning_rate: AdamW's learning rate.
@@ -132,6 +157,8 @@ class AnimationModel(PersonStyles, ABC):
         n_vertices: Vertices,
         identities: Annotated[list[str], Range(items=(1, 1_000_000))],
         frame_rate: Annotated[float, Range(0, 1000, above=True)],
+        space: Space | dict[str, Any] | None = None,
+        channel_weights: ChannelWeights = "rig",
         motion_scale: MotionScale = "unit",
         learning_rate: Annotated[float, Range(0, 1000)] = 1e-4,
         weight_decay: Decay = 0.05,
@@ -149,6 +176,10 @@ class AnimationModel(PersonStyles, ABC):
     ) -> None:
         super().__init__()
         self.n_vertices = n_vertices
+        self.space = read_space(space, n_vertices)
+        self.channel_weighting: ChannelWeights = channel_weights
+        # What the errors of channels are multiplied by; measured when training begins. Vertices count as they are.
+        self.register_buffer("geometry", None if self.space.is_vertices else torch.eye(n_vertices))
         self.identities = list(identities)
         self.frame_rate = frame_rate
         self.motion_scaling = motion_scale
@@ -167,6 +198,8 @@ class AnimationModel(PersonStyles, ABC):
         self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.style_source: StyleSource = style_source
+
+    geometry: Tensor | None
 
     @classmethod
     def for_data(cls, data: SpeechMotionDataModule, **options: Any) -> Self:  # noqa: ANN401
@@ -218,7 +251,7 @@ class AnimationModel(PersonStyles, ABC):
         """
 
     def encode_style(
-        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vectors of reference motions; of width 0 for a model without a speaking style.
 
@@ -438,19 +471,41 @@ class AnimationModel(PersonStyles, ABC):
         Raises:
             FaceDiffError: if some modules need them and the training motion never changes.
         """
+        weights = self.coordinate_weights(data)
+        if self.geometry is not None:
+            self.geometry.copy_(weights)
         waiting = [module for module in self.modules() if isinstance(module, PrincipalComponents)]
         count = max([at_least, *(module.count for module in waiting)])
         if not count:
             return None
-        weights = self.motion_weights(data).flatten()
         mean, shapes = data.principal_motion(count, weights)
         for module in waiting:
             module.attach(mean * self.scale, shapes * self.scale, weights)
         return shapes * self.scale
 
-    def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "vertices 3"]:  # noqa: ARG002
-        """What motion is multiplied by before its principal components are taken."""
-        return torch.ones(self.n_vertices, 3)
+    def coordinate_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "*all"]:
+        """What the coordinates of motion are multiplied by, (n,); of channels the matrix (n, n)."""
+        points = self.motion_weights(data)
+        if self.space.is_vertices:
+            return points.flatten()
+        _, shapes = data.principal_motion(self.n_vertices)
+        covariance = shapes.T @ shapes
+        return channel_weights(self.assets, covariance.diag(), covariance, points, self.channel_weighting)
+
+    def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "points dims"]:  # noqa: ARG002
+        """What the points of :attr:`weighted_assets` count, in principal components and in losses of channels."""
+        weighted = self.weighted_assets
+        return torch.ones(weighted.n_vertices, weighted.space.dims)
+
+    @property
+    def weighted_assets(self) -> Assets:
+        """The assets; of channels with a rig, those of the vertices that the rig moves."""
+        by_rig = self.assets.rig is not None and self.channel_weighting == "rig"
+        return self.assets.mesh if by_rig else self.assets
+
+    def weighed(self, motion: Float[Tensor, "*frames points dims"]) -> Float[Tensor, "*frames points dims"]:
+        """Motion whose squared errors count what :attr:`channel_weighting` says; of vertices the motion itself."""
+        return motion if self.geometry is None else (motion[..., 0] @ self.geometry.T)[..., None]
 
     # Checkpoints and publishing.
 

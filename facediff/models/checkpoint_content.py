@@ -18,6 +18,7 @@ from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.inference import Inference, Style
 from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, plain
+from facediff.spaces import Space
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
 from facediff.utils.limits import LIMITS, quoted
@@ -40,7 +41,8 @@ class CheckpointContent(LightningModule, Inference):
     """The part of a model that a checkpoint keeps besides its weights.
 
     Attributes:
-        n_vertices: vertices of the topology.
+        n_vertices: points of the motion: vertices, or channels.
+        space: what its numbers mean.
         identities: training identities in the order of the identity index.
         motion_scaling: as :class:`facediff.models.AnimationModel` takes ``motion_scale``.
         data_source: class and place of the corpus.
@@ -52,6 +54,7 @@ class CheckpointContent(LightningModule, Inference):
     """
 
     n_vertices: int
+    space: Space
     identities: list[str]
     motion_scaling: MotionScale
     style_source: StyleSource
@@ -64,6 +67,11 @@ class CheckpointContent(LightningModule, Inference):
         self.provenance: dict[str, str] = {}
         self.person_styles: dict[str, Style] = {}
         self._assets: Assets | None = None
+
+    @property
+    def dims(self) -> int:
+        """Numbers that each point of the motion has."""
+        return self.space.dims
 
     @property
     def assets(self) -> Assets:
@@ -102,7 +110,9 @@ class CheckpointContent(LightningModule, Inference):
         """
         sizes = {template.shape[0] for template in assets.templates.values()}
         for what, mine, theirs in (
-            ("vertices", {self.n_vertices}, sizes),
+            ("spaces", self.space.kind, assets.space.kind),
+            ("points", {self.n_vertices}, sizes),
+            ("channels", self.space, assets.space),
             ("identities", self.identities, assets.identities),
             ("frames a second", self.frame_rate, assets.frame_rate),
         ):
@@ -128,7 +138,7 @@ class CheckpointContent(LightningModule, Inference):
 
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the constructor's arguments as plain data, in the form that Lightning rebuilds a module from."""
-        options = {**defaults(type(self)), **arguments}
+        options = {**defaults(type(self)), **arguments, "space": None if self.space.is_vertices else self.space.state()}
         for kind in COMPONENTS.keys() & options.keys():
             modules = [m for m in self.modules() if isinstance(m, component_class(options[kind]))]
             options[kind] = describe(options[kind], modules[0] if modules else None)

@@ -45,6 +45,7 @@ from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY,
 from facediff.errors import FaceDiffError
 from facediff.models.pretrained import read_model
 from facediff.registry import COMPONENTS, Kind, model
+from facediff.spaces import Space
 from facediff.utils.hub import model_path
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
@@ -190,7 +191,10 @@ def model_of(path: Path | str, hparams: Mapping[str, Any], base: type[M]) -> tup
     if not isinstance(identities, list) or not all(map(is_name, identities)):
         raise FaceDiffError(f"{path}: its identities are {quoted(identities)}; expected names without path separators")
     LIMITS.check("identities", len(identities), path)
-    kept = ("_class_path", "_instantiator", "identities")
+    space = hparams.get("space")
+    if space is not None:
+        Space.from_state(space)
+    kept = ("_class_path", "_instantiator", "identities", "space")
     arguments = read_options(
         str(path),
         implementation,
@@ -201,7 +205,7 @@ def model_of(path: Path | str, hparams: Mapping[str, Any], base: type[M]) -> tup
         if not arguments.get(name, 0) > 0:
             raise FaceDiffError(f"{path}: its {name} is {quoted(hparams.get(name))}; expected a number above zero")
     LIMITS.check("vertices", arguments["n_vertices"], path)
-    return implementation, {**arguments, "identities": list(identities)}
+    return implementation, {**arguments, "identities": list(identities), "space": space}
 
 
 def build(path: Path | str, checkpoint: dict[str, Any], base: type[M]) -> M:

@@ -120,6 +120,9 @@ template, or from the mean of its speaker's training clips; the model given anot
 ENERGY_REGIONS = ("lips", "upper_face")
 """Regions by whose energy scores the best checkpoint is chosen, and whose smoothness is scored."""
 
+PARAMETERS = "param_"
+"""How the names of scores begin that are taken of the channels of a parametric space."""
+
 OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
 
@@ -184,6 +187,7 @@ class Evaluation:
         self.chosen: dict[str, dict[str, dict[str, Metric]]] = {}
         self._sequences: list[dict[str, Any]] = []
         self._data: SpeechMotionDataModule | None = None
+        self._assets: Assets | None = None
         self._mean_faces: MeanFaces | None = None
         self._speakers: list[str] = []
         self._validation_seeds = range(1)
@@ -197,7 +201,9 @@ class Evaluation:
             FaceDiffError: if the corpus or the model lacks something that a metric needs.
         """
         assets = model.assets
-        regions = regions_of(assets)
+        self._assets = assets
+        # Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
+        regions = regions_of(self._scored)
         self.splits = list(splits)
         self._sequences = []
         self._data = data
@@ -220,11 +226,41 @@ class Evaluation:
                     for request in self.requests
                     if method == "model" or not OF_THE_MODEL & set(request.needs)
                 }
+                | self._of_channels(device)
                 | self._smoothness(regions, device)
                 for method in methods
             }
             for split in self.splits
         }
+
+    @property
+    def _scored(self) -> Assets:
+        """The assets of what is scored: vertices, or channels without a rig."""
+        assets = self._assets
+        assert assets is not None  # noqa: S101 - for the type checker
+        return assets if assets.rig is None else assets.mesh
+
+    def decoded(self, motion: Tensor, batch: Batch) -> Tensor:
+        """Offsets of a batch's clips, (batch, …, points, dims), as those of what is scored."""
+        assets = self._assets
+        if assets is None or assets.rig is None:
+            return motion
+        names = batch.identity_names
+        return torch.stack([assets.to_vertices(own, name) for own, name in zip(motion, names, strict=True)])
+
+    def _templates(self, batch: Batch) -> Tensor:
+        """Neutral faces of a batch's clips."""
+        if self._assets is None or self._assets.rig is None:
+            return batch.template
+        faces = [self._assets.mesh.template(name) for name in batch.identity_names]
+        return torch.stack(faces).to(batch.template)
+
+    def _of_channels(self, device: torch.device) -> dict[str, Metric]:
+        """The formulas of vertices on the channels themselves, of parametric spaces."""
+        if self._assets is None or self._assets.space.is_vertices:
+            return {}
+        metrics = self.protocol.build(*(regions_of(self._assets)[name] for name in ("lips", "upper_face")))
+        return {f"{PARAMETERS}{name}": metric.to(device) for name, metric in metrics.scores().items()}
 
     def _smoothness(self, regions: Mapping[str, Region], device: torch.device) -> dict[str, Metric]:
         """Difference ratio and frame step by region, of tests."""
@@ -254,10 +290,11 @@ class Evaluation:
         """Add a validation batch's samples (batch, samples, frames, V, 3), and those of a still face."""
         if batch.repeated:
             return
+        samples, truth = self.decoded(samples, batch), self.decoded(batch.motion, batch)
         for name, metric in self.energies.items():
             drawn = torch.zeros_like(samples) if name.startswith("still") else samples
             shown = drawn[:, : metric.n_samples].expand(-1, metric.n_samples, -1, -1, -1)
-            metric.to(samples.device).update(shown, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+            metric.to(samples.device).update(shown, truth, lengths=batch.frame_lengths, clip_names=batch.names)
 
     def _energy(self) -> float | None:
         """The energy score over that of a still face, mean of the regions; empties the metrics."""
@@ -283,12 +320,12 @@ class Evaluation:
             "identities": {"n_identities": len(assets.templates)},
             "time": {"hardware": device_name(device)},
         }
-        if assets.inner_lip_pairs is not None:
-            has["lip_pairs"] = {"pairs": LipPairs.from_pairs(f"{assets.corpus}/inner lips", assets.inner_lip_pairs)}
+        if (pairs := self._scored.inner_lip_pairs) is not None:
+            has["lip_pairs"] = {"pairs": LipPairs.from_pairs(f"{assets.corpus}/inner lips", pairs)}
         if "lid_pairs" in self.needs and (lids := eyelid_pairs_of(data)) is not None:
             has["lid_pairs"] = {"pairs": lids, "frames_per_second": assets.frame_rate}
         if "gallery" in self.needs:
-            has["gallery"] = {"gallery": speaker_gallery(data, self._speakers)}
+            has["gallery"] = {"gallery": speaker_gallery(data, self._speakers, assets)}
         if (data.root / "phonemes").is_dir():
             has["closures"] = {}
         if model.samples:
@@ -296,7 +333,7 @@ class Evaluation:
         if len(self._styles(model)) > 1:
             has["conditions"] = {}
         if "style" in self.needs:
-            still = torch.zeros(1, 1, assets.n_vertices, 3, device=model.device)
+            still = torch.zeros(1, 1, assets.n_vertices, assets.space.dims, device=model.device)
             with torch.inference_mode():
                 if model.encode_style(still, torch.ones(1, 1, dtype=torch.bool, device=model.device)).shape[1]:
                     has["style"] = {}
@@ -381,11 +418,17 @@ class Evaluation:
         if batch.repeated:
             return
         metrics = self.metrics[split][method].to(motion.device)
-        metrics.update(motion, batch.motion, lengths=batch.frame_lengths, clip_names=batch.names)
+        channels = {"prediction": motion, "truth": batch.motion}
+        motion, truth = self.decoded(motion, batch), self.decoded(batch.motion, batch)
+        metrics.update(motion, truth, lengths=batch.frame_lengths, clip_names=batch.names)
         scores: dict[str, Metric] = {**metrics.scores()}
-        inputs = self._inputs(motion, batch) | dict(inputs or {}) if self.chosen[split][method] else {}
+        inputs = dict(inputs or {})
+        for name in ("samples", "predictions"):  # several motions of each clip
+            if name in inputs:
+                inputs[name] = self.decoded(inputs[name], batch)
+        inputs = self._inputs(motion, truth, batch) | inputs if self.chosen[split][method] else {}
         for name, metric in self.chosen[split][method].items():
-            own_inputs = inputs
+            own_inputs = inputs | channels if name.startswith(PARAMETERS) else inputs
             if "samples" in inputs and hasattr(metric, "n_samples"):
                 own_inputs = inputs | {"samples": inputs["samples"][:, : metric.n_samples]}
             try:
@@ -457,14 +500,14 @@ class Evaluation:
             table.append({"split": split, **line, **means, **counts})
         return table
 
-    def _inputs(self, motion: Tensor, batch: Batch) -> dict[str, Any]:
+    def _inputs(self, motion: Tensor, truth: Tensor, batch: Batch) -> dict[str, Any]:
         """What metrics chosen by name may read of a batch, by the name under which they take it; see `NEEDS`."""
         inputs: dict[str, Any] = {
             "prediction": motion,
-            "truth": batch.motion,
+            "truth": truth,
             "lengths": batch.frame_lengths,
             "clip_names": batch.names,
-            "offsets_from": batch.template,
+            "offsets_from": self._templates(batch),
             "waveform": batch.audio,
         }
         if "identities" in self.needs:

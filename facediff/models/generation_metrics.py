@@ -146,7 +146,7 @@ class EvaluationCorpus:
         self.missing: dict[str, str] = {}
         self.gallery = None
         try:
-            self.gallery = speaker_gallery(data, self.speakers)
+            self.gallery = speaker_gallery(data, self.speakers, self.assets)
         except FaceDiffError as error:
             self.missing["nearest_speaker"] = str(error)
         self.eyelids = eyelid_pairs_of(data)

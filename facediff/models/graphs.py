@@ -184,6 +184,11 @@ class GraphedModel(Protocol):
         ...
 
     @property
+    def dims(self) -> int:
+        """Numbers of a point."""
+        ...
+
+    @property
     def clock(self) -> FrameClock:
         """How the model counts its frames."""
         ...
@@ -194,7 +199,7 @@ class GraphedModel(Protocol):
         ...
 
     def encode_style(
-        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vectors of reference motions."""
         ...
@@ -273,7 +278,7 @@ class StyleGraph(nn.Module):
         self.model = model
 
     def forward(
-        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Encode offsets from the template."""
         with of_frames(mask.shape[1]):
@@ -283,7 +288,7 @@ class StyleGraph(nn.Module):
 def style_graphs(model: GraphedModel, width: int) -> list[Graph]:
     """The graph that takes a style from motion, if styles have any width."""
     batch, frames = 2, 50
-    motion = torch.randn(batch, frames, model.n_vertices, 3, generator=torch.Generator().manual_seed(0))
+    motion = torch.randn(batch, frames, model.n_vertices, model.dims, generator=torch.Generator().manual_seed(0))
     inputs = {"motion": motion, "mask": torch.ones(batch, frames, dtype=torch.bool)}
     graph = Graph("style", StyleGraph(model), inputs, dict.fromkeys(inputs, FRAMES), ("style",))
     return [graph] if width else []

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps an iteration, e.g. in a progress bar."""
 
-BatchMotion = Float[Tensor, "batch frames vertices 3"]
+BatchMotion = Float[Tensor, "batch frames points dims"]
 """One motion for each clip of a batch: offsets from the template, zero on padding."""
 
-Motion = Float[Tensor, "seeds frames vertices 3"]
+Motion = Float[Tensor, "seeds frames points dims"]
 """One motion for each seed, of one clip."""
 
 Expressivity = float | Float[Tensor, " vertices"]
@@ -70,7 +70,7 @@ class Prediction:
     name: str
     identity: str
     reference_name: str
-    vertices: Float[Tensor, "frames vertices 3"]
+    vertices: Float[Tensor, "frames points dims"]
 
 
 class Inference(ABC):

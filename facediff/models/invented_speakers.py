@@ -26,16 +26,17 @@ class InventedSpeakers(nn.Module):
     stay those of the speaker.
 
     Args:
-        n_vertices: vertices.
+        n_vertices: points.
+        dims: numbers of a point.
         share: of the clips.
         deviation: standard deviation of the logarithm of the gain on all motion; the components' is half of it.
     """
 
-    def __init__(self, n_vertices: int, share: float, deviation: float) -> None:
+    def __init__(self, n_vertices: int, dims: int, share: float, deviation: float) -> None:
         super().__init__()
         self.share = share
         self.deviation = deviation
-        self.components = PrincipalComponents(n_vertices, COMPONENTS)
+        self.components = PrincipalComponents(n_vertices, dims, COMPONENTS)
 
     def forward(self, batch: Batch, scale: float) -> Batch:
         """The batch with some of its clips changed; nothing is changed in place.
@@ -64,15 +65,15 @@ class InventedSpeakers(nn.Module):
 
     def changed(
         self,
-        motion: Float[Tensor, "clips frames vertices 3"],
+        motion: Float[Tensor, "clips frames points dims"],
         every: Float[Tensor, "clips 1"],
         own: Float[Tensor, "clips components"],
-    ) -> Float[Tensor, "clips frames vertices 3"]:
+    ) -> Float[Tensor, "clips frames points dims"]:
         """Scaled motion with one gain on all of it and one on each of its principal components.
 
         Motion outside the components, of which there is little, gets the common gain alone.
         """
-        mean = self.components.mean.view(-1, 3)
+        mean = self.components.mean.view(-1, self.components.dims)
         amounts = self.components.project(motion)
         moved = motion + self.components.expand(amounts * (own - 1)[:, None]) - mean
         return mean + every[:, :, None, None] * (moved - mean)

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-Motion = Float[Tensor, "batch frames vertices 3"]
+Motion = Float[Tensor, "batch frames points dims"]
 Mask = Bool[Tensor, "batch frames"]
 Scalar = Float[Tensor, ""]
 

@@ -45,7 +45,7 @@ def fused_losses(
 
     Args:
         features: what the map is applied to.
-        weight: the map, coordinates in the order x, y, z of each vertex.
+        weight: the map, all numbers of the first point, then of the second ….
         bias: its constant; None for none.
         truth: true motion.
         mask: valid frames.
@@ -87,7 +87,7 @@ class _FusedLosses(torch.autograd.Function):
         of_weight = torch.empty_like(weight) if needed[1] else None
         of_bias = torch.empty_like(bias) if bias is not None and needed[2] else None
         for block, rows in enumerate(blocks.rows):
-            # Rows are whole vertices, three coordinates each, since L_face needs a vertex's length.
+            # Rows are whole points, all numbers of each, since L_face needs the length of each.
             part = weight[rows]
             prediction = frames @ part.T if bias is None else torch.addmm(bias[rows], frames, part.T)
             # The prediction exists for one block at a time, and its memory becomes the gradient's.
@@ -153,6 +153,7 @@ class _Blocks:
         differentiated: bool,
     ) -> None:
         self.truth, self.factors, self.scale, self.differentiated = truth.flatten(2), factors, scale, differentiated
+        self.dims = dims = truth.shape[-1]
         self.valid = mask[..., None].to(weight.dtype)
         self.count = self.valid.sum(1, keepdim=True).clamp_min(1)
         # What each difference of order 0, 1 and 2 counts in its mean over valid frames and coordinates.
@@ -163,12 +164,12 @@ class _Blocks:
             self.shares.append(share[..., None])
             valid = valid[:, 1:] & valid[:, :-1]
         size = CACHE_SIZE if features.device.type == "cpu" else DEVICE_SIZE
-        step = max(1, size // (3 * max(1, mask.numel())))
-        self.rows = [slice(start, start + 3 * step) for start in range(0, len(weight), 3 * step)]
+        step = max(1, size // (dims * max(1, mask.numel())))
+        self.rows = [slice(start, start + dims * step) for start in range(0, len(weight), dims * step)]
         # The upper-face vertices of each block, counted from its first, and what each counts in the mean. Where the
         # indices are on the CPU already, nothing here waits for an accelerator.
         indices, times = torch.unique(region.cpu(), return_counts=True)
-        edges = torch.arange(0, len(weight) // 3 + step, step)
+        edges = torch.arange(0, len(weight) // dims + step, step)
         sizes = torch.searchsorted(indices, edges).diff().tolist()
         self.upper_face = [
             (part.sub(edge).to(weight.device), many.to(weight) / (len(mask) * len(region)))
@@ -201,12 +202,12 @@ class _Blocks:
         slope[:, 1:] += of_change
         slope[:, :-1] -= of_change
         if pull is not None:
-            slope.view(*slope.shape[:2], -1, 3)[:, :, upper] += pull.mul_(self.factors[3])
+            slope.view(*slope.shape[:2], -1, self.dims)[:, :, upper] += pull.mul_(self.factors[3])
         return values, slope
 
     def _face(self, prediction: Tensor, truth: Tensor, upper: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-        """L_face of a block's upper-face vertices, and its gradient there (B, T, R, 3)."""
-        moved, true = (motion.view(*motion.shape[:2], -1, 3)[:, :, upper] for motion in (prediction, truth))
+        """L_face of a block's upper-face vertices, and its gradient there (B, T, R, dims)."""
+        moved, true = (motion.view(*motion.shape[:2], -1, self.dims)[:, :, upper] for motion in (prediction, truth))
         # The readable form is :func:`facediff.models.losses.face_dynamics_loss` (eq. 19); only its gradient is written
         # out.
         length = torch.linalg.vector_norm(moved, dim=-1)

@@ -16,9 +16,9 @@ from facediff.errors import FaceDiffError
 from facediff.models.layers import Frames, Share, Width, exporting
 from facediff.models.principal import PrincipalComponents
 from facediff.registry import mesh_encoder
-from facediff.utils.ranges import Range, Vertices
+from facediff.utils.ranges import Dims, Range, Vertices
 
-Motion = Float[Tensor, "batch frames vertices 3"]
+Motion = Float[Tensor, "batch frames points dims"]
 """Offsets from the template."""
 
 
@@ -56,19 +56,21 @@ class MeshEncoder(nn.Module, ABC):
 class MeshEncoderFactory(Protocol):
     """Makes a mesh encoder once the model's sizes are known."""
 
-    def __call__(self, *, dim: int, n_vertices: int) -> MeshEncoder:
-        """Make one for features of ``dim`` channels and motion of ``n_vertices`` vertices."""
+    def __call__(self, *, dim: int, n_vertices: int, dims: int) -> MeshEncoder:
+        """Make one for features of ``dim`` channels and motion of ``n_vertices`` points of ``dims`` numbers."""
         ...
 
 
-def check_vertices(motion: Tensor, n_vertices: int) -> None:
-    """Refuse motion (batch, frames, vertices, 3) on another mesh.
+def check_points(motion: Tensor, n_vertices: int, dims: int) -> None:
+    """Refuse motion (batch, frames, points, dims) on another mesh, or of another space.
 
     Raises:
-        ValueError: if the number of vertices is another one; a larger one would be encoded without an error.
+        ValueError: if the number of points is another one; a larger one would be encoded without an error.
     """
-    if motion.shape[2] != n_vertices:
-        raise ValueError(f"motion has {motion.shape[2]} vertices, but the mesh encoder was made for {n_vertices}")
+    if motion.shape[2:] != (n_vertices, dims):
+        raise ValueError(
+            f"motion has {tuple(motion.shape[2:])} points, but the mesh encoder was made for {n_vertices, dims}"
+        )
 
 
 @mesh_encoder.register("linear")
@@ -77,17 +79,18 @@ class LinearMeshEncoder(MeshEncoder):
 
     Args:
         dim: channels of a frame's feature; given by the model.
-        n_vertices: vertices of the mesh; given by the model.
+        n_vertices: points of the motion; given by the model.
+        dims: numbers of a point; given by the model.
     """
 
-    def __init__(self, *, dim: Width, n_vertices: Vertices) -> None:
+    def __init__(self, *, dim: Width, n_vertices: Vertices, dims: Dims) -> None:
         super().__init__()
-        self.n_vertices = n_vertices
-        self.map = nn.Linear(3 * n_vertices, dim)
+        self.n_vertices, self.dims = n_vertices, dims
+        self.map = nn.Linear(dims * n_vertices, dim)
 
     def forward(self, motion: Motion) -> Frames:
         """The feature of each frame."""
-        check_vertices(motion, self.n_vertices)
+        check_points(motion, self.n_vertices, self.dims)
         return self.map(motion.flatten(2))
 
 
@@ -100,20 +103,23 @@ class ComponentMeshEncoder(MeshEncoder):
 
     Args:
         dim: channels of a frame's feature; given by the model.
-        n_vertices: vertices of the mesh; given by the model.
+        n_vertices: points of the motion; given by the model.
+        dims: numbers of a point; given by the model.
         count: components.
     """
 
-    def __init__(self, *, dim: Width, n_vertices: Vertices, count: Annotated[int, Range(1, 4096)] = 64) -> None:
+    def __init__(
+        self, *, dim: Width, n_vertices: Vertices, dims: Dims, count: Annotated[int, Range(1, 4096)] = 64
+    ) -> None:
         super().__init__()
-        self.n_vertices = n_vertices
-        self.components = PrincipalComponents(n_vertices, count)
+        self.n_vertices, self.dims = n_vertices, dims
+        self.components = PrincipalComponents(n_vertices, dims, count)
         self.map = nn.Linear(count, dim)
 
     def forward(self, motion: Motion | Float[Tensor, "batch frames all_components"]) -> Frames:
         """The feature of each frame, of offsets or of their components."""
         if motion.dim() == 4:
-            check_vertices(motion, self.n_vertices)
+            check_points(motion, self.n_vertices, self.dims)
         return self.map(self.components.project(motion))
 
 
@@ -174,7 +180,8 @@ class SpiralMeshEncoder(MeshEncoder):
 
     Args:
         dim: channels of a frame's feature; given by the model.
-        n_vertices: vertices of the mesh; given by the model.
+        n_vertices: points of the motion; given by the model.
+        dims: numbers of a point; given by the model.
         channels: channels of a vertex after each step.
         factor: vertices before a down-sampling to one after it.
         spiral_length: vertices of a spiral, its centre included.
@@ -194,6 +201,7 @@ class SpiralMeshEncoder(MeshEncoder):
         *,
         dim: Width,
         n_vertices: Vertices,
+        dims: Dims,
         channels: Annotated[tuple[int, ...], Range(1, 4096, items=(0, 16))] = (16, 32, 32),
         factor: Annotated[int, Range(1, 1000)] = 4,
         spiral_length: Annotated[int, Range(1, 1000)] = 12,
@@ -203,6 +211,11 @@ class SpiralMeshEncoder(MeshEncoder):
         max_frames: Annotated[int, Range(1, 10**9)] | None = None,
     ) -> None:
         super().__init__()
+        if dims != 3:
+            raise FaceDiffError(
+                "mesh_encoder=spiral follows the surface of a mesh, which channels of a parametric space do not have; "
+                "choose mesh_encoder=linear or mesh_encoder=components"
+            )
         self.n_vertices = n_vertices
         self.factor = factor
         self.spiral_length = spiral_length
@@ -278,7 +291,7 @@ class SpiralMeshEncoder(MeshEncoder):
         Raises:
             FaceDiffError: if the encoder has not been given a mesh.
         """
-        check_vertices(motion, self.n_vertices)
+        check_points(motion, self.n_vertices, 3)
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
         frames = motion.flatten(0, 1)
@@ -289,7 +302,7 @@ class SpiralMeshEncoder(MeshEncoder):
         parts = [self._part(part) for part in torch.split(frames, self.max_frames)]
         return torch.cat(parts).view(*motion.shape[:2], -1)
 
-    def encode(self, x: Float[Tensor, "frames vertices 3"]) -> Float[Tensor, "frames dim"]:
+    def encode(self, x: Float[Tensor, "frames points dims"]) -> Float[Tensor, "frames dim"]:
         """The feature of each frame of one sequence."""
         for step in self.steps:
             x = F.leaky_relu(step(x), self.negative_slope)

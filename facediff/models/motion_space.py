@@ -25,9 +25,9 @@ from facediff.models.layers import Share
 from facediff.models.principal import SMALLEST, PrincipalComponents
 from facediff.models.samplers import Steps
 from facediff.registry import motion_space
-from facediff.utils.ranges import Range, Vertices
+from facediff.utils.ranges import Dims, Range, Vertices
 
-Offsets = Float[Tensor, "batch frames vertices 3"]
+Offsets = Float[Tensor, "batch frames points dims"]
 """Scaled offsets from the template."""
 
 Components = Float[Tensor, "batch frames all_components"]
@@ -92,8 +92,8 @@ class MotionSpace(nn.Module, ABC):
 class MotionSpaceFactory(Protocol):
     """Makes a space once the model's sizes are known."""
 
-    def __call__(self, *, n_vertices: int, steps: int) -> MotionSpace:
-        """Make one for motion of ``n_vertices`` vertices, noised in ``steps`` steps."""
+    def __call__(self, *, n_vertices: int, dims: int, steps: int) -> MotionSpace:
+        """Make one for motion of ``n_vertices`` points of ``dims`` numbers, noised in ``steps`` steps."""
         ...
 
 
@@ -102,13 +102,14 @@ class VertexMotion(MotionSpace):
     """All coordinates of all vertices; the network predicts clean motion (the paper's setting).
 
     Args:
-        n_vertices: vertices; given by the model.
+        n_vertices: points; given by the model.
+        dims: numbers of a point; given by the model.
         steps: of the noise process; given by the model.
     """
 
-    def __init__(self, *, n_vertices: Vertices, steps: Steps) -> None:
+    def __init__(self, *, n_vertices: Vertices, dims: Dims, steps: Steps) -> None:
         super().__init__()
-        self.coordinates = 3 * n_vertices
+        self.coordinates, self.dims = dims * n_vertices, dims
         self.preconditioning = None
 
     def encode(self, motion: Offsets) -> Coordinates:
@@ -118,7 +119,7 @@ class VertexMotion(MotionSpace):
     def decode(self, coordinates: Coordinates) -> Offsets:
         """Every coordinate."""
         # A view: 70 000 coordinates a frame are not copied.
-        return coordinates.view(*coordinates.shape[:2], -1, 3)
+        return coordinates.view(*coordinates.shape[:2], -1, self.dims)
 
 
 @motion_space.register("components")
@@ -129,7 +130,8 @@ class ComponentMotion(MotionSpace):
     d₁. Losses weigh each component as its vertices do, whatever its size in the noise.
 
     Args:
-        n_vertices: vertices; given by the model.
+        n_vertices: points; given by the model.
+        dims: numbers of a point; given by the model.
         steps: of the noise process; given by the model.
         count: components K; motion outside them is lost.
         whitening: 0 keeps the components' sizes, which is vertices up to truncation; at 1 all are of equal size, so
@@ -151,6 +153,7 @@ class ComponentMotion(MotionSpace):
         self,
         *,
         n_vertices: Vertices,
+        dims: Dims,
         steps: Steps,
         count: Annotated[int, Range(1, 4096)] = 64,
         whitening: Share = 0.5,
@@ -165,7 +168,7 @@ class ComponentMotion(MotionSpace):
         self._region_weights = {"upper_face": upper_face_weight, "lips": lips_weight}
         if eyelids_weight is not None:
             self._region_weights["eyelids"] = eyelids_weight
-        self.components = PrincipalComponents(n_vertices, count)
+        self.components = PrincipalComponents(n_vertices, dims, count)
         self.register_buffer("sizes", torch.ones(count))
         if prior_frames % 2 == 0:
             raise ArgumentError(

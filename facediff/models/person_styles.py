@@ -26,7 +26,7 @@ class PersonStyles(CheckpointContent):
 
     @abstractmethod
     def encode_style(
-        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vectors of reference motions, as :meth:`facediff.models.AnimationModel.encode_style`."""
 

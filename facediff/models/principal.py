@@ -16,17 +16,17 @@ SMALLEST = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Offsets from the template (…, V, 3) to components (…, K).
+    """Offsets from the template (…, V, dims) to components (…, K).
 
     Attributes:
-        into: the linear map, (3V, K).
+        into: the linear map, (dims · V, K).
         offset: what is subtracted, (K,).
     """
 
     into: Float[Tensor, "all components"]
     offset: Float[Tensor, " components"]
 
-    def __call__(self, motion: Float[Tensor, "*frames vertices 3"]) -> Float[Tensor, "*frames components"]:
+    def __call__(self, motion: Float[Tensor, "*frames points dims"]) -> Float[Tensor, "*frames components"]:
         """The components of each frame."""
         return motion.flatten(-2) @ self.into - self.offset
 
@@ -39,39 +39,46 @@ class PrincipalComponents(nn.Module):
     before a corpus is known.
 
     Args:
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers of a point.
         count: components K; motion outside them is lost.
 
     Attributes:
-        mean: mean of all coordinates, (3V,), scaled.
-        basis: unit components of weighted motion, (K, 3V); zero where the corpus has fewer.
-        weights: what each coordinate is multiplied by before the components are taken, (3V,).
+        mean: mean of all coordinates, (n,) with n = dims · V, scaled.
+        basis: unit components of weighted motion, (K, n); zero where the corpus has fewer.
+        weights: what each coordinate is multiplied by before the components are taken, (n,); of channels a matrix
+            (n, n), since what two of them move together is more or less than the sum of both.
+        unweighted: the inverse of such a matrix; None where weights are numbers.
         deviations: the components' standard deviations, (K,).
     """
 
     mean: Tensor
     basis: Tensor
     weights: Tensor
+    unweighted: Tensor | None
     deviations: Tensor
 
-    def __init__(self, n_vertices: int, count: int) -> None:
+    def __init__(self, n_vertices: int, dims: int, count: int) -> None:
         super().__init__()
+        self.dims = dims
         self.count = count
-        self.register_buffer("mean", torch.zeros(3 * n_vertices))
-        self.register_buffer("basis", torch.zeros(count, 3 * n_vertices))
-        self.register_buffer("weights", torch.ones(3 * n_vertices))
+        size = dims * n_vertices
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("basis", torch.zeros(count, size))
+        self.register_buffer("weights", torch.eye(size) if dims == 1 else torch.ones(size))
+        self.register_buffer("unweighted", torch.eye(size) if dims == 1 else None)
         self.register_buffer("deviations", torch.ones(count))
 
     def attach(
-        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, " all"]
+        self, mean: Float[Tensor, " all"], shapes: Float[Tensor, "components all"], weights: Float[Tensor, "*all"]
     ) -> None:
         """Take over the training motion's statistics.
 
         Args:
-            mean: mean of all coordinates, 3V, scaled.
+            mean: mean of all coordinates, scaled.
             shapes: principal components of weighted motion, each as long as its standard deviation, largest first;
                 those beyond ``count`` are left out.
-            weights: what each coordinate was multiplied by.
+            weights: what each coordinate was multiplied by, or the matrix that all were.
 
         Raises:
             FaceDiffError: if the training motion never changes.
@@ -87,6 +94,8 @@ class PrincipalComponents(nn.Module):
         # tensors.
         self.mean.copy_(mean)
         self.weights.copy_(weights)
+        if self.unweighted is not None:
+            self.unweighted.copy_(torch.linalg.inv(weights.double()))
         self.basis.zero_()[: len(shapes)] = shapes / deviations[:, None]
         # Projection divides by the deviations. A component that hardly varies, or that the corpus does not have, would
         # turn rounding errors into coordinates of unit size.
@@ -94,7 +103,7 @@ class PrincipalComponents(nn.Module):
         self.deviations.fill_(smallest)[: len(shapes)] = deviations.clamp_min(smallest)
 
     def project(
-        self, motion: Float[Tensor, "batch frames vertices 3"] | Float[Tensor, "batch frames all_components"]
+        self, motion: Float[Tensor, "batch frames points dims"] | Float[Tensor, "batch frames all_components"]
     ) -> Float[Tensor, "batch frames components"]:
         """Components of scaled offsets from the template, each of unit variance over the training frames.
 
@@ -114,14 +123,17 @@ class PrincipalComponents(nn.Module):
         return Projection((own.into * scale).cpu(), own.offset.cpu())
 
     def _projection(self) -> Projection:
-        into = (self.basis * self.weights).T / self.deviations
+        weighted = self.basis * self.weights if self.unweighted is None else self.basis @ self.weights
+        into = weighted.T / self.deviations
         return Projection(into, self.mean @ into)
 
-    def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames vertices 3"]:
+    def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames points dims"]:
         """The scaled offsets with these components; all other components are those of the mean."""
         with torch.autocast(components.device.type, enabled=False):
             back = components.to(self.basis.dtype) * self.deviations
             # The basis is orthonormal in weighted coordinates, so its transpose is its inverse there; then the weights
             # are undone.
-            motion = (back @ self.basis) / self.weights + self.mean
-            return motion.view(*motion.shape[:2], -1, 3)
+            shaped = back @ self.basis
+            shaped = shaped / self.weights if self.unweighted is None else shaped @ self.unweighted.T
+            motion = shaped + self.mean
+            return motion.view(*motion.shape[:2], -1, self.dims)

@@ -146,7 +146,7 @@ def style_width(model: AnimationModel) -> int:
 
     from facediff.data import Reference
 
-    return len(vector_of(Reference("still", torch.zeros(1, model.n_vertices, 3)), model))
+    return len(vector_of(Reference("still", torch.zeros(1, model.n_vertices, model.dims)), model))
 
 
 def extract_style(clips: Sequence[StyleLike], identity: str, model: AnimationModel) -> Tensor:

@@ -292,5 +292,6 @@ USUAL_LOW_LATENCY_STEPS = 1500
 USUAL_VOICE_STEPS = 600
 """Training steps in which an audio encoder learns other voices where no number is given."""
 Vertices = Annotated[int, Range(1, 2_000_000)]
+Dims = Annotated[int, Range(1, 3)]
 Window = Annotated[float, Range(0.01, 600)]
 Workers = Annotated[int, Range(1, 1024)]

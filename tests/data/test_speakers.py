@@ -21,11 +21,11 @@ def test_mean_face_is_that_of_all_training_frames(tiny: Tiny) -> None:
 
 def test_gallery_holds_no_evaluated_recording(tiny: Tiny) -> None:
     speakers = sorted({clip.identity for clip in tiny.corpus.clips.values()})
-    gallery = speaker_gallery(tiny, speakers)
+    gallery = speaker_gallery(tiny, speakers, tiny.assets())
     known = tiny.known_clips()
     assert len(gallery.speakers) == sum(len(known.get(speaker, [])) for speaker in speakers)
     with pytest.raises(FaceDiffError, match="two"):
-        speaker_gallery(tiny, speakers[:1])
+        speaker_gallery(tiny, speakers[:1], tiny.assets())
 
 
 def test_spread_is_even(tiny: Tiny) -> None:

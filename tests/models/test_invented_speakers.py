@@ -23,7 +23,7 @@ Make = Callable[..., Any]
 
 def invented(share: float, deviation: float) -> InventedSpeakers:
     """With components of some correlated motion, under weights."""
-    made = InventedSpeakers(VERTICES, share, deviation)
+    made = InventedSpeakers(VERTICES, 3, share, deviation)
     random = torch.Generator().manual_seed(1)
     weights = 1 + torch.rand(3 * VERTICES, generator=random)
     mixed = torch.randn(300, 90, generator=random) @ torch.randn(90, 3 * VERTICES, generator=random)

@@ -38,7 +38,7 @@ def motion(frames: int = 300, vertices: int = 6, rank: int = 5) -> Tensor:
 
 def components(x: Tensor, weights: Tensor | None = None, **options: Any) -> ComponentMotion:  # noqa: ANN401
     """A space that knows motion, by a singular value decomposition."""
-    space = ComponentMotion(n_vertices=x.shape[2], steps=1000, **options)
+    space = ComponentMotion(n_vertices=x.shape[2], dims=3, steps=1000, **options)
     flat = x[0].flatten(1)
     weights = torch.ones(flat.shape[1]) if weights is None else weights
     _, sizes, shapes = torch.linalg.svd((flat - flat.mean(0)) * weights, full_matrices=False)
@@ -82,7 +82,7 @@ def test_the_noise_sees_components_in_the_sizes_that_they_are_given(whitening: f
     several = torch.tensor([16.0, 9.0, 0.25, 0.01])
     sizes = 4 * (several.sqrt().numpy() / 4) ** (1 - whitening)
     np.testing.assert_allclose(space.noised_variances(several).numpy(), sizes**2, rtol=1e-5)
-    vertices = registry.motion_space.vertices(n_vertices=6, steps=10)
+    vertices = registry.motion_space.vertices(n_vertices=6, dims=3, steps=10)
     assert torch.equal(vertices.noised_variances(several), several)
     assert vertices.coordinates == 18
     assert not vertices.region_weights
@@ -439,7 +439,7 @@ def test_training_measures_the_covariance_over_time(make_model: Make, make_train
     total = measured[:, 2, 2] @ weight
     assert float(np.array(shown) @ weight / total) == pytest.approx(0.5, abs=0.02)
     with pytest.raises(FaceDiffError, match="prior_frames"):
-        ComponentMotion(n_vertices=6, steps=10, prior_frames=4)
+        ComponentMotion(n_vertices=6, dims=3, steps=10, prior_frames=4)
     with pytest.raises(FaceDiffError, match="prior_frames"):
         tiny.covariance_over_time(lambda x: x.flatten(2), 9999)
 

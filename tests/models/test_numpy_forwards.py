@@ -226,7 +226,7 @@ def test_the_core_adds_the_step_before_the_norm() -> None:
         dim=DIM,
         audio_encoder=registry.audio_encoder.mel(dim=DIM),
         identity_encoder=registry.identity_encoder.hierarchical(dim=DIM, n_identities=2),
-        mesh_encoder=registry.mesh_encoder.linear(dim=DIM, n_vertices=5),
+        mesh_encoder=registry.mesh_encoder.linear(dim=DIM, n_vertices=5, dims=3),
         style_encoder=registry.style_encoder.tcn_gru_transformer(dim=DIM),
         fusion=registry.fusion.cross_attention(dim=DIM),
         decoder=registry.decoder.style_transformer(dim=DIM, style_dim=DIM, num_layers=1),

@@ -40,7 +40,14 @@ class TestDecoder:
     def make(self) -> StyleContentDecoder:
         torch.manual_seed(0)
         return StyleContentDecoder(
-            n_vertices=7, content_dim=5, style_dim=3, channels=(6, 8, 8), kernels=(5, 3, 3), hidden=(9, 9), basis_size=4
+            n_vertices=7,
+            dims=3,
+            content_dim=5,
+            style_dim=3,
+            channels=(6, 8, 8),
+            kernels=(5, 3, 3),
+            hidden=(9, 9),
+            basis_size=4,
         )
 
     def test_no_future_frame_is_seen(self) -> None:

@@ -109,7 +109,7 @@ class SampleGraph(nn.Module):
         self.model = model
         self.decoded = decoded
 
-    def forward(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames vertices 3"]:
+    def forward(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
         model = self.model
         scaled = model.network.clean_motion(sample) if self.decoded == "kept" else sample

@@ -178,7 +178,9 @@ class DualPathDiffusion(AnimationModel):
         super().__init__(**options)
         self.identity_dropout = identity_dropout
         self.invented_speakers = (
-            InventedSpeakers(self.n_vertices, invented_speakers, invented_gain) if invented_speakers else None
+            InventedSpeakers(self.n_vertices, self.dims, invented_speakers, invented_gain)
+            if invented_speakers
+            else None
         )
         self.style_dropout = style_dropout
         self.speech_dropout = speech_dropout
@@ -202,7 +204,7 @@ class DualPathDiffusion(AnimationModel):
         self._sampler_options: dict[str, Any] | None = None
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
-        self.motion_space = motion_space(n_vertices=self.n_vertices, steps=diffusion_steps)
+        self.motion_space = motion_space(n_vertices=self.n_vertices, dims=self.dims, steps=diffusion_steps)
         if timestep_sampling == "log_snr" and (self.motion_space.preconditioning is None or min_snr is not None):
             raise ArgumentError(
                 {"timestep_sampling": timestep_sampling},
@@ -216,7 +218,9 @@ class DualPathDiffusion(AnimationModel):
             audio_encoder=audio_encoder(dim=dim),
             identity_encoder=identity_encoder(dim=dim, n_identities=len(self.identities)),
             # Without a dynamic style there is nothing to embed, and no idle weights.
-            mesh_encoder=mesh_encoder(dim=dim, n_vertices=self.n_vertices) if style.token_dims else None,
+            mesh_encoder=mesh_encoder(dim=dim, n_vertices=self.n_vertices, dims=self.dims)
+            if style.token_dims
+            else None,
             style_encoder=style,
             fusion=fusion(dim=dim),
             decoder=decoder(dim=dim, style_dim=dim),
@@ -261,10 +265,13 @@ class DualPathDiffusion(AnimationModel):
         space.fit(self.process.signal, covariance)
         return shapes
 
-    def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "vertices 3"]:
+    def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "points dims"]:
         """The motion space's weights of regions, of those that the corpus lists."""
-        weights, regions = super().motion_weights(data), dict(self.assets.regions)
-        if "eyelids" in self.motion_space.region_weights and (pairs := data.eyelid_pairs()) is not None:
+        weighted = self.weighted_assets
+        weights, regions = super().motion_weights(data), dict(weighted.regions)
+        if not weighted.space.is_vertices:
+            regions["eyelids"] = torch.tensor(weighted.space.region("eyes"), dtype=torch.long)
+        elif "eyelids" in self.motion_space.region_weights and (pairs := data.eyelid_pairs()) is not None:
             regions["eyelids"] = pairs.flatten()
         # The last of them counts where regions overlap: eyelids lie in the upper face.
         for region, weight in self.motion_space.region_weights.items():
@@ -444,7 +451,7 @@ class DualPathDiffusion(AnimationModel):
     def _vertex_losses(
         self,
         conditions: Conditions,
-        motion: Float[Tensor, "draws frames vertices 3"],
+        motion: Float[Tensor, "draws frames points dims"],
         mask: Bool[Tensor, "draws frames"],
         step: Int[Tensor, " draws"],
         noise: Float[Tensor, "draws frames coordinates"],
@@ -459,11 +466,15 @@ class DualPathDiffusion(AnimationModel):
         signal = self.process.signal.to(noise.device)[step][:, None, None]
         noisy = noise.mul_((1 - signal).sqrt()).addcmul_(motion.flatten(2), signal.sqrt() * self.scale)
         decoded = network.core(network.embed(noisy), step, conditions)
+        last: Tensor = network.unembed.weight
+        rest: Tensor = network.unembed.bias
+        if self.geometry is not None:  # linear in the last map, which is weighed in place of its result
+            last, rest = self.geometry @ last, self.geometry @ rest
         return fused_losses(
             decoded,
-            network.unembed.weight,
-            network.unembed.bias,
-            motion,
+            last,
+            rest,
+            self.weighed(motion),
             mask,
             self.assets.regions["upper_face"],
             {**self.loss_weights, "face": face},
@@ -586,7 +597,7 @@ class DualPathDiffusion(AnimationModel):
     @torch.no_grad()
     def generate_clips(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch frames points dims"]:
         """Algorithm 2 with the model's sampler, in its sampling space; conditions are computed once.
 
         All noise of a clip follows from the seed and its name: its motion does not depend on the rest of the batch.
@@ -599,7 +610,7 @@ class DualPathDiffusion(AnimationModel):
     @torch.no_grad()
     def generate_samples(
         self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None
-    ) -> Float[Tensor, "samples frames vertices 3"]:
+    ) -> Float[Tensor, "samples frames points dims"]:
         """The same for several seeds: speech and style are encoded once."""
         lengths = clip.frame_lengths.tolist()
         noise = ClipNoise(clip.names * len(seeds), lengths * len(seeds), seeds, self.device)
@@ -609,7 +620,7 @@ class DualPathDiffusion(AnimationModel):
     @torch.no_grad()
     def generate_window(
         self, clip: Batch, window: MotionWindow, seeds: Sequence[int], before: list[Tensor] | None
-    ) -> tuple[Float[Tensor, "samples frames vertices 3"], list[Tensor]]:
+    ) -> tuple[Float[Tensor, "samples frames points dims"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
         own = slice(window.context, window.context + window.frames)
@@ -630,7 +641,7 @@ class DualPathDiffusion(AnimationModel):
         blend: Blend = unchanged,
         first: int = 0,
         progress: Progress | None = None,
-    ) -> Float[Tensor, "batch wanted vertices 3"]:
+    ) -> Float[Tensor, "batch wanted points dims"]:
         """Run the sampler from noise to motion, in offsets from the template.
 
         Args:
@@ -695,7 +706,7 @@ class DualPathDiffusion(AnimationModel):
 
     def _motion(
         self, denoiser: ConditionalDenoiser, sample: Tensor, first: int
-    ) -> Float[Tensor, "batch wanted vertices 3"]:
+    ) -> Float[Tensor, "batch wanted points dims"]:
         """Offsets from the template, from a first frame on."""
         return self.motion_space.decode(denoiser.motion(sample, first)) / self.scale
 

@@ -151,7 +151,7 @@ class OffsetModel(AutoregressiveModel):
         self.check_length(frames, batch.names[0])
         style, memory = self.conditions(batch, frames)
         motion = self.network.generate(style, memory, self.loop)
-        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
 
 
 class ProjectedKeysValues(NamedTuple):
@@ -385,17 +385,18 @@ class SpokenDecoder(nn.Module):
 
     Args:
         audio_width: channels of the features of speech.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         decoder: the decoder's options.
     """
 
     style: nn.Module
 
-    def __init__(self, audio_width: int, n_vertices: int, decoder: dict[str, Any]) -> None:
+    def __init__(self, audio_width: int, n_vertices: int, dims: int, decoder: dict[str, Any]) -> None:
         super().__init__()
         dim = int(decoder["dim"])
         self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.motion_in = nn.Linear(dims * n_vertices, dim)
         self.decoder = PeriodicDecoder(**decoder)
 
     def after_motion(
@@ -413,7 +414,8 @@ class AutoregressiveNetwork(SpokenDecoder):
 
     Args:
         audio_width: channels of the features.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         style: weights of the training identities to a vector of the decoder's width.
         decoder: the decoder's options.
     """
@@ -423,11 +425,12 @@ class AutoregressiveNetwork(SpokenDecoder):
         *,
         audio_width: int,
         n_vertices: int,
+        dims: int,
         style: nn.Module,
         decoder: dict[str, Any],
     ) -> None:
-        super().__init__(audio_width, n_vertices, decoder)
-        self.motion_out = nn.Linear(int(decoder["dim"]), 3 * n_vertices)
+        super().__init__(audio_width, n_vertices, dims, decoder)
+        self.motion_out = nn.Linear(int(decoder["dim"]), dims * n_vertices)
         self.style = style
         nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
         nn.init.zeros_(self.motion_out.bias)

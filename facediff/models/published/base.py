@@ -255,7 +255,7 @@ class DirectModel(PublishedModel):
     ) -> BatchMotion:
         """All frames in one pass; nothing is random."""
         motion = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
 
     @property
     def heard_steps(self) -> int:
@@ -295,11 +295,11 @@ class DirectMotion(nn.Module):
 
     def forward(
         self, features: Float[Tensor, "batch frames *width"], identity: Int[Tensor, " batch"]
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus; the identity is an index, or −1."""
         model = self.model
         motion = model.decode(features, model.weights_of(identity), None)
-        return motion.view(*motion.shape[:2], model.n_vertices, 3) / model.scale
+        return motion.view(*motion.shape[:2], model.n_vertices, model.dims) / model.scale
 
 
 def direct_graphs(model: DirectModel) -> Graphs:

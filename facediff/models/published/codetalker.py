@@ -161,7 +161,7 @@ class CodeTalker(AutoregressiveModel):
             "scale": attention_scale,
             "positions": positions,
         }
-        self.prior = MotionPrior(n_vertices=self.n_vertices, **self.prior_options)
+        self.prior = MotionPrior(n_vertices=self.n_vertices, dims=self.dims, **self.prior_options)
         self._lacks_prior = False
         if stage == "prior":
             self.windows = type(self.windows)(above=math.inf)
@@ -173,6 +173,7 @@ class CodeTalker(AutoregressiveModel):
         self.network = Predictor(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
+            dims=self.dims,
             width=self.prior.width,
             n_identities=len(self.identities),
             decoder=self.decoder_options,
@@ -336,7 +337,7 @@ class CodeTalker(AutoregressiveModel):
         generate = self.literal if self.loop == "literal" else self.cached
         values, fed_back = generate(style, memory, int(frames.max()), progress or iter)
         motion = torch.stack(fed_back, 1) if self.output == "fed_back" else self.prior.decode_clips(values, frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
 
     def cached(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
         """Codes (B, T, width) and the frames that were fed back, with what does not change kept.
@@ -408,7 +409,7 @@ class CodeTalker(AutoregressiveModel):
         frames = batch.frame_lengths
         tokens = self.prior.encode_clips((batch.motion * self.scale).flatten(2), frames)
         motion = self.prior.decode_clips(self.prior.quantise(tokens).values, frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, 3) / self.scale
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
         """One motion for all seeds."""
@@ -455,16 +456,17 @@ class Predictor(SpokenDecoder):
 
     Args:
         audio_width: channels of the features of speech.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         width: channels of all codes of a frame.
         n_identities: rows of the table of speakers.
         decoder: options of the decoder.
     """
 
     def __init__(
-        self, *, audio_width: int, n_vertices: int, width: int, n_identities: int, decoder: dict[str, Any]
+        self, *, audio_width: int, n_vertices: int, dims: int, width: int, n_identities: int, decoder: dict[str, Any]
     ) -> None:
-        super().__init__(audio_width, n_vertices, decoder)
+        super().__init__(audio_width, n_vertices, dims, decoder)
         dim = int(decoder["dim"])
         self.out = nn.Linear(dim, width, bias=False)
         self.style = SpeakerTable(n_identities, dim, "embedding")

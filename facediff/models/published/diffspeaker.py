@@ -139,6 +139,7 @@ class DiffSpeaker(DiffusionModel):
         self.network = DiffSpeakerNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
+            dims=self.dims,
             dim=self.dim,
             num_layers=num_layers,
             num_heads=num_heads,
@@ -236,9 +237,9 @@ class DiffSpeaker(DiffusionModel):
 
     # Sampling.
 
-    def space(self) -> VertexSpace | FoldedSpace:
+    def state_space(self) -> VertexSpace | FoldedSpace:
         """Where the reverse process runs."""
-        rest = self.network.motion_out.bias.new_zeros(1, 1, 3 * self.n_vertices)
+        rest = self.network.motion_out.bias.new_zeros(1, 1, self.dims * self.n_vertices)
         return space_of(self.network, self.sampling_space, rest, fresh_noise=False)
 
     def graphs(self) -> Graphs:
@@ -251,8 +252,8 @@ class DiffSpeaker(DiffusionModel):
         """The reverse process from noise that is drawn once."""
         self.check_length(frames, batch.names[0])
         network, conditions = self.network, self.conditions(batch, frames)
-        start = noise(batch.template.new_empty(len(batch), int(frames.max()), 3 * self.n_vertices))
-        space = self.space()
+        start = noise(batch.template.new_empty(len(batch), int(frames.max()), self.dims * self.n_vertices))
+        space = self.state_space()
         state = space.project(start)
         # Noisy motion is always U h + weight · b + left · start, of which h, a sum of features, has the network's
         # width; so the vertices are not needed before the end.
@@ -270,7 +271,7 @@ class DiffSpeaker(DiffusionModel):
         if self.sampling_space == "folded":
             weights = network.motion_out
             state = F.linear(features, weights.weight) + weight * weights.bias + left * start
-        motion = state.view(*state.shape[:2], self.n_vertices, 3) / self.scale
+        motion = state.view(*state.shape[:2], self.n_vertices, self.dims) / self.scale
         return smoothed(motion, frames) if self.smooth else motion
 
 
@@ -392,7 +393,8 @@ class DiffSpeakerNetwork(nn.Module):
 
     Args:
         audio_width: channels of a frame's speech.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         dim: channels.
         num_layers: layers.
         num_heads: attention heads.
@@ -408,6 +410,7 @@ class DiffSpeakerNetwork(nn.Module):
         *,
         audio_width: int,
         n_vertices: int,
+        dims: int,
         dim: int,
         num_layers: int,
         num_heads: int,
@@ -420,14 +423,14 @@ class DiffSpeakerNetwork(nn.Module):
         super().__init__()
         self.dim, self.num_heads, self.time_dim, self.period = dim, num_heads, time_dim, period
         self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.motion_in = nn.Linear(dims * n_vertices, dim)
         # Each layer has tokens of its own.
         self.style = SpeakerTable(n_identities, num_layers * dim, "embedding")
         self.time = nn.Sequential(
             nn.Linear(time_dim, num_layers * dim), nn.SiLU(), nn.Linear(num_layers * dim, num_layers * dim)
         )
         self.layers = nn.ModuleList(AdaptedLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
-        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        self.motion_out = nn.Linear(dim, dims * n_vertices)
         nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
         nn.init.zeros_(self.motion_out.bias)
         self.dropout = nn.Dropout(dropout)
@@ -514,7 +517,7 @@ class SpeakerStep(nn.Module):
         step: Int[Tensor, " batch"],
     ) -> tuple[Tensor, Tensor]:
         """The prediction, and the features that it is a map of."""
-        model, network, space = self.model, self.model.network, self.model.space()
+        model, network, space = self.model, self.model.network, self.model.state_space()
         conditions = network.conditions(features, model.weights_of(identity), None)
         hidden = network(space.embed(state[..., : space.width]), step, conditions)
         if model.sampling_space == "vertices":
@@ -532,7 +535,7 @@ class SpeakerStart(nn.Module):
 
     def forward(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
         """Noise alone: of features and bias there is nothing yet."""
-        state = self.model.space().project(noise)
+        state = self.model.state_space().project(noise)
         ones = torch.ones_like(state[..., :1])
         return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
 
@@ -548,7 +551,7 @@ class SpeakerMotion(nn.Module):
         self,
         sample: Float[Tensor, "batch frames state"],
         noise: Float[Tensor, "batch frames coordinates"] | None = None,
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus; ``noise`` is what sampling started from, if anything is left of it."""
         model, last = self.model, self.model.network.motion_out
         coordinates = sample
@@ -556,11 +559,11 @@ class SpeakerMotion(nn.Module):
             features = sample[..., model.dim : -2]
             coordinates = nn.functional.linear(features, last.weight) + sample[..., -2:-1] * last.bias
             coordinates = coordinates if noise is None else coordinates + sample[..., -1:] * noise
-        motion = coordinates.view(*coordinates.shape[:2], model.n_vertices, 3) / model.scale
+        motion = coordinates.view(*coordinates.shape[:2], model.n_vertices, model.dims) / model.scale
         return smoothed_whole(motion) if model.smooth else motion
 
 
-def smoothed_whole(motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames vertices 3"]:
+def smoothed_whole(motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames points dims"]:
     """As :func:`smoothed`, of clips without padding and of any length."""
     # By indices and not by slices: a graph takes clips of any length, and slices of one or two frames would be empty.
     places, last = torch.arange(motion.shape[1]), motion.shape[1] - 1
@@ -574,7 +577,7 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
     speech = features_graph(model, model.network, 1)
     features = results_of(speech)
     batch, frames, dim = features.shape
-    folded, coordinates = model.sampling_space == "folded", 3 * model.n_vertices
+    folded, coordinates = model.sampling_space == "folded", model.dims * model.n_vertices
     width = 2 * dim + 2 if folded else coordinates
     inputs = conditions_of(features, model)
     del inputs["template"]

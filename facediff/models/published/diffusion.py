@@ -84,7 +84,11 @@ CONDITIONS: dict[str, Axes] = {"features": FRAMES, "identity": BATCH, "template"
 def conditions_of(features: Tensor, model: PublishedModel) -> dict[str, Tensor]:
     """Example values of what every step is given."""
     batch = features.shape[0]
-    return {"features": features, "identity": zeros(batch), "template": torch.zeros(batch, model.n_vertices, 3)}
+    return {
+        "features": features,
+        "identity": zeros(batch),
+        "template": torch.zeros(batch, model.n_vertices, model.dims),
+    }
 
 
 def features_graph(model: DiffusionModel, network: LinearEnds, steps: int) -> Graph:

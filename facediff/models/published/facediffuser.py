@@ -97,6 +97,7 @@ class FaceDiffuser(DiffusionModel):
         self.network = FaceDiffuserNetwork(
             audio_width=2 * self.audio_width,
             n_vertices=self.n_vertices,
+            dims=self.dims,
             dim=dim or (512 if self.pairs else 256),
             steps=self.steps,
             num_layers=num_layers,
@@ -174,14 +175,14 @@ class FaceDiffuser(DiffusionModel):
         predicted = torch.where(mask, network.motion_out(hidden) + rest, clean)
         return F.huber_loss(predicted, clean, reduction="sum") / (frames.sum() * clean.shape[2])
 
-    def rest(self, template: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch 1 coordinates"]:
+    def rest(self, template: Float[Tensor, "batch points dims"]) -> Float[Tensor, "batch 1 coordinates"]:
         """What is noised where the face does not move: the template, or nothing."""
         rest = (template * self.scale).flatten(1)[:, None]
         return rest if self.noised == "absolute" else torch.zeros_like(rest)
 
     # Sampling.
 
-    def space(self, rest: Float[Tensor, "batch 1 coordinates"]) -> VertexSpace | FoldedSpace:
+    def state_space(self, rest: Float[Tensor, "batch 1 coordinates"]) -> VertexSpace | FoldedSpace:
         """Where the reverse process runs."""
         return space_of(self.network, self.sampling_space, rest)
 
@@ -194,7 +195,7 @@ class FaceDiffuser(DiffusionModel):
     ) -> BatchMotion:
         """The reverse process over all steps: the first noisy motion, then new noise in each step."""
         network, posterior, rest = self.network, self.posterior, self.rest(batch.template)
-        style, space = network.style(self.identity_weights(batch)), self.space(rest)
+        style, space = network.style(self.identity_weights(batch)), self.state_space(rest)
         speech = network.audio_map(self.hear(batch, frames))
         last = self.steps - self.skip_steps - 1
         state = space.noise(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
@@ -218,7 +219,7 @@ class FaceDiffuser(DiffusionModel):
         motion = (network.motion_out(hidden) + rest - (batch.template * self.scale).flatten(1)[:, None]) / self.scale
         if self.noised == "offsets":
             motion = network.motion_out(hidden) / self.scale
-        return motion.view(*motion.shape[:2], self.n_vertices, 3)
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims)
 
 
 class Posterior:
@@ -261,7 +262,8 @@ class FaceDiffuserNetwork(nn.Module):
 
     Args:
         audio_width: channels of a frame's speech.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         dim: channels of each of the three inputs, and of the recurrent layers.
         steps: noising steps.
         num_layers: recurrent layers.
@@ -274,6 +276,7 @@ class FaceDiffuserNetwork(nn.Module):
         *,
         audio_width: int,
         n_vertices: int,
+        dims: int,
         dim: int,
         steps: int,
         num_layers: int,
@@ -282,14 +285,14 @@ class FaceDiffuserNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(3 * n_vertices, 2 * dim)
+        self.motion_in = nn.Linear(dims * n_vertices, 2 * dim)
         self.smooth = nn.Conv1d(1, 1, kernel_size=9, padding=4)
         self.step = nn.Linear(steps, dim)
         self.norm = nn.LayerNorm(3 * dim)
         # Forward only, so that a frame's motion does not depend on later speech but for HuBERT's own attention.
         self.gru = nn.GRU(3 * dim, dim, num_layers, batch_first=True, dropout=dropout if num_layers > 1 else 0.0)
         self.style = SpeakerTable(n_identities, dim)
-        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        self.motion_out = nn.Linear(dim, dims * n_vertices)
         nn.init.zeros_(self.motion_out.weight)
         nn.init.zeros_(self.motion_out.bias)
         self.of_weights: WeightCache[Fold] = WeightCache()
@@ -328,13 +331,13 @@ class DiffuserStep(nn.Module):
         self,
         features: Float[Tensor, "batch frames dim"],
         identity: Int[Tensor, " batch"],
-        template: Float[Tensor, "batch vertices 3"],
+        template: Float[Tensor, "batch points dims"],
         state: Float[Tensor, "batch frames state"],
         step: Int[Tensor, " batch"],
     ) -> tuple[Tensor, Tensor]:
         """Where vertices are noised with the face, the template is a part of what is predicted."""
         model, network = self.model, self.model.network
-        space = model.space(model.rest(template))
+        space = model.state_space(model.rest(template))
         hidden = network(space.embed(state), step, features, network.style(model.weights_of(identity)))
         return space.clean(hidden), hidden
 
@@ -349,7 +352,7 @@ class DiffuserStart(nn.Module):
 
     def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
         """Noised zeros."""
-        space = self.model.space(torch.zeros(1, 1, 3 * self.model.n_vertices))
+        space = self.model.state_space(torch.zeros(1, 1, self.model.dims * self.model.n_vertices))
         return space.noise(noise) * self.share
 
 
@@ -360,16 +363,16 @@ class LastMap(nn.Module):
         super().__init__()
         self.model = model
 
-    def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames vertices 3"]:
+    def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
         coordinates = self.model.network.motion_out(sample)
-        return coordinates.view(*coordinates.shape[:2], self.model.n_vertices, 3) / self.model.scale
+        return coordinates.view(*coordinates.shape[:2], self.model.n_vertices, self.model.dims) / self.model.scale
 
 
 def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     """FaceDiffuser over all of its steps, with fresh noise in each but the last."""
     speech = features_graph(model, model.network, 2)
-    features, space = results_of(speech), model.space(torch.zeros(1, 1, 3 * model.n_vertices))
+    features, space = results_of(speech), model.state_space(torch.zeros(1, 1, model.dims * model.n_vertices))
     batch, frames, dim = features.shape
     step = Graph(
         "step",

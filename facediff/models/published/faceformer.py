@@ -53,6 +53,7 @@ class FaceFormer(OffsetModel):
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
+            dims=self.dims,
             style=SpeakerTable(len(self.identities), self.dim),
             decoder=self.decoder_options,
         )

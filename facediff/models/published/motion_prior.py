@@ -133,7 +133,8 @@ class MotionPrior(nn.Module):
     """Motion as tokens of a table of codes, and back.
 
     Args:
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         dim: channels of both halves.
         tokens: tokens of a frame.
         token_dim: channels of a token.
@@ -148,6 +149,7 @@ class MotionPrior(nn.Module):
         self,
         *,
         n_vertices: int,
+        dims: int,
         dim: int,
         tokens: int,
         token_dim: int,
@@ -158,7 +160,7 @@ class MotionPrior(nn.Module):
     ) -> None:
         super().__init__()
         self.tokens, self.width = tokens, tokens * token_dim
-        self.motion_in = nn.Linear(3 * n_vertices, dim)
+        self.motion_in = nn.Linear(dims * n_vertices, dim)
         self.encoder = Half(dim=dim, **options)
         self.to_tokens = nn.Linear(dim, self.width) if token_maps else nn.Identity()
         # Uniform in ±1/codes, as in the public VQ-VAE implementations that the released code follows: all codes start
@@ -166,7 +168,7 @@ class MotionPrior(nn.Module):
         self.codebook = nn.Parameter(torch.empty(codes, token_dim).uniform_(-1 / codes, 1 / codes))
         self.from_tokens = nn.Linear(self.width, dim) if token_maps else nn.Identity()
         self.decoder = Half(dim=dim, **options)
-        self.motion_out = nn.Linear(dim, 3 * n_vertices, bias=out_bias)
+        self.motion_out = nn.Linear(dim, dims * n_vertices, bias=out_bias)
 
     def encode(self, motion: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames width"]:
         """Tokens of clips of one length, not yet codes."""

@@ -117,6 +117,7 @@ class SelfTalk(DirectModel):
         self.network = SelfTalkNetwork(
             audio_width=self.audio_width * (2 if self.pairs else 1),
             n_vertices=self.n_vertices,
+            dims=self.dims,
             dim=dim,
             num_layers=num_layers,
             num_heads=num_heads,
@@ -157,7 +158,7 @@ class SelfTalk(DirectModel):
         """A lip reader of these vertices, with the recogniser's width and letters."""
         if max(vertices) >= self.n_vertices:
             raise ArgumentError({"lip_vertices": max(vertices)}, f"the faces have {self.n_vertices} vertices")
-        return LipReader(vertices, dim=text.width, letters=text.letters, **self._reader_options)
+        return LipReader(vertices, self.dims, dim=text.width, letters=text.letters, **self._reader_options)
 
     @property
     def heard_steps(self) -> int:
@@ -236,7 +237,8 @@ class SelfTalkNetwork(nn.Module):
 
     Args:
         audio_width: channels of a frame's speech.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         dim: channels of the decoder.
         num_layers: its layers.
         num_heads: its attention heads.
@@ -249,6 +251,7 @@ class SelfTalkNetwork(nn.Module):
         *,
         audio_width: int,
         n_vertices: int,
+        dims: int,
         dim: int,
         num_layers: int,
         num_heads: int,
@@ -259,7 +262,7 @@ class SelfTalkNetwork(nn.Module):
         self.audio_map = nn.Linear(audio_width, dim)
         layer = nn.TransformerDecoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
         self.decoder = nn.TransformerDecoder(layer, num_layers)
-        self.motion_out = nn.Linear(dim, 3 * n_vertices)
+        self.motion_out = nn.Linear(dim, dims * n_vertices)
         nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
         nn.init.zeros_(self.motion_out.bias)
 
@@ -310,6 +313,7 @@ class LipReader(nn.Module):
     def __init__(
         self,
         vertices: Sequence[int],
+        dims: int,
         *,
         dim: int,
         letters: int,
@@ -319,9 +323,9 @@ class LipReader(nn.Module):
         dropout: float,
     ) -> None:
         super().__init__()
-        places = 3 * torch.tensor(list(vertices))[:, None] + torch.arange(3)
+        places = dims * torch.tensor(list(vertices))[:, None] + torch.arange(dims)
         self.register_buffer("columns", places.flatten(), persistent=False)
-        self.lip_map = nn.Linear(3 * len(vertices), dim)
+        self.lip_map = nn.Linear(dims * len(vertices), dim)
         layer = nn.TransformerEncoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
         # Nested tensors, PyTorch's default here, warn that they are a prototype.
         encoder = nn.TransformerEncoder(layer, num_layers, nn.LayerNorm(dim), enable_nested_tensor=False)

@@ -79,6 +79,7 @@ class TalkingStyle(OffsetModel):
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
+            dims=self.dims,
             style=SpeakerStyle(len(self.identities), self.dim, style_attention),
             decoder=self.decoder_options,
         )
@@ -103,7 +104,7 @@ class TalkingStyle(OffsetModel):
         # Published: vertex numbers index the flattened coordinates, so that others than the mouth's are weighted.
         if self.mouth_loss == "flattened":
             return lips
-        return (3 * lips[:, None] + torch.arange(3, device=self.device)).flatten()
+        return (self.dims * lips[:, None] + torch.arange(self.dims, device=self.device)).flatten()
 
 
 class SpeakerStyle(nn.Module):

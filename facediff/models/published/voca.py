@@ -78,6 +78,7 @@ class Voca(DirectModel):
         self.network = VocaNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
+            dims=self.dims,
             n_identities=len(self.identities),
             window=speech_window,
             channels=channels,
@@ -214,7 +215,8 @@ class VocaNetwork(nn.Module):
 
     Args:
         audio_width: channels of speech.
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         n_identities: rows of the tables of speakers.
         window: rows of speech.
         channels: of the convolutions.
@@ -229,6 +231,7 @@ class VocaNetwork(nn.Module):
         *,
         audio_width: int,
         n_vertices: int,
+        dims: int,
         n_identities: int,
         window: int,
         channels: Sequence[int],
@@ -250,7 +253,7 @@ class VocaNetwork(nn.Module):
         self.dense = nn.Linear(left * widths[-1], dim)
         self.late_style = SpeakerTable(n_identities, dim)
         self.coefficients = nn.Linear(dim, components)
-        self.expression = nn.Linear(components, 3 * n_vertices)
+        self.expression = nn.Linear(components, dims * n_vertices)
 
     def forward(
         self, windows: Float[Tensor, "frames channels rows"], speaker: Float[Tensor, "frames identities"]

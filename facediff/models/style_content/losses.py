@@ -17,7 +17,7 @@ from facediff.data import Batch
 from facediff.models.losses import masked_std
 from facediff.speech.cepstra import align_features, cepstra
 
-Motion = Float[Tensor, "batch frames vertices 3"]
+Motion = Float[Tensor, "batch frames points dims"]
 Mask = Bool[Tensor, "batch frames"]
 EPSILON = 1e-6
 """Added to denominators and under roots, so that gradients are finite."""
@@ -49,7 +49,7 @@ class MotionDistance:
         mask: Mask,
         *,
         vertices: Int[Tensor, " region"] | None = None,
-        rest: Float[Tensor, "batch vertices 3"] | None = None,
+        rest: Float[Tensor, "batch points dims"] | None = None,
         pairs: Int[Tensor, "pairs 2"] | None = None,
         upper: Int[Tensor, " upper_face"] | None = None,
     ) -> Float[Tensor, ""]:

@@ -176,8 +176,8 @@ class StyleContentDisentanglement(AnimationModel):
         if not style.token_dims:
             raise FaceDiffError("style_encoder: this model needs a style; choose another style encoder, such as lstm")
         self.network = DisentanglementNetwork(
-            content_encoder=mesh_encoder(dim=content_dim, n_vertices=self.n_vertices),
-            style_frames=mesh_encoder(dim=dim, n_vertices=self.n_vertices),
+            content_encoder=mesh_encoder(dim=content_dim, n_vertices=self.n_vertices, dims=self.dims),
+            style_frames=mesh_encoder(dim=dim, n_vertices=self.n_vertices, dims=self.dims),
             style_encoder=style,
             audio_encoder=audio_encoder(dim=dim),
             speech_content=WindowedTransformer(
@@ -190,6 +190,7 @@ class StyleContentDisentanglement(AnimationModel):
             ),
             decoder=StyleContentDecoder(
                 n_vertices=self.n_vertices,
+                dims=self.dims,
                 content_dim=content_dim,
                 style_dim=sum(style.token_dims),
                 channels=decoder_channels,
@@ -362,16 +363,16 @@ class StyleContentDisentanglement(AnimationModel):
 
     def decode_scaled(self, content: Tensor, style: Tensor, mask: Bool[Tensor, "batch frames"]) -> Tensor:
         """D(C, S): scaled motion (B, T, V, 3); what it is on padding has no meaning."""
-        return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, 3)
+        return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, self.dims)
 
     def encode_style(
-        self, reference: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vectors of reference motions."""
         return self.network.style(reference * self.scale, mask)
 
     def encode_content(
-        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames content_dim"]:
         """Content of motion, independent of the speaker; zero on padding."""
         return self.network.content(motion * self.scale, mask)
@@ -381,7 +382,7 @@ class StyleContentDisentanglement(AnimationModel):
         content: Float[Tensor, "batch frames content_dim"],
         style: Float[Tensor, "batch style_dim"],
         mask: Bool[Tensor, "batch frames"],
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch frames points dims"]:
         """Offsets from the template, zero on padding, of content and style that may be of different speakers."""
         return self.decode_scaled(content, style, mask) / self.scale * mask[..., None, None]
 
@@ -391,7 +392,7 @@ class StyleContentDisentanglement(AnimationModel):
 
     def generate_clips(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch frames points dims"]:
         """Content from the speech, style from the reference; nothing is random, so the seed does not matter."""
         return self.decode(self.network.content_of_speech(batch), self.style_of(batch), batch.mask)
 
@@ -411,7 +412,7 @@ class ContentMotionGraph(nn.Module):
         features: Float[Tensor, "batch frames content_dim"],
         mask: Bool[Tensor, "batch frames"],
         style: Float[Tensor, "batch style_dim"],
-    ) -> Float[Tensor, "batch frames vertices 3"]:
+    ) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
         return self.model.decode(features, style, mask)
 

@@ -69,7 +69,7 @@ class DisentanglementNetwork(nn.Module):
         self.register_buffer("visible", None if n_vertices is None else torch.ones(n_vertices), persistent=False)
 
     def content(
-        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames content_dim"]:
         """Content of motion; zero on padding."""
         content = self.content_encoder(self.seen(motion)) * mask[..., None]
@@ -83,12 +83,12 @@ class DisentanglementNetwork(nn.Module):
         return centred / (centred.square().sum(1, keepdim=True) / count + EPSILON).sqrt()
 
     def style(
-        self, motion: Float[Tensor, "batch frames vertices 3"], mask: Bool[Tensor, "batch frames"]
+        self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vector of a motion."""
         return self.style_encoder(self.style_frames(self.seen(motion)), mask)
 
-    def seen(self, motion: Float[Tensor, "batch frames vertices 3"]) -> Float[Tensor, "batch frames vertices 3"]:
+    def seen(self, motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames points dims"]:
         """The motion of the vertices that the encoders see; zero elsewhere."""
         return motion if self.visible is None else motion * self.visible[:, None]
 
@@ -122,7 +122,8 @@ class StyleContentDecoder(nn.Module):
     the fully connected layers is a trainable linear basis of the vertices.
 
     Args:
-        n_vertices: vertices V.
+        n_vertices: points V.
+        dims: numbers that each point has.
         content_dim: channels of the content.
         style_dim: channels of the style vector.
         channels: of the convolutions.
@@ -135,6 +136,7 @@ class StyleContentDecoder(nn.Module):
         self,
         *,
         n_vertices: int,
+        dims: int,
         content_dim: int,
         style_dim: int,
         channels: Sequence[int] = (64, 128, 256),
@@ -158,7 +160,7 @@ class StyleContentDecoder(nn.Module):
             ),
             nn.Linear(steps[-1], basis_size),
         )
-        self.basis = nn.Linear(basis_size, 3 * n_vertices)
+        self.basis = nn.Linear(basis_size, dims * n_vertices)
 
     @property
     def past_frames(self) -> int:

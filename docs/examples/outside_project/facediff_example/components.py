@@ -60,13 +60,14 @@ class HalvedMotion(MotionSpace):
     """All coordinates of all vertices, at half their size.
 
     Args:
-        n_vertices: vertices; given by the model.
+        n_vertices: points of the motion; given by the model.
+        dims: numbers of a point: 3 of a vertex, 1 of a channel; given by the model.
         steps: of the noise process; given by the model.
     """
 
-    def __init__(self, *, n_vertices: int, steps: int) -> None:
+    def __init__(self, *, n_vertices: int, dims: int, steps: int) -> None:
         super().__init__()
-        self.coordinates = 3 * n_vertices
+        self.coordinates, self.dims = dims * n_vertices, dims
         self.preconditioning = None
 
     def encode(self, motion: Tensor) -> Tensor:
@@ -75,7 +76,7 @@ class HalvedMotion(MotionSpace):
 
     def decode(self, coordinates: Tensor) -> Tensor:
         """Double."""
-        return 2 * coordinates.unflatten(2, (-1, 3))
+        return 2 * coordinates.unflatten(2, (-1, self.dims))
 
 
 class DistanceMeshEncoder(MeshEncoder):
@@ -83,10 +84,11 @@ class DistanceMeshEncoder(MeshEncoder):
 
     Args:
         dim: channels; given by the model.
-        n_vertices: vertices; given by the model.
+        n_vertices: points of the motion; given by the model.
+        dims: numbers of a point: 3 of a vertex, 1 of a channel; given by the model.
     """
 
-    def __init__(self, *, dim: int, n_vertices: int) -> None:
+    def __init__(self, *, dim: int, n_vertices: int, dims: int) -> None:
         super().__init__()
         self.map = nn.Linear(n_vertices, dim)
 

@@ -37,10 +37,10 @@ class AutoregressiveTransformer(AnimationModel):
         super().__init__(**options)
         self.audio_encoder = audio_encoder(dim=dim)
         self.identity_table = nn.Embedding(len(self.identities), dim)
-        self.embed = nn.Linear(3 * self.n_vertices, dim)
+        self.embed = nn.Linear(self.dims * self.n_vertices, dim)
         layer = nn.TransformerDecoderLayer(dim, num_heads, 2 * dim, dropout=0.0, batch_first=True)
         self.decoder = nn.TransformerDecoder(layer, num_layers)
-        self.unembed = nn.Linear(dim, 3 * self.n_vertices)
+        self.unembed = nn.Linear(dim, self.dims * self.n_vertices)
         nn.init.zeros_(self.unembed.weight)  # start from a still face
         nn.init.zeros_(self.unembed.bias)
 
@@ -83,8 +83,8 @@ class AutoregressiveTransformer(AnimationModel):
     ) -> Float[Tensor, "batch frames vertices 3"]:
         """One frame after the other; nothing is random, so the seed does not matter."""
         speech = self.encode_speech(batch)
-        motion = speech.new_zeros(*speech.shape[:2], 3 * self.n_vertices)
+        motion = speech.new_zeros(*speech.shape[:2], self.dims * self.n_vertices)
         for frame in (progress or iter)(range(speech.shape[1])):
             before = nn.functional.pad(motion[:, : frame + 1], (0, 0, 1, -1))
             motion[:, frame] = self(before, speech[:, : frame + 1], batch.identity)[:, -1]
-        return (motion / self.scale).view(*speech.shape[:2], self.n_vertices, 3)
+        return (motion / self.scale).view(*speech.shape[:2], self.n_vertices, self.dims)
