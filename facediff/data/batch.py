@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -247,19 +248,19 @@ class Rig:
     mesh: Assets
     deltas: dict[str, Float[Tensor, "face vertices 3"]]
 
+    @cached_property
+    def mean(self) -> Float[Tensor, "face vertices 3"]:
+        """The mean of all speakers' shapes."""
+        return torch.stack([*self.deltas.values()]).mean(0)
+
     def decode(
         self, motion: Float[Tensor, "*frames channels 1"], space: Space, identity: str
     ) -> Float[Tensor, "*frames vertices 3"]:
         """Offsets of channels as offsets of a speaker's vertices; how the head turns as a whole is left out.
 
-        Raises:
-            FaceDiffError: if the rig knows no such speaker.
+        A speaker without shapes of their own moves by the mean of all others'.
         """
-        if identity not in self.deltas:
-            raise FaceDiffError(
-                f'identity: the rig of {self.mesh.corpus} has no "{identity}"; it has {", ".join(sorted(self.deltas))}'
-            )
-        deltas = self.deltas[identity].to(motion)
+        deltas = self.deltas.get(identity, self.mean).to(motion)
         weights = motion[..., list(space.face), 0]
         return (weights @ deltas.flatten(1)).view(*weights.shape[:-1], -1, 3)
 
@@ -337,7 +338,7 @@ class Assets:
         """Offsets from the template as offsets of vertices; those of vertices are themselves.
 
         Raises:
-            FaceDiffError: if there is no rig, or it does not know the speaker.
+            FaceDiffError: if there is no rig.
         """
         if self.space.is_vertices:
             return motion

@@ -327,8 +327,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
         if not self.space.is_vertices and (self.packed is not None or self.people):
             raise FaceDiffError(
-                "data.root: packed corpora and imported speakers hold vertices, and data.space asks for channels; give "
-                "the corpus's folder, without data.people"
+                "data.root: packed corpora and imported speakers hold vertices, and this data module reads channels; "
+                "give the corpus's folder, without data.people"
             )
         return Corpus(
             self.root,

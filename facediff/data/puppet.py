@@ -218,8 +218,8 @@ class Puppet(SpeechMotionDataModule):
             and Festival are installed.
         recordings: folder of people's recordings, ``SPEAKER/NAME.wav`` or ``.flac`` with ``NAME.TextGrid``: each drawn
             speaker speaks with those of one person.
-        space: ``vertices``, or ``arkit`` for the second edition's truth as it is kept: ARKit's 52 shapes and two of the
-            tongue, the turns of head and eyes; see docs/parameters.md.
+        motion: ``vertices``, or ``arkit`` for the second edition's truth as it is kept: ARKit's 52 shapes and two of
+            the tongue, the turns of head and eyes; see docs/parameters.md.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
     """
@@ -249,7 +249,7 @@ class Puppet(SpeechMotionDataModule):
         edition: Literal[1, 2] | None = None,
         people_voices: bool = False,
         recordings: str | None = None,
-        space: Literal["vertices", "arkit"] = "vertices",
+        motion: Literal["vertices", "arkit"] = "vertices",
         batch_size: Count = 8,
         extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
@@ -276,10 +276,10 @@ class Puppet(SpeechMotionDataModule):
                 f"choose the second, or leave data.people_voices and data.recordings out"
             )
         self.n_vertices = self.edition.n_vertices
-        if space != "vertices":
+        if motion != "vertices":
             if isinstance(self.edition, FirstEdition):
                 raise FaceDiffError(
-                    f"data.space={space}: the first edition of the built-in corpus has no such weights; choose "
+                    f"data.motion={motion}: the first edition of the built-in corpus has no such weights; choose "
                     f"data.edition=2"
                 )
             self.space = channel_space()

@@ -110,9 +110,9 @@ class CheckpointContent(LightningModule, Inference):
         """
         sizes = {template.shape[0] for template in assets.templates.values()}
         for what, mine, theirs in (
-            ("spaces", self.space.kind, assets.space.kind),
-            ("points", {self.n_vertices}, sizes),
-            ("channels", self.space, assets.space),
+            ("kinds of space", self.space.kind, assets.space.kind),
+            ("vertices" if self.space.is_vertices else "channels", {self.n_vertices}, sizes),
+            ("spaces", self.space, assets.space),
             ("identities", self.identities, assets.identities),
             ("frames a second", self.frame_rate, assets.frame_rate),
         ):

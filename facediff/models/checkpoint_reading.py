@@ -193,7 +193,10 @@ def model_of(path: Path | str, hparams: Mapping[str, Any], base: type[M]) -> tup
     LIMITS.check("identities", len(identities), path)
     space = hparams.get("space")
     if space is not None:
-        Space.from_state(space)
+        try:
+            Space.from_state(space)
+        except FaceDiffError as error:
+            raise FaceDiffError(f"{path}: {error}. The file is damaged") from error
     kept = ("_class_path", "_instantiator", "identities", "space")
     arguments = read_options(
         str(path),

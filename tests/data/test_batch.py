@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from facediff.data import Assets, collate
 from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.pipelines.trained import facts_of
+from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.glb_reader import Reader
 from tests.fakes.tiny import Tiny, write_tiny
 
@@ -71,3 +73,34 @@ def test_colours_that_do_not_fit_name_their_file(tmp_path: Path) -> None:
     np.savez(root / "colours.npz", A=np.zeros((5, 3), np.uint8))
     with pytest.raises(FaceDiffError, match="colours.npz"):
         Tiny(root=str(root)).assets()
+
+
+def test_assets_of_channels_survive_a_checkpoint_and_refuse_what_does_not_fit(tmp_path: Path) -> None:
+    assets = TinyChannels(root=str(write_channels(tmp_path / "channels"))).assets()
+    state = assets.state()
+    again = Assets.from_state(state)
+    assert again.space == CHANNELS
+    motion = torch.randn(4, 6, 1)
+    assert torch.equal(again.to_vertices(motion, "A"), assets.to_vertices(motion, "A"))
+    # A speaker without shapes of their own moves by the mean of all others'.
+    assert torch.equal(again.to_vertices(motion, "stranger"), assets.to_vertices(motion, "A"))
+    rig = state["rig"]
+    wrong = [
+        {"space": CHANNELS.state() | {"channels": ["a"], "rotations": []}},
+        {"space": []},
+        {"rig": {**rig, "deltas": {"A": torch.zeros(2, 24, 3)}}},
+        {"rig": {**rig, "deltas": {"nobody": torch.zeros(3, 24, 3)}}},
+        {"rig": {**rig, "mesh": state}},
+        {"rig": {"mesh": rig["mesh"]}},
+        {"rig": 3},
+    ]
+    for change in wrong:
+        with pytest.raises(FaceDiffError):
+            Assets.from_state({**state, **change})
+
+
+def test_channels_without_a_rig_have_no_mesh(tmp_path: Path) -> None:
+    assets = replace(TinyChannels(root=str(write_channels(tmp_path / "channels"))).assets(), rig=None)
+    with pytest.raises(FaceDiffError, match="rig"):
+        assets.to_vertices(torch.zeros(1, 6, 1), "A")
+    assert Assets.from_state(assets.state()).rig is None
