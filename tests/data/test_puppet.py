@@ -2,13 +2,17 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from facediff import synthetic as puppet
 from facediff.data import Puppet
+from facediff.data.batch import Rig
 from facediff.data.puppet import FirstEdition, SecondEdition
 from facediff.errors import FaceDiffError
 from facediff.synthetic.corpus import generate
+from facediff.synthetic.second_edition import generate_second
 
 
 def test_data_module_trains_on_drawn_speakers_and_compares_the_eight(tmp_path: Path) -> None:
@@ -32,3 +36,26 @@ def test_a_folder_says_which_edition_it_holds(tmp_path: Path) -> None:
     assert Puppet(edition=1).compared_speakers != Puppet().compared_speakers
     with pytest.raises(FaceDiffError, match="edition"):
         Puppet(root=str(tmp_path / "first"), people_voices=True)
+
+
+def test_channels_are_the_truth_of_the_vertices(tmp_path: Path) -> None:
+    generate_second(tmp_path / "second", only=["F1_t03"], progress=False)
+    channels, vertices = (Puppet(root=str(tmp_path / "second"), motion=motion) for motion in ("arkit", "vertices"))
+    clip = channels.corpus.clips["F1_t03"]
+    motion = channels.corpus.read_motion(clip)
+    assert motion.shape[1:] == (63, 1)
+    assert channels.space.channels[54:57] == ("HeadYaw", "HeadPitch", "HeadRoll")
+    rig = Rig(vertices.assets(), channels.deltas())
+    torch.testing.assert_close(
+        rig.decode(motion, channels.space, "F1"), vertices.corpus.read_motion(clip), atol=1e-6, rtol=0
+    )
+    # Pitch, yaw and roll in degrees on disk; where the eyes look, to the left and up.
+    head, gaze = (np.load(tmp_path / "second" / f"{name}_npy" / "F1_t03.npy") for name in ("head", "gaze"))
+    np.testing.assert_allclose(motion[:, 54:57, 0], np.deg2rad(head[:, [1, 0, 2]]), atol=1e-6)
+    np.testing.assert_allclose(motion[:, 57:59, 0], np.deg2rad(gaze * [1, -1]), atol=1e-6)
+    assert torch.equal(motion[:, 57:60], motion[:, 60:63])
+
+
+def test_the_first_edition_has_no_channels() -> None:
+    with pytest.raises(FaceDiffError, match="edition"):
+        Puppet(edition=1, motion="arkit")
