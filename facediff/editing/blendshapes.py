@@ -15,6 +15,7 @@ from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.mesh import triangle_areas
 from facediff.spaces.arkit import ARKIT, ROTATIONS, absent_from, beyond_arkit, live_link_name, mirror_pairs
+from facediff.spaces.rigs import LinearRig
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.plain_files import json_text, write_table
@@ -24,6 +25,7 @@ Array = npt.NDArray[np.float64]
 CHUNK_BYTES = 32 * 2**20
 AROUND = 1 / 15  # Seconds before and after a shape's work in which it is free to fade
 VISIBLE_MM = 0.2  # A residual that nobody sees is none, however small the motion
+UNBOUNDED = 1e3  # More than a coefficient reaches, in standard deviations or weights
 STATED_RATE = 30.0  # Frames a second for which the smoothness is stated
 
 
@@ -262,6 +264,21 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         metadata={**animation.metadata, **{f"solve {key}": value for key, value in about.items()}},
         head=None if head is None else head[:, :3],
     )
+
+
+def encode(animation: Animation, rig: LinearRig) -> Array:
+    """Weights (T, C) of a rig that come nearest to an animation's vertices: the exact ones if the rig made them.
+
+    This is :func:`solve` without sparsity and smoothness, which suit artists; captured weights are dense, and keeping
+    shapes at 0 would cost them more than it costs the geometry.
+
+    Args:
+        animation: of the rig's topology and unit.
+        rig: for ARKit's shapes the weights are bounded by 0 and 1, else by the rig's own range or not at all.
+    """
+    lower, upper = rig.space.valid_range or (-UNBOUNDED, UNBOUNDED)
+    options = SolveOptions(smoothness=0.0, sparsity=0.0, ridge=0.0, lower=lower, upper=upper, residual_limit=1.0)
+    return solve(animation, ShapeSet(rig.names, rig.neutral, rig.deltas), options).values
 
 
 def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:

@@ -29,7 +29,7 @@ Values = npt.NDArray[np.generic]
 
 
 class Flame:
-    """The model with its head, neck and eyes at rest; only the jaw moves.
+    """The model with its neck and eyes at rest; the jaw and, about the root joint, the head turn.
 
     Args:
         arrays: content of the model file.
@@ -48,7 +48,7 @@ class Flame:
         correctives = arrays.pose_directions.reshape(len(directions), -1)[:, nine]
         # Rows: expressions, then the nine pose correctives of the jaw; all frames are a combination of these rows.
         self._basis = np.ascontiguousarray(np.concatenate([directions[:, SHAPES:], correctives], axis=1).T)
-        self._jaw_regressor = arrays.joint_regressor[JAW]
+        self._jaw_regressor, self._root_regressor = arrays.joint_regressor[JAW], arrays.joint_regressor[0]
         expressions = self._basis[:EXPRESSIONS].reshape(EXPRESSIONS, -1, 3)
         self._jaw_basis: Array = np.einsum("v,evc->ec", self._jaw_regressor, expressions)
         # Joints below the jaw turn with it and all others stay. The weights of a vertex add up to one, so that a single
@@ -81,8 +81,10 @@ class Flame:
         shape: npt.NDArray[np.floating],
         expression: npt.NDArray[np.floating],
         jaw: npt.NDArray[np.floating],
+        *,
+        head: npt.NDArray[np.floating] | None = None,
     ) -> Array:
-        """Vertices (T, V, 3) in metres, without rotation of head, neck and eyes, eqs. 2 to 10.
+        """Vertices (T, V, 3) in metres, without rotation of neck and eyes, eqs. 2 to 10.
 
         Joints are regressed from shape and expression together, as in the published implementations.
 
@@ -90,6 +92,7 @@ class Flame:
             shape: (S,) shape coefficients, the same for all frames; omitted ones are zero.
             expression: (T, E) expression coefficients; omitted ones are zero.
             jaw: (T, 3) rotation of the jaw, axis-angle in radians.
+            head: (T, 3) rotation of the whole about the root joint, likewise; None for none.
         """
         expression = _coefficients("expression", expression, EXPRESSIONS, 2)
         jaw = _coefficients("jaw", jaw, 3, 2)
@@ -114,6 +117,11 @@ class Flame:
             # Eq. 2, (1 − w) x + w (R (x − j) + j), with the identity for every joint that stays.
             arms = posed[:, self._turning] - joint
             posed[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
+            if head is not None:
+                # All vertices hang from the root: its rotation is that of the posed face about one point.
+                root_basis = np.einsum("v,evc->ec", self._root_regressor, self._basis[:count].reshape(count, -1, 3))
+                root = (self._root_regressor @ face + expression[part] @ root_basis)[:, None]
+                posed[:] = (posed - root) @ rotations(head[part]).transpose(0, 2, 1) + root
         return result
 
 

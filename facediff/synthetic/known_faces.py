@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError, choices
 from facediff.spaces.arkit import ARKIT
+from facediff.spaces.rigs import LinearRig
 from facediff.synthetic import arkit, corpus, second_edition
 from facediff.synthetic.cast import CAST
 from facediff.synthetic.face import N_VERTICES, build_face
@@ -122,6 +123,13 @@ def built_in_shapes(speaker: str | None = None, edition: int = 2) -> tuple[Array
         rest, *fields = second_edition.rig_of(speaker).astype(np.float64)
     shapes = {name: rest + field for name, field in zip(SHAPES, fields, strict=True) if name in ARKIT}
     return rest, np.asarray(mesh.faces, np.int64), shapes
+
+
+def built_in_rig(speaker: str | None = None, edition: int = 2) -> LinearRig:
+    """The rig of a built-in face; the arguments are those of :func:`built_in_shapes`."""
+    rest, faces, shapes = built_in_shapes(speaker, edition)
+    deltas = np.stack([vertices - rest for vertices in shapes.values()])
+    return LinearRig(tuple(shapes), rest, deltas, faces, "m", f"puppet {edition}" + (f" {speaker}" if speaker else ""))
 
 
 def write_puppet_shapes(folder: Path, speaker: str | None = None, edition: int = 2) -> list[str]:

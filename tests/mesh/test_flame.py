@@ -30,7 +30,11 @@ RNG = np.random.default_rng(3)
 
 
 def by_definition(
-    content: dict[str, np.ndarray], shape: np.ndarray, expression: np.ndarray, jaw: np.ndarray
+    content: dict[str, np.ndarray],
+    shape: np.ndarray,
+    expression: np.ndarray,
+    jaw: np.ndarray,
+    head: np.ndarray | None = None,
 ) -> np.ndarray:
     """One frame (V, 3), vertex by vertex, with 4 × 4 transforms of all five joints (SMPL, eqs. 1 to 10)."""
     coefficients = np.zeros(400)
@@ -45,6 +49,7 @@ def by_definition(
     joints = content["J_regressor"] @ shaped
     pose = np.zeros((5, 3))
     pose[2] = jaw
+    pose[0] = 0 if head is None else head
     turns = [turn_by_definition(vector) for vector in pose]
     feature = np.concatenate([(turn - np.eye(3)).ravel() for turn in turns[1:]])
     posed = shaped + content["posedirs"] @ feature
@@ -144,10 +149,13 @@ def test_any_parameters_agree_with_the_definition() -> None:
     content = flame_arrays(16)
     shape, jaw = RNG.normal(0, 2, 300), RNG.normal(0, 0.7, (3, 3))
     expression = RNG.normal(0, 2, (3, 100))
-    found = layer(content).vertices(shape, expression, jaw)
-    assert found.dtype == np.float64
-    for frame, face in enumerate(found):
-        np.testing.assert_allclose(face, by_definition(content, shape, expression[frame], jaw[frame]), atol=1e-13)
+    for head in (None, RNG.normal(0, 0.7, (3, 3))):
+        found = layer(content).vertices(shape, expression, jaw, head=head)
+        assert found.dtype == np.float64
+        for frame, face in enumerate(found):
+            turn = None if head is None else head[frame]
+            expected = by_definition(content, shape, expression[frame], jaw[frame], turn)
+            np.testing.assert_allclose(face, expected, atol=1e-13)
 
 
 def test_a_long_clip_is_the_same_frame_by_frame() -> None:

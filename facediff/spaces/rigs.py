@@ -1,0 +1,186 @@
+"""Rigs: the displacements that give the channels of a space their meaning, and vertices from values through them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.mesh.flame import EXPRESSIONS, Flame
+from facediff.spaces.arkit import ARKIT, arkit_name, plain
+from facediff.spaces.rotations import convert
+from facediff.spaces.shape_files import ICT_NEUTRAL, ShapeFiles, read_shape_files
+from facediff.spaces.space import Form, Space
+
+Array = npt.NDArray[np.float64]
+Values = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRig:
+    """A face whose vertices are a neutral face plus a weighted sum of displacements.
+
+    Attributes:
+        names: C channels; ARKit's own spelling where they are ARKit's.
+        neutral: (V, 3) the face at rest.
+        deltas: (C, V, 3) displacements of the vertices at weight 1.
+        faces: (F, 3) triangles; None if there are none.
+        unit: of length; empty if the file does not say.
+        title: what messages and records call it.
+
+    Example:
+        >>> rig = LinearRig(("jawOpen",), np.zeros((2, 3)), np.ones((1, 2, 3)))
+        >>> rig.decode(np.array([[0.5]]))[0, 0], rig.gram()
+        (array([0.5, 0.5, 0.5]), array([[6.]]))
+    """
+
+    names: tuple[str, ...]
+    neutral: Array
+    deltas: Array
+    faces: npt.NDArray[np.integer] | None = None
+    unit: str = "m"
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit each other."""
+        expected = (len(self.names), *self.neutral.shape)
+        if self.neutral.ndim != 2 or self.neutral.shape[1] != 3 or self.deltas.shape != expected:
+            raise FaceDiffError(
+                f"{self.title or 'rig'}: has displacements of shape {self.deltas.shape}; expected {expected}: a name "
+                f"and a displacement of each vertex for each channel"
+            )
+
+    @classmethod
+    def from_files(cls, files: ShapeFiles) -> LinearRig:
+        """The rig of a set of shapes.
+
+        Raises:
+            FaceDiffError: if it has no face at rest, or two of its names are one of ARKit's.
+        """
+        if files.neutral is None:
+            raise FaceDiffError(f"{files.path}: has no face at rest; add it as neutral{files.first.suffix}")
+        names = tuple(arkit_name(name) or name for name in files.names)
+        if len({name.casefold() for name in names}) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise FaceDiffError(f"{files.path}: has the shape {twice} in two spellings; keep one of them")
+        neutral = np.asarray(files.neutral, np.float64)
+        deltas = np.asarray(files.shapes, np.float64) - neutral
+        if not (np.isfinite(neutral).all() and np.isfinite(deltas).all()):
+            raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it again")
+        centimetres = plain(Path(files.rest).stem) == ICT_NEUTRAL
+        unit = "m" if files.metric else "cm" if centimetres else ""
+        return cls(names, neutral, deltas, files.faces, unit, files.path.name)
+
+    @classmethod
+    def read(cls, path: Path) -> LinearRig:
+        """Read the morph targets of a ``.glb``, or a folder of meshes such as ICT-FaceKit's ``FaceXModel``."""
+        return cls.from_files(read_shape_files(path))
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 of the names and displacements, by which coefficients of two rigs are told apart."""
+        digest = hashlib.sha256("\0".join(self.names).encode())
+        digest.update(np.ascontiguousarray(self.deltas, "<f4").tobytes())
+        return digest.hexdigest()
+
+    @property
+    def space(self) -> Space:
+        """The space of the rig's weights."""
+        arkit = set(self.names) <= set(ARKIT)
+        absent = tuple(name for name in ARKIT if name not in self.names) if arkit else ()
+        return Space(
+            "arkit" if arkit else "linear",
+            self.names,
+            "arkit" if arkit else "",
+            rig=self.title,
+            rig_hash=self.hash,
+            valid_range=(0.0, 1.0) if arkit else None,
+            absent=absent,
+        )
+
+    def only(self, names: Sequence[str]) -> LinearRig:
+        """The rig's channels of these names, in their order.
+
+        Raises:
+            FaceDiffError: if the rig lacks one.
+        """
+        column = {name.casefold(): index for index, name in enumerate(self.names)}
+        lacking = [name for name in names if name.casefold() not in column]
+        if lacking:
+            raise FaceDiffError(f"{self.title or 'rig'}: has no {', '.join(lacking[:4])}; give a rig with these shapes")
+        deltas = self.deltas[[column[name.casefold()] for name in names]]
+        return LinearRig(tuple(names), self.neutral, deltas, self.faces, self.unit, self.title)
+
+    def decode(self, values: Values, neutral: Values | None = None) -> Array:
+        """Vertices (T, V, 3) of values (T, C).
+
+        Args:
+            values: in the order of the rig's names.
+            neutral: (V, 3) another face at rest; the rig's own if None.
+        """
+        if values.ndim != 2 or values.shape[1] != len(self.names):
+            raise FaceDiffError(f"motion: has shape {values.shape}; expected (frames, {len(self.names)}) for the rig")
+        moved = np.asarray(values, np.float64) @ self.deltas.reshape(len(self.names), -1)
+        rest = self.neutral if neutral is None else np.asarray(neutral, np.float64)
+        return moved.reshape(len(values), *self.neutral.shape) + rest
+
+    def gram(self, weights: Values | None = None) -> Array:
+        """G = D Dᵀ (C, C): x G xᵀ is the sum of the squared displacements of all vertices that weights x make.
+
+        So a loss on weights is the loss on vertices, without building any.
+
+        Args:
+            weights: (V,) of the vertices; all 1 if None.
+        """
+        flat = self.deltas.reshape(len(self.names), -1)
+        scaled = flat if weights is None else flat * np.repeat(np.asarray(weights, np.float64), 3)
+        return np.asarray(scaled @ flat.T)
+
+
+def flame_rig(flame: Flame) -> LinearRig:
+    """FLAME's expressions as a linear rig; its jaw is a rotation and no part of it."""
+    count = flame.n_vertices
+    still = np.zeros((EXPRESSIONS, 3))
+    deltas = flame.vertices(np.zeros(0), np.eye(EXPRESSIONS), still) - flame.template
+    names = tuple(f"expression_{index}" for index in range(EXPRESSIONS))
+    return LinearRig(names, flame.template, deltas.reshape(EXPRESSIONS, count, 3), flame.faces, "m", "FLAME")
+
+
+def decode_flame(flame: Flame, values: Values, space: Space, shape: Values | None = None) -> Array:
+    """Vertices (T, V, 3) in metres of FLAME coefficients.
+
+    Expressions, jaw and head act, as the space writes them; the neck and the eyeballs stay at rest, and channels that
+    FLAME has no displacement for, such as a translation, do nothing.
+
+    Args:
+        flame: the model.
+        values: (T, C).
+        space: their space, of the kind ``flame``.
+        shape: (S,) the person's coefficients; the mean face if None.
+
+    Raises:
+        FaceDiffError: if the space is of another kind, or the values do not fit it.
+    """
+    if space.kind != "flame" or values.ndim != 2 or values.shape[1] != len(space.channels):
+        raise FaceDiffError(
+            f"motion: has shape {values.shape} in a space of {space.kind} with {len(space.channels)} channels; "
+            f"expected FLAME's coefficients (frames, channels)"
+        )
+    expression = np.zeros((len(values), EXPRESSIONS))
+    for column, name in enumerate(space.channels):
+        family, _, index = name.rpartition("_")
+        if family == "expression" and index.isdecimal() and int(index) < EXPRESSIONS:
+            expression[:, int(index)] = values[:, column]
+    turns = {"jaw": np.zeros((len(values), 3)), "head": np.zeros((len(values), 3))}
+    for turn in space.rotations:
+        if turn.joint in turns:
+            form: Form = turn.form
+            turns[turn.joint] = convert(values[:, list(turn.channels)], form, "axis_angle")
+    person = np.zeros(0) if shape is None else shape
+    return flame.vertices(person, expression, turns["jaw"], head=turns["head"])
