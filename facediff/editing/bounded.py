@@ -1,7 +1,8 @@
 """Least squares within bounds: quadratic programs whose variables have a least and a greatest value.
 
-Two solvers: :func:`minimise` for all frames of a motion in one problem, and :class:`Pivoting` for one frame after the
-other, each of which is nearly the last one.
+Three solvers: :func:`minimise` for all frames of a motion in one problem; :class:`Pivoting` for one frame after the
+other, each of which is nearly the last one; and :func:`least_squares` of a system itself, without squaring its
+condition.
 """
 
 from __future__ import annotations
@@ -184,6 +185,7 @@ def _newton(problem: Problem, right: Array, free: Mask) -> Array:
 MISSED = 1e-10  # How far a variable may lie beyond its bound, or a slope on the wrong side of zero: rounding
 PATIENCE = 3  # Exchanges of all wrong variables that may fail to make them fewer
 KEPT = 64  # Inverses
+ROUNDING = 1e-14  # Share of its terms' sum below which a slope of a system is zero
 
 
 class Pivoting:
@@ -272,3 +274,68 @@ class Pivoting:
         solution = minimise(problem, np.full(len(right), MISSED), self.max_iterations)[0][0]
         self._side = np.where(solution <= lower, -1, np.where(solution >= upper, 1, 0)).astype(np.int8)
         return solution
+
+
+# Of a system A x = b as it is. The quadratic program of its normal equations has the square of A's condition, which
+# leaves no correct digits where A is the Gram matrix of shapes that resemble each other.
+
+
+def least_squares(matrix: Array, right: Array, lower: Array, upper: Array, start: Array | None = None) -> Array:
+    """The point of a box at which |A x − b|² is least, where A has full rank.
+
+    Stark & Parker, "Bounded-variable least-squares: an algorithm and applications", Computational Statistics 1995:
+    variables are free or on a bound; the free ones are solved for, go only as far as the box allows, and of the others
+    the one whose slope leads into the box most steeply becomes free, until there is none.
+
+    Args:
+        matrix: A (M, K).
+        right: b (M,).
+        lower: least values (K,).
+        upper: greatest values (K,).
+        start: a point near the solution.
+
+    Example:
+        >>> least_squares(np.eye(2), np.array([0.5, -1.0]), np.zeros(2), np.ones(2)).tolist()
+        [0.5, 0.0]
+    """
+    count = matrix.shape[1]
+    x = np.clip(np.linalg.lstsq(matrix, right)[0] if start is None else start, lower, upper)
+    side = np.where(x <= lower, -1, np.where(x >= upper, 1, 0))
+    x = np.where(side < 0, lower, np.where(side > 0, upper, x))
+    scale = np.abs(matrix).T @ np.abs(right) + np.abs(matrix.T @ matrix) @ np.maximum(np.abs(lower), np.abs(upper))
+    refused: set[int] = set()  # freed, and pushed back by rounding: not to be freed again before something else moves
+    for _ in range(20 * count):
+        while (free := side == 0).any():
+            goal = right - matrix[:, ~free] @ x[~free]
+            target = x.copy()
+            target[free] = np.linalg.lstsq(matrix[:, free], goal)[0]
+            beyond = free & ((target < lower) | (target > upper))
+            if not beyond.any():
+                x = target
+                break
+            # Only as far as the first bound that is met.
+            bound = np.where(target < lower, lower, upper)
+            shares = np.full(count, np.inf)
+            shares[beyond] = (bound - x)[beyond] / (target - x)[beyond]
+            first = int(shares.argmin())
+            x = np.where(free, x + min(1.0, max(0.0, float(shares[first]))) * (target - x), x)
+            x[first], side[first] = bound[first], -1 if bound[first] == lower[first] else 1
+            x = np.clip(x, lower, upper)
+        slope = matrix.T @ (right - matrix @ x)
+        inwards = np.where(side < 0, slope, np.where(side > 0, -slope, 0.0)) / np.maximum(scale, 1e-300)
+        inwards[upper <= lower] = 0.0
+        inwards[list(refused)] = 0.0
+        chosen = int(inwards.argmax())
+        if inwards[chosen] <= ROUNDING:
+            break
+        before = side[chosen]
+        side[chosen] = 0
+        free = side == 0
+        goal = right - matrix[:, ~free] @ x[~free]
+        moved = np.linalg.lstsq(matrix[:, free], goal)[0][int(free[:chosen].sum())] - x[chosen]
+        if moved * before >= 0:  # it would leave the box at once: its slope is nothing but rounding
+            side[chosen] = before
+            refused.add(chosen)
+        else:
+            refused.clear()
+    return x

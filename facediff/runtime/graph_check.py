@@ -85,13 +85,13 @@ OPTIONAL = {"Clip": 1, "GRU": 3, "LSTM": 3, "Pad": 2, "RNN": 3, "Slice": 3}
 """From which place on inputs of an operator may be left out by an empty name; elsewhere that can end the process."""
 
 
-def check_graph(path: Path, opset: int, ends: dict[str, list[dict[str, Any]]]) -> int:
+def check_graph(path: Path, opset: int | None = None, ends: dict[str, list[dict[str, Any]]] | None = None) -> int:
     """Read a graph, and refuse what could cost more than the budget, or is not what ``model.json`` says.
 
     Args:
         path: the file.
-        opset: version of the operators.
-        ends: inputs and outputs as ``model.json`` describes them.
+        opset: version of the operators; any if None, for models of others, which do not state it elsewhere.
+        ends: inputs and outputs as ``model.json`` describes them; any if None.
 
     Returns:
         how many bytes a node may have that is computed while the graph is opened.
@@ -122,20 +122,21 @@ class _Reading:
     def refuse(self, problem: str) -> FaceDiffError:
         return FaceDiffError(f"{self.path}: {problem}; {REMEDY}")
 
-    def model(self, content: memoryview, opset: int, ends: dict[str, list[dict[str, Any]]]) -> int:
+    def model(self, content: memoryview, opset: int | None, ends: dict[str, list[dict[str, Any]]] | None) -> int:
         model = parse_message(content)
         if model.keys() & {20, 25}:  # training, functions
             raise self.refuse("holds functions, expected one graph of plain operators")
         imports = [parse_message(each) for each in _messages(model, 8)]
         found = [(_text(each, 1), integer_field(each, 2)) for each in imports]
-        if found != [("", opset)]:
-            raise self.refuse(f"has operators of {quoted(found)}, expected ONNX's own of version {quoted(opset)}")
+        if [domain for domain, _ in found] != [""] or opset not in (None, found[0][1]):
+            version = "" if opset is None else f" of version {quoted(opset)}"
+            raise self.refuse(f"has operators of {quoted(found)}, expected ONNX's own{version}")
         graph = parse_message(_single(model, 7))
         if 15 in graph:
             raise self.refuse("holds sparse tensors, expected dense ones")
         for number, key in ((11, "inputs"), (12, "outputs")):
             described = [self.value(each) for each in _messages(graph, number)]
-            if described != ends.get(key):
+            if ends is not None and described != ends.get(key):
                 wrong = next((each for each in described if each not in (ends.get(key) or [])), described)
                 raise self.refuse(f"has the {key} {quoted(wrong)}, expected those that model.json describes")
         for each in _messages(graph, 13):

@@ -59,35 +59,13 @@ class ExportedGraphs:
             threads: of the processor; as many as it has cores if 0.
             providers: what computes, by ONNX Runtime's names; the processor if None.
         """
-        import onnxruntime
-
         folder = Path(folder)
         description, arrays = read_folder(folder)
 
         def load(name: str) -> onnxruntime.InferenceSession:
             path = folder / f"{name}.onnx"
             largest = check_graphs(folder, description, [name])
-            options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = threads
-            options.log_severity_level = 4  # errors are raised; warnings are about optimisations that do not apply
-            # Threads that wait by spinning take the processor from whatever else runs: where something does, a frame
-            # takes twice as long.
-            options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-            options.add_session_config_entry("session.use_env_allocators", "1")
-            # Where shapes contradict one another, optimisations may end the process. So may the one that is left out:
-            # it merges stored numbers of 16 bits that were not widened on opening, and otherwise has nothing to do.
-            options.add_session_config_entry("session.strict_shape_type_inference", "1")
-            options.add_session_config_entry(
-                "optimization.disable_specified_optimizers", "FuseFp16InitializerToFp32NodeTransformer"
-            )
-            options.add_session_config_entry("optimization.constant_folding_max_output_size_in_bytes", str(largest))
-            try:
-                limit_memory()
-                return onnxruntime.InferenceSession(
-                    path, options, providers=list(providers or ["CPUExecutionProvider"])
-                )
-            except Exception as error:  # ONNX Runtime's own errors share no base class
-                raise FaceDiffError(f"{path}: ONNX Runtime cannot read it ({brief(error)}); {REMEDY}") from error
+            return open_session(path, largest, threads=threads, providers=providers)
 
         return cls(description, arrays, load)
 
@@ -114,22 +92,8 @@ class ExportedGraphs:
         ends, axes = self.description.graphs[graph], dict[str, int]()
         for end in ends.get("inputs", ()):
             axes.update(zip(end["shape"], given[end["name"]].shape, strict=False))
-        seconds = LIMITS.computing * max(1, math.ceil(axes.get("frames", 1) / self.frame_rate))
         what = f"{graph}.onnx of {self.description.model}"
-        try:
-            with limited_time(seconds) as options:
-                results = cast(list[Array], session.run(None, given, options))
-        except Exception as error:  # ONNX Runtime's own errors share no base class
-            if options.terminate:
-                problem = f"computes for more than {seconds:g} s; if you trust it, set FACEDIFF_MAX_COMPUTING higher"
-            elif "requested b" in str(error) or isinstance(error, MemoryError):
-                problem = (
-                    f"needs more memory than {LIMITS.bytes:g} bytes; animate in shorter windows, or, if you trust it, "
-                    f"set FACEDIFF_MAX_BYTES higher"
-                )
-            else:
-                problem = f"cannot be computed ({brief(error)}); {REMEDY}"
-            raise FaceDiffError(f"{what}: {problem}") from error
+        results = run_session(session, given, what, seconds=math.ceil(axes.get("frames", 1) / self.frame_rate))
         for end, result in zip(ends.get("outputs", ()), results, strict=False):
             shape = tuple(axes.get(size, size) for size in end["shape"])
             flat = result.ravel()
@@ -141,6 +105,71 @@ class ExportedGraphs:
                 f"{REMEDY}"
             )
         return results
+
+
+def open_session(
+    path: Path, largest: int, *, threads: int = 0, providers: Sequence[str] | None = None
+) -> onnxruntime.InferenceSession:
+    """Open a graph that :func:`~facediff.runtime.graph_check.check_graph` has read.
+
+    Args:
+        path: the graph.
+        largest: bytes that a node may have that is computed while the graph is opened.
+        threads: of the processor; as many as it has cores if 0.
+        providers: what computes, by ONNX Runtime's names; the processor if None.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 4  # errors are raised; warnings are about optimisations that do not apply
+    # Threads that wait by spinning take the processor from whatever else runs: where something does, a frame takes
+    # twice as long.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    # Where shapes contradict one another, optimisations may end the process. So may the one that is left out: it merges
+    # stored numbers of 16 bits that were not widened on opening, and otherwise has nothing to do.
+    options.add_session_config_entry("session.strict_shape_type_inference", "1")
+    options.add_session_config_entry(
+        "optimization.disable_specified_optimizers", "FuseFp16InitializerToFp32NodeTransformer"
+    )
+    options.add_session_config_entry("optimization.constant_folding_max_output_size_in_bytes", str(largest))
+    try:
+        limit_memory()
+        return onnxruntime.InferenceSession(path, options, providers=list(providers or ["CPUExecutionProvider"]))
+    except Exception as error:  # ONNX Runtime's own errors share no base class
+        raise FaceDiffError(f"{path}: ONNX Runtime cannot read it ({brief(error)}); {REMEDY}") from error
+
+
+def run_session(
+    session: onnxruntime.InferenceSession, inputs: Mapping[str, npt.NDArray[Any]], what: str, *, seconds: float = 1
+) -> list[Array]:
+    """Results of a graph.
+
+    Args:
+        session: the graph.
+        inputs: those that it declares.
+        what: what messages call it.
+        seconds: of motion that it computes, which bound how long it may take.
+
+    Raises:
+        FaceDiffError: if it fails, or takes more memory or time than the budget.
+    """
+    allowed = LIMITS.computing * max(1, seconds)
+    try:
+        with limited_time(allowed) as options:
+            return cast(list[Array], session.run(None, dict(inputs), options))
+    except Exception as error:  # ONNX Runtime's own errors share no base class
+        if options.terminate:
+            problem = f"computes for more than {allowed:g} s; if you trust it, set FACEDIFF_MAX_COMPUTING higher"
+        elif "requested b" in str(error) or isinstance(error, MemoryError):
+            problem = (
+                f"needs more memory than {LIMITS.bytes:g} bytes; animate in shorter windows, or, if you trust it, "
+                f"set FACEDIFF_MAX_BYTES higher"
+            )
+        else:
+            problem = f"cannot be computed ({brief(error)}); {REMEDY}"
+        raise FaceDiffError(f"{what}: {problem}") from error
 
 
 def limit_memory() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, key_frames, solve
+from facediff.editing.bounded import least_squares
 from facediff.editing.shapes import ShapeSet, check_shapes, read_shapes
 from facediff.errors import FaceDiffError
 from facediff.synthetic.arkit import puppet_shapes
@@ -125,3 +126,21 @@ def test_eyes_turn_about_their_centres() -> None:
             assert np.sign((pose - neutral)[front, axis]) == sign
             before, after = (np.linalg.norm(np.diff(at[ball], axis=0), axis=1) for at in (neutral, pose))
             assert after == pytest.approx(before, abs=1e-9)
+
+
+@pytest.mark.parametrize("started", [False, True])
+def test_least_squares_is_scipys_also_where_shapes_resemble_each_other(started: bool) -> None:
+    from scipy.optimize import lsq_linear
+
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        count = int(rng.integers(2, 40))
+        shapes = rng.normal(size=(count, 3 * count))
+        shapes[-1] = shapes[0] + 0.01 * rng.normal(size=3 * count)
+        matrix = shapes @ shapes.T + 0.35 * np.eye(count)
+        right = matrix @ rng.normal(0.4, 0.6, count) + rng.normal(size=count)
+        lower, upper = np.zeros(count), np.where(rng.random(count) < 0.2, 1e-10, 1.0)
+        start = rng.random(count) * upper if started else None
+        solved = least_squares(matrix, right, lower, upper, start)
+        expected = lsq_linear(matrix, right, (lower, upper), method="bvls", tol=1e-14, max_iter=1000).x
+        np.testing.assert_allclose(solved, expected, atol=1e-9)

@@ -1,0 +1,155 @@
+"""Weights of blendshapes as Audio2Face-3D solves for them: least squares of a regularised Gram matrix's own system.
+
+NVIDIA's solver minimises |A w − b|² and not the quadratic form that A and b belong to; both have one solution as long
+as no weight meets a bound, and are up to 0.95 apart where some do. :func:`facediff.editing.blendshapes.solve` minimises
+the distance of the vertices themselves; docs/methods.md compares both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.editing.bounded import Array, least_squares
+from facediff.errors import FaceDiffError
+
+TemporalTerm = Literal["published", "corrected"]
+"""How a weight is held near the last frame's: ``published`` has its factor of 100 on the left side only, which shrinks
+the motion instead of smoothing it; ``corrected`` has it on both."""
+
+L1, L2, TEMPORAL, SYMMETRY = 0.25, 10.0, 100.0, 10.0
+"""Factors of the strengths."""
+
+EXCLUDED = 1e-10
+"""Upper bound of a weight whose partner excludes it."""
+
+
+@dataclass(frozen=True)
+class Regularisation:
+    """Strengths of the terms, for a face of a certain size; the defaults are NVIDIA's.
+
+    Attributes:
+        l1: keeps the sum of the weights small.
+        l2: keeps each weight small.
+        temporal: keeps weights near those of the frame before.
+        symmetry: keeps the weights of a symmetric pair alike.
+        template_size: diagonal of the face for which the strengths are stated; they grow with the square of the size.
+        temporal_term: ``published`` or ``corrected``.
+    """
+
+    l1: float = 1.0
+    l2: float = 3.5
+    temporal: float = 0.0
+    symmetry: float = 100.0
+    template_size: float = 54.7
+    temporal_term: TemporalTerm = "published"
+
+
+class RegularisedSolver:
+    """Solves for weights from 0 to 1, frame after frame.
+
+    Args:
+        neutral: (V, 3) the face at rest.
+        deltas: (K, V, 3) what a weight of 1 adds.
+        mask: vertices that are compared; all if empty.
+        regularisation: strengths of the terms.
+        active: (K,) which shapes are used, the weights of others are 0; all if None.
+        symmetric: pairs of shapes that are a left one and a right one.
+        cancel: pairs of shapes that exclude one another: of each, the smaller weight is held at nearly 0.
+        multipliers: (K,) factor of each weight that was solved for; 1 if None.
+        offsets: (K,) what is added to it then; 0 if None.
+
+    Raises:
+        FaceDiffError: if sizes do not fit each other.
+
+    Example:
+        >>> neutral, deltas = np.eye(3) * 54.7, np.eye(9).reshape(9, 3, 3)[:2]
+        >>> solver = RegularisedSolver(neutral, deltas, regularisation=Regularisation(l1=0, l2=0, symmetry=0))
+        >>> solver.solve(neutral + 0.5 * deltas[:1] - deltas[1:]).tolist()
+        [[0.5, 0.0]]
+    """
+
+    def __init__(
+        self,
+        neutral: npt.NDArray[np.floating],
+        deltas: npt.NDArray[np.floating],
+        *,
+        mask: npt.NDArray[np.integer] | None = None,
+        regularisation: Regularisation | None = None,
+        active: Sequence[bool] | None = None,
+        symmetric: Sequence[tuple[int, int]] = (),
+        cancel: Sequence[tuple[int, int]] = (),
+        multipliers: Sequence[float] | None = None,
+        offsets: Sequence[float] | None = None,
+    ) -> None:
+        count = len(deltas)
+        if deltas.shape[1:] != neutral.shape or neutral.ndim != 2:
+            raise FaceDiffError(
+                f"shapes: have the shape {deltas.shape} and the face {neutral.shape}; expected one size"
+            )
+        self.neutral, self.options = neutral, regularisation or Regularisation()
+        self._rows: Any = slice(None) if mask is None or not len(mask) else np.asarray(mask, np.int64)
+        used = np.ones(count, bool) if active is None else np.asarray(active, bool)
+        self._used = np.flatnonzero(used)
+        self._factor = np.ones(count) if multipliers is None else np.asarray(multipliers, np.float64)
+        self._offset = np.zeros(count) if offsets is None else np.asarray(offsets, np.float64)
+        place = {int(shape): index for index, shape in enumerate(self._used)}
+        # A pair counts only if both of its shapes are used.
+        pairs = [[(place[i], place[j]) for i, j in group if i in place and j in place] for group in (symmetric, cancel)]
+        self._cancel = pairs[1]
+        # The size of the whole face, whatever the mask leaves out.
+        self._scale = float(np.square(np.ptp(neutral.astype(np.float64), axis=0)).sum()) / self.options.template_size**2
+        self._shapes = deltas[self._used][:, self._rows].reshape(len(self._used), -1).astype(np.float64)
+        self._matrix = self._shapes @ self._shapes.T + self._scale * self._penalty(pairs[0])
+
+    def _penalty(self, symmetric: Sequence[tuple[int, int]]) -> Array:
+        options, count = self.options, len(self._used)
+        difference = np.zeros((len(symmetric), count))
+        for row, (left, right) in enumerate(symmetric):
+            difference[row, left], difference[row, right] = 1, -1
+        return np.asarray(
+            L1 * options.l1**2 * np.ones((count, count))
+            + (L2 * options.l2 + TEMPORAL * options.temporal) * np.eye(count)
+            + SYMMETRY * options.symmetry * difference.T @ difference
+        )
+
+    def solve(self, vertices: npt.NDArray[np.floating]) -> Array:
+        """Weights (T, K) of a motion, absolute vertices (T, V, 3); the face at rest goes before the first frame."""
+        if vertices.ndim != 3 or vertices.shape[1:] != self.neutral.shape:
+            raise FaceDiffError(
+                f"vertices: have the shape {vertices.shape}; expected (frames, {len(self.neutral)}, 3) as the shapes"
+            )
+        weights = np.zeros((len(vertices), len(self._factor)))
+        last = np.zeros(len(self._used))
+        towards = self._scale * self.options.temporal * (TEMPORAL if self.options.temporal_term == "corrected" else 1.0)
+        for frame, pose in enumerate(vertices):
+            moved = (pose.astype(np.float64) - self.neutral)[self._rows].ravel()
+            last = self._frame(self._shapes @ moved + towards * last, last)
+            weights[frame, self._used] = last
+        return weights * self._factor + self._offset
+
+    def _frame(self, right: Array, last: Array) -> Array:
+        lower, upper = np.zeros(len(right)), np.ones(len(right))
+        weights = least_squares(self._matrix, right, lower, upper, last)
+        if not self._cancel:
+            return weights
+        for i, j in self._cancel:
+            upper[j if weights[i] >= weights[j] else i] = EXCLUDED
+        return least_squares(self._matrix, right, lower, upper, weights)
+
+
+def pairs_of(partners: Sequence[int]) -> list[tuple[int, int]]:
+    """Pairs of places with the same number, not negative.
+
+    >>> pairs_of([0, -1, 1, 0, 1])
+    [(0, 3), (2, 4)]
+    """
+    places: dict[int, list[int]] = {}
+    for place, number in enumerate(partners):
+        if number >= 0:
+            places.setdefault(number, []).append(place)
+    return [(pair[0], pair[1]) for pair in places.values() if len(pair) == 2]

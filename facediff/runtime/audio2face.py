@@ -1,0 +1,303 @@
+"""Audio2Face-3D v2.3 (NVIDIA, 2025) without PyTorch: windows of speech to coefficients, and coefficients to a face.
+
+The network sees half a second around each frame's moment, so that any frame rate may be asked for and frames do not
+depend on one another; what follows the network smooths them. docs/methods.md says what is NVIDIA's and what is offered
+besides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError, choices
+from facediff.runtime.audio2face_folder import REMEDY, SAMPLE_RATE, Audio2FaceFolder, read_audio2face
+from facediff.runtime.graph_check import check_graph
+from facediff.runtime.graphs import open_session, run_session
+from facediff.utils.licences import Licence
+from facediff.utils.limits import FRAME_RATES, check_number, quoted
+
+if TYPE_CHECKING:
+    import onnxruntime  # type: ignore[import-untyped]
+
+Array = npt.NDArray[np.float32]
+Array64 = npt.NDArray[np.float64]
+
+LICENCE = Licence(
+    "weights",
+    "NVIDIA Open Model License",
+    "allowed",
+    "huggingface.co/nvidia/Audio2Face-3D-v2.3-Mark",
+)
+"""The released models' licence; the data of the actor Claire are for evaluation only, which its owner says apart."""
+
+SACCADE_RATE = 30
+"""Rows a second of the stored saccades."""
+
+AT_ONCE = 32
+"""Windows that the network is given together where it takes several."""
+
+
+class Audio2Face:
+    """A model folder, ready to run.
+
+    Args:
+        folder: its content.
+        session: its network.
+
+    Example:
+        >>> model = Audio2Face.open("Audio2Face-3D-v2.3-Mark")  # doctest: +SKIP
+        >>> face = model.animate(model.infer(speech, 30, {"joy": 0.7}), 30)  # doctest: +SKIP
+        >>> face["skin_vertices"].shape  # doctest: +SKIP
+        (69, 61520, 3)
+    """
+
+    def __init__(self, folder: Audio2FaceFolder, session: onnxruntime.InferenceSession) -> None:
+        self.folder, self._session = folder, session
+        facts = folder.facts
+        expected = {"input": facts.buffer, "emotion": facts.implicit + len(facts.emotions)}
+        ends = {node.name: node.shape for node in session.get_inputs()}
+        results = [node.name for node in session.get_outputs()]
+        fits = ends.keys() == expected.keys() and results == ["result"]
+        if not fits or any(len(ends[name]) != 3 or ends[name][1:] != [1, length] for name, length in expected.items()):
+            raise FaceDiffError(
+                f"{folder.network}: takes {quoted(ends)} and gives {quoted(results)}; expected input (B, 1, "
+                f"{expected['input']}) and emotion (B, 1, {expected['emotion']}), and result; {REMEDY}"
+            )
+        self._batch = 1 if isinstance(ends["input"][0], int) else AT_ONCE
+
+    @classmethod
+    def open(cls, folder: str | Path, *, threads: int = 0) -> Audio2Face:
+        """Read a folder.
+
+        Args:
+            folder: as NVIDIA distributes it.
+            threads: of the processor; as many as it has cores if 0.
+
+        Raises:
+            FaceDiffError: naming the file and what is wrong in it.
+        """
+        content = read_audio2face(Path(folder))
+        largest = check_graph(content.network)
+        return cls(content, open_session(content.network, largest, threads=threads))
+
+    @staticmethod
+    def frames(samples: int, frame_rate: float) -> int:
+        """Frames whose moments lie in so many samples: frame k is at k/frame_rate seconds."""
+        return math.ceil(samples / step(frame_rate))
+
+    def emotion(self, strengths: Mapping[str, float] | None = None) -> Array:
+        """The network's emotion (I + E,): the implicit one of the settings, then the explicit one.
+
+        Args:
+            strengths: of explicit emotions by name; of all others the model's usual ones.
+
+        Raises:
+            FaceDiffError: if there is no such emotion, or a strength is no number.
+        """
+        names = self.folder.facts.emotions
+        explicit = np.array(self.folder.facts.default_emotion, np.float32)
+        for name, strength in (strengths or {}).items():
+            if name not in names:
+                raise FaceDiffError(f'emotion: there is no "{name}": {choices(name, names)}')
+            explicit[names.index(name)] = check_number("emotion", name, strength, -10, 10)
+        return np.concatenate([self.folder.implicit, explicit])
+
+    def infer(
+        self,
+        audio: Array,
+        frame_rate: float,
+        emotion: Mapping[str, float] | Array | None = None,
+        *,
+        start: int = 0,
+        frames: int | None = None,
+    ) -> Array:
+        """What the network gives for each frame.
+
+        Args:
+            audio: speech (S,) at 16 kHz, full scale 1, not normalised.
+            frame_rate: frames a second.
+            emotion: strengths by name, or the explicit emotion of every frame (T, E).
+            start: the first frame.
+            frames: how many; all whose moments lie in the speech if None.
+
+        Returns:
+            (T, n): coefficients of skin and tongue, offsets of the jaw's points, angles of the eyes.
+        """
+        facts, rate = self.folder.facts, step(frame_rate)
+        count = self.frames(len(audio), frame_rate) - start if frames is None else frames
+        if isinstance(emotion, np.ndarray):
+            implicit = np.broadcast_to(self.folder.implicit, (len(emotion), facts.implicit))
+            emotions = np.concatenate([implicit, emotion.astype(np.float32)], 1)[:count]
+        else:
+            emotions = np.broadcast_to(self.emotion(emotion), (count, facts.implicit + len(facts.emotions)))
+        if emotions.shape != (count, facts.implicit + len(facts.emotions)):
+            raise FaceDiffError(
+                f"emotion: has the shape {np.shape(emotion)}; expected ({count}, {len(facts.emotions)})"
+            )
+        # The moments are whole samples, rounded down, in exact arithmetic: 29.97 frames a second must not drift.
+        moments = [math.floor((start + frame) * rate) for frame in range(count)]
+        padded = np.pad(audio.astype(np.float32), (facts.before, facts.buffer)) * np.float32(
+            self.folder.settings.input_strength
+        )
+        padded = np.pad(padded, (0, max(0, max(moments, default=0) + facts.buffer - len(padded))))
+        results = np.empty((count, facts.size), np.float32)
+        for first in range(0, count, self._batch):
+            rows = slice(first, min(first + self._batch, count))
+            windows = np.stack([padded[at : at + facts.buffer] for at in moments[rows]])[:, None]
+            inputs = {"input": windows, "emotion": np.ascontiguousarray(emotions[rows][:, None])}
+            (result,) = run_session(self._session, inputs, str(self.folder.network), seconds=len(windows))
+            if result.size != len(windows) * facts.size or result.dtype != np.float32 or not np.isfinite(result).all():
+                raise FaceDiffError(
+                    f"{self.folder.network}: gives {result.dtype} {result.shape}; expected {facts.size} finite numbers "
+                    f"for each window, as network_info.json says; {REMEDY}"
+                )
+            results[rows] = result.reshape(len(windows), facts.size)
+        return results
+
+    def animate(self, result: Array, frame_rate: float, *, blink: float = 0.0) -> dict[str, Array]:
+        """The face of every frame; see :class:`FaceAnimator`.
+
+        Args:
+            result: (T, n) of :meth:`infer`.
+            frame_rate: frames a second.
+            blink: how far the lids are closed besides.
+
+        Returns:
+            ``skin_vertices`` (T, V, 3), ``tongue_vertices`` (T, U, 3), ``jaw_transform`` (T, 4, 4) for column vectors,
+            and ``eyes_rotation`` (T, 4): the angles x and y of the right eye, then of the left one.
+        """
+        animator = FaceAnimator(self.folder, frame_rate, blink=blink)
+        return animator.animate(result)
+
+
+class FaceAnimator:
+    """What makes a face of the network's results, frame after frame; it remembers what smoothing needs.
+
+    Args:
+        folder: content of the model's folder.
+        frame_rate: frames a second.
+        blink: how far the lids are closed besides.
+    """
+
+    def __init__(self, folder: Audio2FaceFolder, frame_rate: float, *, blink: float = 0.0) -> None:
+        self.folder, self.frame_rate = folder, float(frame_rate)
+        arrays, settings = folder.arrays, folder.settings
+        height = arrays["skin"][:, 1].astype(np.float64)
+        share = (height - height.min()) / np.ptp(height)
+        distance = (settings.face_mask_level - share) / settings.face_mask_softness
+        with np.errstate(over="ignore"):  # far below the border, exp overflows to infinity, which gives the right 0
+            lower = (1 / (1 + np.exp(-distance)))[:, None]
+        self._parts = (
+            (lower * settings.lower_face_strength, self._share(settings.lower_face_smoothing)),
+            ((1 - lower) * settings.upper_face_strength, self._share(settings.upper_face_smoothing)),
+        )
+        closing = -settings.eyelid_open_offset + blink * settings.blink_strength
+        self._offset = arrays["eye_close"] * closing + arrays["lip_open"] * np.float64(settings.lip_open_offset)
+        self._filters: list[list[Array64]] = []
+        self._frame = 0
+
+    def _share(self, smoothing: float) -> float:
+        """The part of a difference that a filter takes over in a frame: half of it in ``smoothing`` seconds."""
+        return 1 - 0.5 ** (1 / self.frame_rate / smoothing) if smoothing > 0 else 1.0
+
+    def animate(self, result: Array) -> dict[str, Array]:
+        """The next frames; see :meth:`Audio2Face.animate`."""
+        facts, count = self.folder.facts, len(result)
+        if result.ndim != 2 or result.shape[1] != facts.size or not np.isfinite(result).all():
+            raise FaceDiffError(f"result: has the shape {result.shape}; expected finite numbers (frames, {facts.size})")
+        skin, tongue, jaw, eyes = np.split(result, np.cumsum([facts.skin, facts.tongue, facts.jaw]), axis=1)
+        vertices = np.empty((count, facts.skin_vertices, 3), np.float32)
+        for frame, coefficients in enumerate(skin):
+            vertices[frame] = self._skin(coefficients)
+        animated = {
+            "skin_vertices": vertices,
+            "tongue_vertices": self._tongue(tongue),
+            "jaw_transform": np.stack([self._jaw(points) for points in jaw.reshape(count, -1, 3)]),
+            "eyes_rotation": self._eyes(eyes),
+        }
+        self._frame += count
+        return animated
+
+    def _skin(self, coefficients: Array) -> Array64:
+        arrays = self.folder.arrays
+        # The shapes are displacements; the mean that they were taken about is the face at rest, which is added last.
+        delta = np.tensordot(coefficients, arrays["skin_shapes"], 1)
+        pose = self.folder.settings.skin_strength * delta.astype(np.float64) + self._offset
+        if not self._filters:
+            self._filters = [[pose.copy(), pose.copy()] for _ in self._parts]
+        total = arrays["skin"].astype(np.float64)
+        for (mask, share), filters in zip(self._parts, self._filters, strict=True):
+            followed = pose
+            for state in filters:
+                state += (followed - state) * share
+                followed = state
+            total += mask * followed
+        return total
+
+    def _tongue(self, coefficients: Array) -> Array:
+        arrays, settings = self.folder.arrays, self.folder.settings
+        delta = np.tensordot(coefficients.astype(np.float64), arrays["tongue_shapes"], 1)
+        offset = np.array([0, settings.tongue_height_offset, settings.tongue_depth_offset])
+        return np.asarray(arrays["tongue"] + delta * settings.tongue_strength + offset, np.float32)
+
+    def _jaw(self, offsets: Array) -> Array:
+        settings, rest = self.folder.settings, self.folder.arrays["jaw"].astype(np.float64)
+        shift = np.array([0, settings.lower_teeth_height_offset, settings.lower_teeth_depth_offset])
+        return rigid_transform(rest, rest + offsets * settings.lower_teeth_strength + shift).astype(np.float32)
+
+    def _eyes(self, angles: Array) -> Array:
+        settings, saccades = self.folder.settings, self.folder.arrays["saccades"]
+        # In exact arithmetic: NVIDIA adds up a clock in single precision, which at 25 frames a second is late by a row
+        # wherever a moment of the saccades meets a frame.
+        clock = step(self.frame_rate) * SACCADE_RATE / SAMPLE_RATE
+        seed = Fraction(settings.eye_saccade_seed)
+        rows = [
+            math.floor(seed + frame * clock) % len(saccades) for frame in range(self._frame, self._frame + len(angles))
+        ]
+        both = np.tile(saccades[rows], (1, 2)) * np.float64(settings.saccade_strength)
+        offsets = np.array(
+            [
+                settings.right_eye_rot_x_offset,
+                settings.right_eye_rot_y_offset,
+                settings.left_eye_rot_x_offset,
+                settings.left_eye_rot_y_offset,
+            ]
+        )
+        return np.asarray(offsets + settings.eyeballs_strength * angles.astype(np.float64) + both, np.float32)
+
+
+def rigid_transform(rest: Array64, moved: Array64) -> Array64:
+    """The 4 × 4 matrix of the rotation and shift that bring points (P, 3) nearest to others, in column vectors.
+
+    Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
+
+    Example:
+        >>> points = np.random.default_rng(0).normal(size=(5, 3))
+        >>> bool(np.allclose(rigid_transform(points, points + [0, 1, 0])[:3, 3], [0, 1, 0]))
+        True
+    """
+    start, end = rest.mean(0), moved.mean(0)
+    left, _, right = np.linalg.svd((rest - start).T @ (moved - end))
+    # A mirrored fit may be the nearest, but a jaw is not mirrored: the weakest axis is turned round then.
+    mirrored = np.linalg.det(right.T @ left.T)
+    rotation = right.T @ np.diag([1, 1, mirrored]) @ left.T
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, end - rotation @ start
+    return transform
+
+
+def step(frame_rate: float) -> Fraction:
+    """Samples from one frame to the next, exactly; 30000/1001 frames a second are known as such.
+
+    >>> step(30), step(30000 / 1001) == Fraction(16_000 * 1001, 30_000)
+    (Fraction(1600, 3), True)
+    """
+    check_number("frame_rate", "the frame rate", frame_rate, *FRAME_RATES)
+    return SAMPLE_RATE / Fraction(frame_rate).limit_denominator(1001)

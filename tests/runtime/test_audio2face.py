@@ -1,0 +1,258 @@
+"""Audio2Face-3D's network, animator and folder, against the formulas in plain NumPy."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.runtime.audio2face import Audio2Face, FaceAnimator, rigid_transform
+from tests.fakes.audio2face import BEFORE, BUFFER, CONFIG, EMOTIONS, LENGTH, SKIN, TONGUE, write_audio2face
+
+SPEECH = (np.random.default_rng(1).normal(size=5000) * 0.1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("audio2face")
+
+
+@pytest.fixture(scope="module")
+def content(folder: Path) -> dict[str, Any]:
+    return write_audio2face(folder)
+
+
+@pytest.fixture(scope="module")
+def model(folder: Path, content: dict[str, Any]) -> Audio2Face:
+    return Audio2Face.open(folder)
+
+
+def network(content: dict[str, Any], moment: int, explicit: list[float]) -> np.ndarray:
+    """The network of one window, sample by sample."""
+    window = [SPEECH[t] if 0 <= t < len(SPEECH) else 0.0 for t in range(moment - BEFORE, moment - BEFORE + BUFFER)]
+    emotion = np.concatenate([content["implicit"], explicit])
+    heard = 1.4 * np.array(window) @ content["sound"].astype(np.float64)
+    return np.tanh(heard + emotion @ content["mood"] + content["bias"])
+
+
+@pytest.mark.parametrize(("frame_rate", "frames"), [(30, 10), (25, 8), (60, 19)])
+def test_infer_is_the_network_of_windows_around_each_frame(
+    model: Audio2Face, content: dict[str, Any], frame_rate: int, frames: int
+) -> None:
+    assert frames == math.ceil(len(SPEECH) * frame_rate / 16000)
+    result = model.infer(SPEECH, frame_rate)
+    expected = [network(content, k * 16000 // frame_rate, [0.0, 0.2, 0.0, 0.0]) for k in range(frames)]
+    np.testing.assert_allclose(result, expected, atol=2e-6)
+
+
+def test_infer_takes_emotions_by_name_or_for_each_frame(model: Audio2Face, content: dict[str, Any]) -> None:
+    result = model.infer(SPEECH, 30, {"joy": 0.7, "pain": 0.2})
+    np.testing.assert_allclose(result[4], network(content, 2133, [0.0, 0.2, 0.7, 0.2]), atol=2e-6)
+    each = np.random.default_rng(0).random((10, 4)).astype(np.float32)
+    result = model.infer(SPEECH, 30, each)
+    np.testing.assert_allclose(result[7], network(content, 3733, list(each[7])), atol=2e-6)
+    with pytest.raises(FaceDiffError, match="envy"):
+        model.infer(SPEECH, 30, {"envy": 1.0})
+    with pytest.raises(FaceDiffError, match="emotion"):
+        model.infer(SPEECH, 30, each[:3])
+
+
+def test_infer_of_parts_is_that_of_the_whole(model: Audio2Face) -> None:
+    whole = model.infer(SPEECH, 60)
+    parts = [model.infer(SPEECH, 60, start=start, frames=4) for start in (0, 4, 8, 12)]
+    np.testing.assert_allclose(np.concatenate(parts), whole[:16], atol=1e-6)
+    assert model.infer(SPEECH, 30000 / 1001).shape == (10, LENGTH)
+
+
+def reference(content: dict[str, Any], result: np.ndarray, frame_rate: float, blink: float = 0.0) -> dict[str, Any]:
+    """The animator, vertex by vertex and filter by filter."""
+    data, c = {name: array.astype(np.float64) for name, array in content["data"].items()}, CONFIG
+    rest = data["shapes_mean_skin"]
+    low, high = min(rest[:, 1]), max(rest[:, 1])
+    skin = np.zeros((len(result), *rest.shape))
+    smoothed: dict[tuple[str, int], Any] = {}
+    for t, row in enumerate(result.astype(np.float64)):
+        p = c["skin_strength"] * sum(row[k] * data["shapes_matrix_skin"][k] for k in range(SKIN))
+        p = p + data["eye_close_pose_delta"] * (-c["eyelid_open_offset"] + blink * c["blink_strength"])
+        p = p + data["lip_open_pose_delta"] * c["lip_open_offset"]
+        for part in ("lower", "upper"):
+            alpha = 1 - 0.5 ** (1 / frame_rate / c[f"{part}_face_smoothing"])
+            value = p
+            for pole in (1, 2):
+                if t == 0:
+                    smoothed[part, pole] = p
+                value = smoothed[part, pole] = smoothed[part, pole] + (value - smoothed[part, pole]) * alpha
+        for v in range(len(rest)):
+            share = (rest[v, 1] - low) / (high - low)
+            m = 1 / (1 + math.exp(-(c["face_mask_level"] - share) / c["face_mask_softness"]))
+            upper, lower = smoothed["upper", 2][v] * 0.9 * (1 - m), smoothed["lower", 2][v] * 1.3 * m
+            skin[t, v] = rest[v] + upper + lower
+    at = SKIN
+    tongue = np.tensordot(result[:, at : at + TONGUE], data["shapes_matrix_tongue"], 1) * 1.5
+    tongue += data["shapes_mean_tongue"] + [0, 0.2, -0.3]
+    eyes = np.zeros((len(result), 4))
+    for t, row in enumerate(result):
+        saccade = data["saccade_rot_matrix"][(3 + t * 30 // int(frame_rate)) % 11]
+        eyes[t] = [0.1, -2.0, 0.3, 2.0] + 0.8 * row[-4:] + 0.9 * np.tile(saccade, 2)
+    moved = data["neutral_jaw"] + 1.2 * result[:, at + TONGUE : -4].reshape(-1, 5, 3) + [0, -0.1, 0.25]
+    return {"skin_vertices": skin, "tongue_vertices": tongue, "eyes_rotation": eyes, "moved": moved}
+
+
+@pytest.mark.parametrize("frame_rate", [30, 25, 60])
+def test_animate_follows_the_formulas(model: Audio2Face, content: dict[str, Any], frame_rate: int) -> None:
+    result = np.random.default_rng(2).normal(size=(40, LENGTH)).astype(np.float32)
+    animated, expected = model.animate(result, frame_rate, blink=0.3), reference(content, result, frame_rate, 0.3)
+    for name in ("skin_vertices", "tongue_vertices", "eyes_rotation"):
+        np.testing.assert_allclose(animated[name], expected[name], atol=2e-5, err_msg=name)
+    for transform, moved in zip(animated["jaw_transform"], expected["moved"], strict=True):
+        assert_best_fit(transform, content["data"]["neutral_jaw"], moved)
+
+
+def assert_best_fit(transform: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> None:
+    """A rotation and a shift of which no small change comes nearer."""
+    rotation, shift = transform[:3, :3].astype(np.float64), transform[:3, 3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(rotation) > 0
+    np.testing.assert_array_equal(transform[3], [0, 0, 0, 1])
+
+    def distance(rotation: np.ndarray, shift: np.ndarray) -> float:
+        return float(np.square(rest @ rotation.T + shift - moved).sum())
+
+    best = distance(rotation, shift)
+    for axis in range(3):
+        for angle in (-0.01, 0.01):
+            turn = np.eye(3)
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            turn[a, a] = turn[b, b] = math.cos(angle)
+            turn[a, b], turn[b, a] = -math.sin(angle), math.sin(angle)
+            turned = turn @ rotation
+            assert distance(turned, moved.mean(0) - turned @ rest.mean(0)) > best
+        assert distance(rotation, shift + 0.01 * np.eye(3)[axis]) > best
+
+
+def test_rigid_transform_never_mirrors() -> None:
+    rest = np.random.default_rng(0).normal(size=(5, 3))
+    assert np.linalg.det(rigid_transform(rest, rest * [-1, 1, 1])[:3, :3]) == pytest.approx(1)
+
+
+def test_an_animator_goes_on_where_it_was(model: Audio2Face) -> None:
+    result = np.random.default_rng(3).normal(size=(20, LENGTH)).astype(np.float32)
+    whole, animator = model.animate(result, 24), FaceAnimator(model.folder, 24)
+    parts = [animator.animate(result[:7]), animator.animate(result[7:])]
+    for name, array in whole.items():
+        np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), array)
+    with pytest.raises(FaceDiffError, match="result"):
+        animator.animate(result[:, :-1])
+
+
+# Folders of strangers.
+
+INFO, SETTINGS = "network_info.json", "model_config_Nobody.json"
+
+Change = Callable[[Path], object]
+
+
+def edit(name: str, *keys: str, value: object) -> Change:
+    def change(folder: Path) -> None:
+        content = json.loads((folder / name).read_text())
+        inner = content
+        for key in keys[:-1]:
+            inner = inner[key]
+        inner[keys[-1]] = value
+        (folder / name).write_text(json.dumps(content))
+
+    return change
+
+
+def arrays(name: str, **changes: np.ndarray | None) -> Change:
+    def change(folder: Path) -> None:
+        with np.load(folder / name) as archive:
+            content = {key: archive[key] for key in archive.files} | changes
+        np.savez(folder / name, **{key: array for key, array in content.items() if array is not None})
+
+    return change
+
+
+def looped(folder: Path) -> None:
+    model = onnx.load(folder / "network.onnx")
+    model.graph.node[-1].op_type = "RandomNormalLike"
+    (folder / "network.onnx").write_bytes(model.SerializeToString())
+
+
+def linked(folder: Path) -> None:
+    (folder / "model_data.npz").rename(folder.parent / "elsewhere.npz")
+    (folder / "model_data.npz").symlink_to(folder.parent / "elsewhere.npz")
+
+
+HOSTILE: dict[str, tuple[str, Change]] = {
+    "a path outside": ("networkInfoPath", edit("model.json", "networkInfoPath", value="../network_info.json")),
+    "an absolute path": ("modelDataPath", edit("model.json", "modelDataPath", value="/etc/passwd")),
+    "a path of a drive": ("modelDataPath", edit("model.json", "modelDataPath", value="C:\\data.npz")),
+    "a link outside": ("modelDataPath", linked),
+    "no path": ("emotionDatabasePath", edit("model.json", "emotionDatabasePath", value=7)),
+    "no graph of ONNX": ("network.onnx", lambda folder: (folder / "network.onnx").unlink()),
+    "another kind of network": ("type", edit(INFO, "id", "type", value="diffusion")),
+    "a size beyond reason": ("num_shapes_skin", edit(INFO, "params", "num_shapes_skin", value=10**12)),
+    "an endless window": ("buffer_len", edit(INFO, "audio_params", "buffer_len", value=1e30)),
+    "a size that is not the network's": (
+        "network.onnx",
+        edit(INFO, "audio_params", "buffer_len", value=800),
+    ),
+    "emotions twice": (
+        "explicit_emotions",
+        edit(INFO, "params", "explicit_emotions", value=["joy"] * 4),
+    ),
+    "a shot that is missing": ("source_shot", edit(SETTINGS, "config", "source_shot", value="other")),
+    "a frame beyond its shot": ("source_frame", edit(SETTINGS, "config", "source_frame", value=3)),
+    "a strength that is no number": (
+        "skin_strength",
+        edit(SETTINGS, "config", "skin_strength", value="1"),
+    ),
+    "no softness": ("softness", edit(SETTINGS, "config", "face_mask_softness", value=0)),
+    "a row beyond the database": ("implicit_emo_db", arrays("implicit_emo_db.npz", emo_spec_start=np.array([0, 6]))),
+    "no shapes": ("shapes_matrix_skin", arrays("model_data.npz", shapes_matrix_skin=None)),
+    "other shapes": ("lip_open_pose_delta", arrays("model_data.npz", lip_open_pose_delta=np.zeros((3, 3), np.float32))),
+    "NaN": ("neutral_jaw", arrays("model_data.npz", neutral_jaw=np.full((5, 3), np.nan, np.float32))),
+    "objects": ("model_data.npz", arrays("model_data.npz", neutral_jaw=np.array([{}] * 15))),
+    "a flat face": ("shapes_mean_skin", arrays("model_data.npz", shapes_mean_skin=np.zeros((24, 3), np.float32))),
+    "a mask outside": ("frontalMask", arrays("bs_skin.npz", frontalMask=np.array([24]))),
+    "a pose that is missing": ("jawOpen", arrays("bs_skin.npz", jawOpen=None)),
+    "poses without neutral": ("poseNames", arrays("bs_skin.npz", poseNames=np.array(["a", "b"], "S8"))),
+    "a pair of three": (
+        "bsSolveCancelPoses",
+        edit("bs_skin_config.json", "blendshape_params", "bsSolveCancelPoses", value=[0, 0, 0, -1, -1, -1]),
+    ),
+    "no pose in use": (
+        "bsSolveActivePoses",
+        edit("bs_skin_config.json", "blendshape_params", "bsSolveActivePoses", value=[0] * 6),
+    ),
+    "an operator that draws numbers": ("network.onnx", looped),
+}
+
+
+@pytest.mark.parametrize(("named", "change"), HOSTILE.values(), ids=HOSTILE)
+def test_open_refuses_a_hostile_folder(tmp_path: Path, named: str, change: Change) -> None:
+    write_audio2face(tmp_path / "model")
+    change(tmp_path / "model")
+    with pytest.raises(FaceDiffError, match=named):
+        Audio2Face.open(tmp_path / "model")
+
+
+def test_infer_refuses_results_of_another_size(tmp_path: Path) -> None:
+    write_audio2face(tmp_path)
+    edit(INFO, "params", "num_shapes_tongue", value=2)(tmp_path)
+    arrays("model_data.npz", shapes_matrix_tongue=np.zeros((2, 9, 3), np.float32))(tmp_path)
+    with pytest.raises(FaceDiffError, match="network_info"):
+        Audio2Face.open(tmp_path).infer(SPEECH, 30)
+
+
+def test_emotions_are_those_of_the_folder(model: Audio2Face) -> None:
+    assert model.folder.facts.emotions == EMOTIONS
+    assert model.emotion({"anger": 0.5}).tolist()[4:] == [0.0, 0.5, 0.0, 0.0]
