@@ -55,7 +55,7 @@ def retarget(
             (default: it is searched for in all parts). Teeth and tongue follow the jaw, other parts stand still
         pick: pick landmarks on a page in the browser first; they are saved next to the correspondence, or to OUT, as
             <name>.landmarks.json, and the command goes on with them
-        show: picture of both faces at the most open mouth
+        show: picture of both faces at the widest mouth, a full blink and raised brows
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
         host: address at which the page of --pick is served; by default nobody but this machine reaches it
@@ -78,7 +78,7 @@ def retarget(
     else:
         refuse_idle("is for --pick", host=host != "127.0.0.1", port=port != 0, open=open)
 
-    from facediff.editing.fit_check import check_fit, refuse_poor
+    from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.pictures import draw_correspondence
@@ -91,8 +91,8 @@ def retarget(
         landmarks = picked
     reports = []
 
-    def judge(made: Animation, found: Correspondence) -> None:
-        reports.append(check_fit(own, made, found))
+    def judge(made: Animation, found: Correspondence, report: FitReport) -> None:
+        reports.append(report)
         if show is not None:  # the picture shows what is wrong
             draw_correspondence(show, own, made, found)
         if not accept_poor:
@@ -193,6 +193,7 @@ def remarks(animation: Animation, made: Animation, found: Correspondence, report
     ]
     lines.append(report.summary)
     lines += [f"WARNING: {fault}" for fault in report.faults]
+    lines += [f"note: {remark}" for remark in report.remarks]
     if found.similarity.rotation[1, 1] < TURNED:
         lines.append("the target mesh is turned against the animation, whose y axis points up; so is what is written")
     return lines

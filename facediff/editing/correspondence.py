@@ -7,6 +7,7 @@ the target onto the source, and nearest points of a surface, which all of them n
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy.typing as npt
 
 from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
+from facediff.editing.lids import EyeLids, eye_lids
 from facediff.editing.loose_pieces import loose_pieces
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
@@ -34,6 +36,8 @@ CLOSE, FAR = 0.1, 0.3
 EXACT = 0.005
 """Nearer than this share of the face's size, the place on the surface is trusted fully if the sheet is right."""
 BADLY = 0.05  # A median distance above this share of the face's size is reported as a bad fit
+LIDS_AS_ALL, LIDS_FITTED, LIDS_AT_REST = 0, 1, 2
+"""What lids do: move as everything else, as on two cuts of one surface; move by their own opening; or stay at rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,33 @@ class Correspondence:
     source_faces: Indices  # (Fs, 3)
     target_vertices: Array  # (Vt, 3) the target mesh
     target_faces: Indices  # (Ft, 3)
+    hidden: Indices  # numbers of the target's triangles that the face is not searched for in
+    followers: Indices  # (A,) vertices of the target that move with its skin: brows, lashes, a beard
+    follower_corners: Indices  # (A, 3) the skin's vertices that they move with
+    follower_weights: Array  # (A, 3) their barycentric weights
+    lids: int  # LIDS_AS_ALL, LIDS_FITTED or LIDS_AT_REST
+
+    @cached_property
+    def laid(self) -> Surface:
+        """The target mesh in the source's place, with the triangles that the face is searched for in."""
+        faces = np.delete(self.target_faces, self.hidden, axis=0)
+        return Surface(self.similarity.inverse().apply(self.target_vertices), faces)
+
+    @cached_property
+    def features(self) -> tuple[Features | None, Features | None]:
+        """What the source shows of a face, and what the target shows in the source's place."""
+        source = find_features(self.source_vertices, self.source_faces)
+        return source, None if source is None else find_features(self.laid.vertices, self.laid.faces, source)
+
+    @cached_property
+    def eye_lids(self) -> list[EyeLids] | None:
+        """How the lids of both eyes are carried; None if they move as everything else."""
+        source, target = self.features
+        if self.lids == LIDS_AS_ALL or source is None or target is None:
+            return None
+        laid = Surface(self.laid.vertices, self.target_faces)
+        own = Surface(self.source_vertices, self.source_faces)
+        return eye_lids(own, laid, (source, target), at_rest=self.lids == LIDS_AT_REST)
 
     @property
     def fits_badly(self) -> bool:
@@ -120,11 +151,13 @@ def correspond(
         # Which side of an opening a vertex belongs to is known there: no neighbour on the other side is asked.
         sided = (bending[1].codes > 0) & (left < FAR)
         trust[sided] = np.maximum(trust[sided], 1.0 - left[sided] / FAR)
+    followers = (np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3)))
     if both is not None:
         loose = loose_pieces(source, laid, *both, places.alone)
         corners[loose.jaw], weights[loose.jaw], share[loose.jaw] = loose.place.corners[0], loose.place.weights[0], 1.0
         share[loose.still] = 0.0
         trust[loose.jaw] = trust[loose.still] = 1.0
+        followers = loose.followers, loose.follower_corners, loose.follower_weights
     elif shown is not None:
         others = np.setdiff1d(np.arange(len(target.vertices)), face.faces)
         share[others], trust[others] = 0.0, 1.0
@@ -139,6 +172,11 @@ def correspond(
         source_faces=source.faces,
         target_vertices=target.vertices,
         target_faces=np.ascontiguousarray(target_faces, np.int64),
+        hidden=np.zeros(0, np.int64) if shown is None else np.setdiff1d(np.arange(len(target.faces)), shown),
+        followers=followers[0],
+        follower_corners=followers[1],
+        follower_weights=followers[2],
+        lids=LIDS_FITTED if bending is not None else LIDS_AS_ALL,
     )
 
 
@@ -220,6 +258,11 @@ def _vertex_by_vertex(source: Surface, target: Surface) -> Correspondence:
         source_faces=source.faces,
         target_vertices=target.vertices,
         target_faces=target.faces,
+        hidden=np.zeros(0, np.int64),
+        followers=np.zeros(0, np.int64),
+        follower_corners=np.zeros((0, 3), np.int64),
+        follower_weights=np.zeros((0, 3)),
+        lids=LIDS_AS_ALL,
     )
 
 

@@ -24,6 +24,7 @@ WELD = 1e-6  # Vertices nearer than this share of the mesh's size are one: seams
 SAMPLES = 33  # points of each side of an opening, from corner to corner
 
 UPPER_LIP, LOWER_LIP, OPPOSITE = 1, 2, (0, 2, 1, 4, 3, 6, 5)
+LIDS = (3, 4), (5, 6)
 """Codes of vertices next to an opening: lips 1 and 2, then 3 and 4, 5 and 6 for the lids of either eye; 0 elsewhere.
 ``OPPOSITE`` is the code on the other side of the same opening."""
 

@@ -1,4 +1,4 @@
-"""Whether an animation carried to another mesh can be used: do its lips part, does it fold, does it cover the face."""
+"""Whether an animation carried to another mesh can be used: lips part, lids meet, nothing folds, all of it is there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import Correspondence
-from facediff.editing.face_features import find_features
+from facediff.editing.eye_check import EyeFigures, check_eyes, fullest_blink, raised_brows
+from facediff.editing.lids import lid_edges
 from facediff.editing.surface import Surface, nearest
 from facediff.errors import OptionError
 
@@ -41,7 +42,9 @@ class FitReport:
         folded: share of the moving triangles that turn over in some frame.
         crossed: share of pairs and frames in which upper and lower lip pass through one another.
         covered: share of the animation's motion for which the mesh has a place.
+        eyes: the upper face's figures.
         faults: what is wrong, a clause each; empty if the result can be used.
+        remarks: what is not as in the animation and no fault, a clause each.
     """
 
     lip_ratio: float | None
@@ -50,7 +53,9 @@ class FitReport:
     folded: float
     crossed: float | None
     covered: float
+    eyes: EyeFigures | None
     faults: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
 
     @property
     def good(self) -> bool:
@@ -63,6 +68,8 @@ class FitReport:
         figures = []
         if self.lip_ratio is not None and self.opened is not None:
             figures.append(f"lips {self.lip_ratio:.2f} of their widest gap at rest, {self.opened:.0%} as open")
+        if self.eyes is not None and self.eyes.lid_gap is not None:
+            figures.append(f"{self.eyes.lid_gap:.0%} of the eyes left open at a full blink")
         figures.append(f"{self.folded:.1%} of the triangles fold over")
         figures.append(f"{self.covered:.0%} of the motion is carried")
         return ", ".join(figures)
@@ -90,7 +97,7 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
     frames = np.unique(np.linspace(0, len(animation.vertices) - 1, min(FRAMES, len(animation.vertices))).astype(int))
     lip_ratio = opened = torn = crossed = None
     faults = []
-    source = find_features(correspondence.source_vertices, correspondence.source_faces)
+    source, target = correspondence.features
     if source is not None:
         pairs = source.lips(correspondence.source_vertices, LIPS)
         own = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
@@ -100,8 +107,7 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
         frames = np.unique(np.append(frames, widest))
         opening = float(mean[1 + widest] - mean[0])
         if opening * metres_per_unit(animation.unit) > SPEAKS:
-            laid = correspondence.similarity.inverse().apply(correspondence.target_vertices)
-            target = find_features(laid, correspondence.target_faces, source)
+            laid = correspondence.laid.vertices
             if target is None:
                 faults.append(
                     "no line between its lips was found: triangles close its mouth, or it lies elsewhere; cut a closed "
@@ -125,13 +131,40 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
                 faults += _lip_faults(
                     lip_ratio, max(LIP_RATIO, 1.3 * float(mean[0] / mean.max())), opened, torn, crossed
                 )
+    frames = np.unique(np.append(frames, list(telling_frames(animation, correspondence).values()))).astype(int)
     folded = _folded(carried, correspondence.target_faces, frames)
     if folded > FOLDED + _folded(animation, animation.triangles.astype(np.int64), frames):
         faults.append(f"{folded:.0%} of its moving triangles fold over")
     covered = _covered(animation, correspondence, frames)
     if covered < COVERED:
         faults.append(f"it has a place for {covered:.0%} of the animation's motion only")
-    return FitReport(lip_ratio, opened, torn, folded, crossed, covered, tuple(faults))
+    eyes, eye_faults, remarks = check_eyes(animation, carried, correspondence, frames)
+    return FitReport(
+        lip_ratio,
+        opened,
+        torn,
+        folded,
+        crossed,
+        covered,
+        eyes,
+        (*faults, *eye_faults),
+        tuple(remarks),
+    )
+
+
+def telling_frames(animation: Animation, correspondence: Correspondence) -> dict[str, int]:
+    """The frames that show most of a result, by name: the widest mouth, a full blink and raised brows."""
+    source = correspondence.features[0]
+    if source is None:
+        return {}
+    gaps = _gaps(animation.vertices, source.lips(correspondence.source_vertices, LIPS)).mean(axis=1)
+    frames = {"widest mouth": int(gaps.argmax())}
+    edges = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
+    shown = [one for one in edges if one is not None]
+    if shown:
+        frames["full blink"] = fullest_blink(animation, shown)[0]
+    brows = raised_brows(animation, source)
+    return frames if brows is None else {**frames, "raised brows": brows}
 
 
 def _lip_faults(ratio: float, limit: float, opened: float, torn: float, crossed: float) -> list[str]:
@@ -228,9 +261,7 @@ def _covered(animation: Animation, correspondence: Correspondence, frames: npt.N
     # A sample is enough for a share, and each place costs a search.
     if len(some) > 400:
         some = np.sort(np.random.default_rng(0).choice(some, 400, replace=False))
-    laid = Surface(
-        correspondence.similarity.inverse().apply(correspondence.target_vertices), correspondence.target_faces
-    )
+    laid = correspondence.laid
     size = Surface(correspondence.source_vertices, correspondence.source_faces).size
     points = np.asarray(correspondence.source_vertices[some], np.float64)
     away = nearest(laid, points, np.zeros_like(points), 0.0).distances

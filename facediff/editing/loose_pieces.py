@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.face_features import Features
+from facediff.editing.face_features import LIDS, Features
 from facediff.editing.surface import Nearest, Surface, nearest
 
 Array = npt.NDArray[np.float64]
@@ -21,6 +21,9 @@ CAP = 0.12  # A wider gap than this share says no more
 OVERBITE = 0.05  # So far below the line between the lips, in widths, both rows meet
 LARGE = 2.0  # Pieces larger than so many widths are hair, glasses, a beard or a body
 ABOUT, BEARD = 1.2, 0.1  # A large piece of which so much lies within so many widths of the mouth is a beard
+ON_SKIN = 0.08  # A piece no further from the skin than this share of the mouth's width lies on it; others are worn
+TOUCHES = 0.05  # What is nearer than this to a thing that is worn, and nearer than to the skin, belongs to it
+LASH, LASHES = 0.1, 1.5  # Lashes begin so near to a lid's edge, and are no wider, in widths of the eye
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,9 @@ class Loose:
     jaw: Indices  # vertices of lower teeth and a tongue
     still: Indices  # vertices of all that stands still
     place: Nearest  # (1,) the place of the jaw on the source
+    followers: Indices  # (A,) vertices of what lies on the mesh's own skin and moves with it
+    follower_corners: Indices  # (A, 3) the skin's vertices that they move with
+    follower_weights: Array  # (A, 3)
 
 
 def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Features, alone: list[Indices]) -> Loose:
@@ -37,7 +43,8 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
 
     Teeth and tongues lie behind the lips; those below the gap between both rows of teeth follow the jaw. What else lies
     inside the head stands still, and so does what is large, such as hair or a body, unless it lies about the mouth as a
-    beard does. What lies in front of the skin, such as brows and lashes, follows it.
+    beard does, and what is worn in front of the skin, such as glasses. Brows and a beard move with the skin that they
+    lie on, and lashes with the edge of their lid.
 
     Args:
         source: the animation's face.
@@ -54,9 +61,10 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
         features.mouth.centre[None] - [[0.0, 0.45 * features.mouth.width, 0.0]],
         np.array([[0.0, 0.0, 1.0]]),
     )
+    none = np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3))
     alone = [some for some in alone if len(some) and not seen.skin[some].any()]
     if not alone:
-        return Loose(np.zeros(0, np.int64), np.zeros(0, np.int64), place)
+        return Loose(none[0], none[0], place, *none)
     which, starts = np.concatenate(alone), np.cumsum([0, *(len(some) for some in alone[:-1])])
     points, counts = laid.vertices[which], np.array([len(some) for some in alone])
 
@@ -77,8 +85,87 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
     about = mean((np.linalg.norm(points - mouth, axis=1) < ABOUT * width).astype(float)) > BEARD
     large = extent > LARGE * width
     lower = oral & (middle[:, 1] < _gap(middle[oral, 1], mouth[1], width))
-    still = ~lower & (oral | inside | (large & ~about))
-    return Loose(which[np.repeat(lower, counts)], which[np.repeat(still, counts)], place)
+    # What lies between the lids belongs to the eyeball: an iris, a cornea, a reflection.
+    between = mean(_between_lids(points, seen).astype(float)) > 0.6
+    lash = _lashes(points, starts, extent, seen) & ~oral & ~large & ~between
+    still = ~lower & ~lash & (oral | inside | between | (large & ~about))
+    # What else is there lies on the skin, or is worn in front of it.
+    left = np.flatnonzero(~lower & ~lash & ~still)
+    some = np.flatnonzero(np.isin(np.repeat(np.arange(len(alone)), counts), left))
+    on_skin = (
+        nearest(
+            Surface(laid.vertices, laid.faces[seen.skin[laid.faces[:, 0]]]), points[some], np.zeros((len(some), 3)), 0.0
+        )
+        if len(some)
+        else None
+    )
+    if on_skin is not None:
+        away = np.zeros(len(which))
+        away[some] = on_skin.distances
+        worn = np.array([np.median(away[first : first + count]) for first, count in zip(starts, counts, strict=True)])
+        worn_piece = (worn > ON_SKIN * width) & ~about
+        worn_piece[[k for k in range(len(alone)) if k not in set(left)]] = False
+        # Frames of glasses that were large stood still already; their pads touch the nose and belong to them.
+        frames = np.repeat(worn_piece | (large & ~about & ~inside & (middle[:, 2] > mouth[2] - width)), counts)
+        if frames.any():
+            gap = cKDTree(points[frames]).query(points)[0]
+            belongs = mean((gap < np.minimum(TOUCHES * width, np.maximum(away, 0.01 * width))).astype(float)) > 0.5
+            worn_piece |= belongs & np.isin(np.arange(len(alone)), left)
+        still |= worn_piece
+        kept = ~np.repeat(worn_piece, counts)[some]
+        followers = which[some][kept], on_skin.corners[kept], on_skin.weights[kept]
+    else:
+        followers = none
+    lashes = which[np.repeat(lash, counts)]
+    rims = _rim_vertices(laid.vertices, lashes, seen)
+    return Loose(
+        which[np.repeat(lower, counts)],
+        which[np.repeat(still, counts)],
+        place,
+        np.concatenate([followers[0], lashes]),
+        np.concatenate([followers[1], np.repeat(rims[:, None], 3, axis=1)]),
+        np.concatenate([followers[2], np.tile([1.0, 0.0, 0.0], (len(lashes), 1))]),
+    )
+
+
+def _between_lids(points: Array, seen: Features) -> Mask:
+    """Which points (N, 3) are seen in an eye's opening."""
+    chosen = np.zeros(len(points), bool)
+    for eye in seen.eyes:
+        if eye is not None:
+            x, y = points[:, 0], points[:, 1]
+            top, bottom = (np.interp(x, side[:, 0], side[:, 1], -np.inf, -np.inf) for side in (eye.upper, eye.lower))
+            chosen |= (y < top) & (y > bottom)
+    return chosen
+
+
+def _lashes(points: Array, starts: Indices, extent: Array, seen: Features) -> Mask:
+    """Which pieces begin at the edge of a lid."""
+    chosen = np.zeros(len(starts), bool)
+    for eye in seen.eyes:
+        if eye is not None:
+            edges = np.concatenate([eye.upper, eye.lower])
+            away = np.linalg.norm(points[:, None] - edges[None, ::2], axis=2).min(axis=1)
+            near = np.minimum.reduceat(away, starts) < LASH * eye.width
+            within = np.maximum.reduceat(away, starts) < 0.5 * eye.width
+            chosen |= near & within & (extent < LASHES * eye.width)
+    return chosen
+
+
+def _rim_vertices(vertices: Array, lashes: Indices, seen: Features) -> Indices:
+    """The vertex at the edge of a lid (A,) that each vertex of lashes moves with."""
+    from scipy.spatial import cKDTree
+
+    seeds = [
+        own[seen.codes[own] == code]
+        for eye, codes in zip(seen.eyes, LIDS, strict=True)
+        if eye is not None
+        for own, code in zip((eye.upper_seeds, eye.lower_seeds), codes, strict=True)
+    ]
+    if not len(lashes):
+        return lashes
+    rim = np.concatenate(seeds)
+    return np.asarray(rim[cKDTree(vertices[rim]).query(vertices[lashes])[1]])
 
 
 def _gap(heights: Array, line: float, width: float) -> float:

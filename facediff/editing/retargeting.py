@@ -11,6 +11,9 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import (
+    LIDS_AS_ALL,
+    LIDS_AT_REST,
+    LIDS_FITTED,
     Array,
     Correspondence,
     Indices,
@@ -20,8 +23,9 @@ from facediff.editing.correspondence import (
     refuse_other_mesh,
 )
 from facediff.editing.face_features import facing, sides_of_pairs
-from facediff.editing.fit_check import check_fit
+from facediff.editing.fit_check import FitReport, check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
+from facediff.editing.lids import with_lids, without_lids
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError, OptionError
@@ -46,7 +50,7 @@ def retarget(
     landmarks_path: Path | None = None,
     *,
     parts: Sequence[str] = (),
-    judge: Callable[[Animation, Correspondence], object] | None = None,
+    judge: Callable[[Animation, Correspondence, FitReport], object] | None = None,
 ) -> tuple[Animation, Correspondence]:
     """An animation on the mesh in a file, and the correspondence between both meshes.
 
@@ -57,11 +61,20 @@ def retarget(
         landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
         parts: names of the parts of the file that show the face, see :func:`facediff.mesh.parts.named_triangles`; it is
             searched for in all of them if there are none.
-        judge: called with the result before a new correspondence is written; raises where it should not be. Where it
-            raises and both meshes are of known topologies, their named landmarks are tried.
+        judge: called with the result and what was measured of it, before a new correspondence is written; raises where
+            it should not be. Where it raises and both meshes are of known topologies, their named landmarks are tried.
+            Nothing is measured if None.
     """
     triangles = animation.triangles  # refuses an animation without triangles before the other mesh is read
     mesh = read_mesh(mesh_path)
+
+    def judged(correspondence: Correspondence) -> tuple[Animation, Correspondence]:
+        if judge is None:
+            return carry(animation, correspondence, mesh), correspondence
+        carried, correspondence, report = carry_checked(animation, correspondence, mesh)
+        judge(carried, correspondence, report)
+        return carried, correspondence
+
     if correspondence_path is not None and correspondence_path.exists():
         if landmarks_path is not None:
             raise OptionError.naming(
@@ -77,10 +90,7 @@ def retarget(
         refuse_other_mesh(
             str(mesh_path), mesh.vertices, mesh.faces, correspondence.target_vertices, correspondence.target_faces
         )
-        carried = carry(animation, correspondence, mesh)
-        if judge is not None:
-            judge(carried, correspondence)
-        return carried, correspondence
+        return judged(correspondence)
     if correspondence_path is not None:
         if correspondence_path.suffix != ".npz":
             raise OptionError.naming(f"{{correspondence}} {correspondence_path}: expected a name that ends in .npz")
@@ -99,10 +109,7 @@ def retarget(
             )
         except FaceDiffError as error:
             raise FaceDiffError(f"{mesh_path}: {error}") from error
-        carried = carry(animation, correspondence, mesh)
-        if judge is not None:
-            judge(carried, correspondence)
-        return carried, correspondence
+        return judged(correspondence)
 
     try:
         carried, correspondence = attempt(landmarks)
@@ -116,6 +123,29 @@ def retarget(
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
     return carried, correspondence
+
+
+def carry_checked(
+    animation: Animation, correspondence: Correspondence, target: Mesh
+) -> tuple[Animation, Correspondence, FitReport]:
+    """The motion of an animation on a target mesh, the correspondence that carried it, and what was measured of it.
+
+    Where a result is poor, its eyes are carried another way: lids go the share of their own opening, if they did not
+    yet, and else stay at rest. That result counts if nothing else is wrong.
+    """
+    carried = carry(animation, correspondence, target)
+    report = check_fit(animation, carried, correspondence)
+    faults = report.faults
+    for lids in (LIDS_FITTED, LIDS_AT_REST):
+        if report.good or report.eyes is None or correspondence.lids >= lids:
+            continue
+        other = replace(correspondence, lids=lids)
+        moved = carry(animation, other, target)
+        again = check_fit(animation, moved, other)
+        if again.good:
+            why = [f"lids in motion were worse: {faults[0]}"] if lids == LIDS_AT_REST else []
+            return moved, other, replace(again, remarks=(*again.remarks, *why))
+    return carried, correspondence, report
 
 
 def carry(animation: Animation, correspondence: Correspondence, target: Mesh) -> Animation:
@@ -198,10 +228,14 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
 
     Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
     its place on the source is not well known, neighbours are averaged; where it is far from anything, motion fades.
+    Lids go the share of their own eye's opening, and what lies on the skin moves with it.
     """
     # Displacements are differences of positions: the similarity's translation does not act on them.
     matrix = correspondence.similarity.scale * correspondence.similarity.rotation
-    moved = np.asarray(displacements, np.float64)
+    moved, lids = np.asarray(displacements, np.float64), correspondence.eye_lids
+    edges: list[Array] = []
+    if lids is not None:
+        moved, edges = without_lids(lids, moved)
     carried = (
         sum(correspondence.weights[:, k, None] * moved[:, correspondence.corners[:, k]] for k in range(3)) @ matrix.T
     )
@@ -215,7 +249,17 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
         for _ in range(ROUNDS):
             columns = trusted + smoothing @ columns
         carried = columns.reshape(carried.shape[1], carried.shape[0], 3).transpose(1, 0, 2)
-    return np.asarray(correspondence.share[:, None] * carried)
+    carried = np.asarray(correspondence.share[:, None] * carried)
+    if lids is not None:
+        laid = carried @ np.linalg.inv(matrix).T
+        with_lids(lids, correspondence.laid.vertices, laid, edges)
+        carried = laid @ matrix.T
+    if len(correspondence.followers):
+        with_skin = np.einsum(
+            "ak,takd->tad", correspondence.follower_weights, carried[:, correspondence.follower_corners]
+        )
+        carried[:, correspondence.followers] = with_skin
+    return carried
 
 
 def unit_of(unit: str, scale: float) -> str:
@@ -346,7 +390,7 @@ def _about_what_moves(neutral: Array, points: Array, faces: Indices) -> Indices:
 
 # Correspondences on disk.
 
-FORMAT = "facediff correspondence 1"
+FORMAT = "facediff correspondence 2"
 ARRAYS = {
     "corners": ("i", 2),
     "weights": ("f", 2),
@@ -357,6 +401,11 @@ ARRAYS = {
     "source_faces": ("i", 2),
     "target_vertices": ("f", 2),
     "target_faces": ("i", 2),
+    "hidden": ("i", 1),
+    "followers": ("i", 1),
+    "follower_corners": ("i", 2),
+    "follower_weights": ("f", 2),
+    "lids": ("i", 0),
 }
 SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
 """Kind and number of axes of each array in the file."""
@@ -373,7 +422,7 @@ def save_correspondence(path: Path, correspondence: Correspondence) -> None:
             allow_pickle=False,
             format=np.array(FORMAT),
             **{name: np.asarray(getattr(similarity, name)) for name in SIMILARITY},
-            **{name: getattr(correspondence, name) for name in ARRAYS},
+            **{name: np.asarray(getattr(correspondence, name)) for name in ARRAYS},
         )
 
 
@@ -391,7 +440,8 @@ def load_correspondence(path: Path) -> Correspondence:
         if held[name].dtype.kind != kind or held[name].ndim != axes or not np.isfinite(held[name]).all():
             raise FaceDiffError(f"{path}: its {name} are damaged; make a new correspondence")
     correspondence = Correspondence(
-        **{name: held[name] for name in ARRAYS},
+        **{name: held[name] for name in ARRAYS if name != "lids"},
+        lids=int(held["lids"]),
         similarity=Similarity(held["rotation"], held["translation"], float(held["scale"])),
     )
     if not _consistent(correspondence):
@@ -404,6 +454,8 @@ def _consistent(parts: Correspondence) -> bool:
     return (
         parts.corners.shape == parts.weights.shape == (targets, 3)
         and parts.distances.shape == parts.trust.shape == parts.share.shape == (targets,)
+        and parts.follower_corners.shape == parts.follower_weights.shape == (len(parts.followers), 3)
+        and parts.lids in (LIDS_AS_ALL, LIDS_FITTED, LIDS_AT_REST)
         and parts.similarity.rotation.shape == (3, 3)
         and parts.similarity.translation.shape == (3,)
         and parts.similarity.scale > 0
@@ -415,6 +467,14 @@ def _consistent(parts: Correspondence) -> bool:
                 (parts.source_faces, sources),
                 (parts.corners, sources),
                 (parts.target_faces, targets),
+            )
+        )
+        and all(
+            not some.size or (some.min() >= 0 and some.max() < count)
+            for some, count in (
+                (parts.followers, targets),
+                (parts.follower_corners, targets),
+                (parts.hidden, len(parts.target_faces)),
             )
         )
     )

@@ -357,7 +357,7 @@ class AnimationPipeline(ABC):
             animation = self.face.apply(animation, seed=seed, acted=acted)
         if self.options.target_mesh is None:
             return animation
-        from facediff.editing.fit_check import check_fit, refuse_poor
+        from facediff.editing.fit_check import FitReport, refuse_poor
         from facediff.editing.retargeting import carry, retarget
         from facediff.mesh import read_mesh
 
@@ -366,8 +366,8 @@ class AnimationPipeline(ABC):
         if self._correspondence is not None:
             return carry(animation, self._correspondence, read_mesh(target))
 
-        def judge(retargeted: Animation, fit: Correspondence) -> None:
-            refuse_poor(target, check_fit(animation, retargeted, fit))
+        def judge(retargeted: Animation, fit: Correspondence, report: FitReport) -> None:
+            refuse_poor(target, report)
 
         # All samples have one face, so that one correspondence serves all.
         is_known = file is not None and file.exists()

@@ -16,6 +16,9 @@ import trimesh
 from facediff.animation import Animation
 from facediff.editing.landmarks import puppet_landmarks
 from facediff.synthetic.face import EYE_CENTRE, build_face
+from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.people import Face
+from facediff.synthetic.head.rig import head_shapes
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig, lip_pairs
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -294,6 +297,127 @@ def lower_face() -> Head:
     return laid(Head(*finer(vertices, faces)), 3.0, turned(20, 140, 0))
 
 
+INSIDE_LIDS = ("lid_edge", "lid_behind", "lid_end")
+INSIDE_MOUTH = ("lip_roll", "mouth_front", "mouth_bag", "mouth_back")
+BALLS = ("ball_", "iris_", "pupil", "glint")
+APART = ("teeth", "tongue", "hair", "brow_", "lash_", *BALLS)
+
+
+def second(face: Face, *without: str, **pose: float) -> Mesh:
+    """A person of the second edition in metres, posed by ARKit's shapes, without the named groups of vertices."""
+    mesh, shapes = build_head(), head_shapes()
+    posed = mesh.vertices + sum((pose[name] * shapes[name] for name in pose), np.zeros_like(mesh.vertices))
+    gone = np.zeros(len(posed), bool)
+    gone[mesh.both(*without)] = bool(without)
+    return cleaned(face(posed) / 1000.0, mesh.faces[~gone[mesh.faces].any(axis=1)])
+
+
+def only(face: Face, *groups: str) -> Mesh:
+    """Some groups of a person of the second edition."""
+    mesh = build_head()
+    return second(face, *(name for name in mesh.groups if not name.startswith(groups)))
+
+
+WIDE = Face(sex=0.5, width=0.6, eye_gap=0.8, nose_width=0.8, brow_ridge=0.8, mouth_width=0.5)
+NARROW = Face(sex=-0.6, width=-0.7, eye_size=-0.6, eye_gap=-0.6, length=0.5, lips=-0.4)
+TILTED = Face(sex=-0.8, eye_size=0.8, eye_tilt=0.9, cheekbones=0.8, nose_length=-0.6, forehead=0.7)
+
+
+def sockets() -> Head:
+    """A head of ICT-FaceKit's kind: lids with thickness, eyeballs, lashes as cards, brows, teeth, hair; centimetres."""
+    groups = {"balls": BALLS, "lashes": ("lash_",), "brows": ("brow_",), "teeth": ("teeth",), "tongue": ("tongue",)}
+    skin = second(WIDE, *APART)
+    head = joined(skin=finer(*skin), **{name: only(WIDE, *own) for name, own in groups.items()})
+    return shuffled(laid(head, 100.0, np.eye(3), (0, 165, 4)))
+
+
+def eye_holes() -> Head:
+    """A mask of BIWI's kind with holes for eyes whose lids stand wide open, and nothing behind them; millimetres."""
+    opened = {"eyeWideLeft": 1.0, "eyeWideRight": 1.0}
+    vertices, faces = second(NARROW, *APART, *INSIDE_LIDS, *INSIDE_MOUTH, "ear_", **opened)
+    kept = (vertices[:, 2] > 0.02) & (vertices[:, 1] > -0.1)
+    vertices, faces = cleaned(vertices, faces[kept[faces].all(axis=1)])
+    return shuffled(laid(Head(*finer(vertices, faces)), 1000.0, turned(-5, 3, 0), (12, -30, 55)))
+
+
+def painted_eyes() -> Head:
+    """Eyes that are shut for good: one skin with a crease where the lids meet."""
+    shut = {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0}
+    vertices, faces = second(TILTED, *APART, *INSIDE_LIDS, **shut)
+    loop, mesh = build_head().groups["eye_edge"], build_head()
+    rest = second_places(TILTED, **shut)
+    for ring in (loop, mesh.mirror[loop]):
+        own = np.array([np.linalg.norm(vertices - rest[v], axis=1).argmin() for v in ring])
+        half = len(own) // 2
+        for upper, lower in zip(own[1:half], own[:half:-1], strict=True):
+            faces = np.where(faces == upper, lower, faces)
+    return shuffled(laid(Head(*finer(*cleaned(vertices, faces))), 1.0, np.eye(3)))
+
+
+def second_places(face: Face, **pose: float) -> np.ndarray:
+    """All vertices of a person of the second edition in metres, posed."""
+    mesh, shapes = build_head(), head_shapes()
+    posed = mesh.vertices + sum((pose[name] * shapes[name] for name in pose), np.zeros_like(mesh.vertices))
+    return np.asarray(face(posed) / 1000.0)
+
+
+def uneven_eyes() -> Head:
+    """One eye half shut at rest, the face crooked and wider than high."""
+    vertices, faces = second(NARROW, *APART, eyeBlinkLeft=0.4)
+    head = joined(skin=(vertices, faces), balls=only(NARROW, *BALLS))
+    x, y, z = head.vertices.T
+    head.vertices = np.stack([1.12 * x + 0.02 * y, 0.95 * y + 0.03 * x, 1.05 * z], axis=1)
+    return shuffled(laid(head, 1000.0, turned(4, -7, 3), (30, 10, -80)))
+
+
+def large_eyes() -> Head:
+    """A stylised head: eyes half as large again as a person's, a small nose, z up."""
+    points = second(TILTED, *APART), only(TILTED, *BALLS)
+    made = []
+    for vertices, faces in points:
+        about = np.stack([np.sign(vertices[:, 0]) * 0.0335, np.full(len(vertices), 0.0245), vertices[:, 2]], axis=1)
+        away = np.linalg.norm((vertices - about)[:, :2], axis=1)
+        grown = 1.0 + 0.4 / (1.0 + (away / 0.022) ** 4) * np.clip(np.abs(vertices[:, 0]) / 0.012, 0, 1)
+        made.append((np.concatenate([(about + (vertices - about) * grown[:, None])[:, :2], vertices[:, 2:]], 1), faces))
+    head = joined(skin=finer(*made[0]), balls=made[1])
+    return shuffled(laid(head, 100.0, turned(90, 0, 0)))
+
+
+def few_triangles() -> Head:
+    """About 500 vertices for the skin, and two eyeballs."""
+    skin = coarser(*second(WIDE, *APART, "ear_", "nostril"), 0.8)
+    return shuffled(joined(skin=skin, balls=only(WIDE, *BALLS)))
+
+
+def dense() -> Head:
+    """About 25 000 vertices, decimated from four times as many, with eyeballs and lashes; metres."""
+    skin = coarser(*finer(*second(TILTED, *APART), 2), 0.6)
+    return shuffled(joined(skin=skin, balls=only(TILTED, *BALLS), lashes=only(TILTED, "lash_")))
+
+
+def dressed_avatar() -> Head:
+    """A figure with eyeballs, lashes, brows, teeth, hair, glasses with pads, a hat and earrings; centimetres."""
+    skin = second(NARROW, *APART)
+    groups = {"balls": BALLS, "lashes": ("lash_",), "brows": ("brow_",), "teeth": ("teeth",), "hair": ("hair",)}
+    parts = {name: only(NARROW, *own) for name, own in groups.items()}
+    middle = parts["balls"][0][parts["balls"][0][:, 0] > 0].mean(axis=0) * [1, 1, 0] + [0, 0, 0.088]
+    for side, sign in (("left", 1), ("right", -1)):
+        lens = trimesh.creation.torus(0.021, 0.0012, major_sections=24, minor_sections=6)
+        parts[f"lens_{side}"] = (np.array(lens.vertices) + middle * [sign, 1, 1], np.array(lens.faces))
+        bow = trimesh.creation.box((0.002, 0.004, 0.1)).subdivide()
+        parts[f"bow_{side}"] = (np.array(bow.vertices) + [sign * 0.078, middle[1], 0.04], np.array(bow.faces))
+        drop = trimesh.creation.icosphere(1, 0.004)
+        parts[f"earring_{side}"] = (np.array(drop.vertices) + [sign * 0.083, -0.036, -0.004], np.array(drop.faces))
+    bridge = trimesh.creation.box((0.022, 0.002, 0.002)).subdivide()
+    parts["bridge"] = (np.array(bridge.vertices) + [0, middle[1], 0.0885], np.array(bridge.faces))
+    hat = trimesh.creation.icosphere(2)
+    parts["hat"] = (np.array(hat.vertices) * [0.09, 0.03, 0.11] + [0, 0.125, 0.0], np.array(hat.faces))
+    torso = trimesh.creation.capsule(height=0.9, radius=0.16, count=[16, 16])
+    body = np.array(torso.vertices) @ turned(90, 0, 0).T * [1, 1, 0.7]
+    parts["body"] = (body - [0, body[:, 1].max() + 0.19, 0.02], np.array(torso.faces))
+    return laid(joined(skin=skin, **parts), 100.0, np.eye(3), (0, 150, 0))
+
+
 LOWER_MARKS = ("chin", "mouth_corner_left", "mouth_corner_right", "nose_base", "upper_lip_top", "lower_lip_bottom")
 """Landmarks that :func:`lower_face` shows."""
 
@@ -315,4 +439,12 @@ FAMILY: dict[str, Callable[[], Head]] = {
     "scan": scan,
     "whole avatar": whole_avatar,
     "sealed scan": lambda: scan(sealed=True),
+    "sockets and lashes": sockets,
+    "eye holes": eye_holes,
+    "painted eyes": painted_eyes,
+    "uneven eyes": uneven_eyes,
+    "large eyes": large_eyes,
+    "few triangles": few_triangles,
+    "dense head": dense,
+    "dressed avatar": dressed_avatar,
 }

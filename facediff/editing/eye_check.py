@@ -1,0 +1,253 @@
+"""Whether the eyes and the forehead of a carried animation can be used: do lids meet, pass, dive, tear or fold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.editing.correspondence import LIDS_AT_REST, Correspondence
+from facediff.editing.face_features import Features, Seen
+from facediff.editing.lids import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
+from facediff.editing.surface import Surface
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+BLINKS = 0.5  # An animation whose lids leave more than this share of the opening does not blink
+LEFT_OPEN = 0.2  # Share of an eye's opening that may still be seen at a full blink, beyond what the animation leaves
+PASSED = 0.3  # Share of the opening by which the upper lid may pass the lower one
+INSIDE, DEEP = 0.15, 0.04  # Share of a lid's vertices that may lie this share of the eye's width inside the eyeball
+UNEVEN = 0.25  # How much more of one eye's opening than of the other's may be left
+STRETCHED = 0.6  # Edges of the forehead may grow or shrink by this share more than the animation's
+FOLDED = 0.01  # Share of the forehead's moving triangles that may turn over
+PIXELS = 96  # across an eye's window
+FOREHEAD, BESIDE = 1.6, 0.5
+"""The forehead reaches so many widths of an eye up from the eyes, and begins so many away from the lids."""
+MOVES = 0.004  # What moves by less than this share of the eye's width is no part of it
+
+
+@dataclass(frozen=True)
+class EyeFigures:
+    """What was measured at the fullest blink; None where the animation does not blink, or lids stay at rest.
+
+    Attributes:
+        lid_gap: share of the opening that is still seen, of the worse eye; 0 is best.
+        overshoot: how far the upper lid passes the lower one, as a share of the opening.
+        inside: share of the lids' vertices that lie inside the eyeball.
+        uneven: difference between both eyes of the share that is still seen.
+        stretch: how much the forehead's edges grow or shrink in the worst frame, but for one of 200.
+        folded: share of the forehead's moving triangles that turn over.
+    """
+
+    lid_gap: float | None
+    overshoot: float | None
+    inside: float | None
+    uneven: float | None
+    stretch: float
+    folded: float
+
+
+def check_eyes(
+    animation: Animation, carried: Animation, correspondence: Correspondence, frames: npt.NDArray[np.integer]
+) -> tuple[EyeFigures | None, list[str], list[str]]:
+    """Measure the upper face of a carried animation.
+
+    Args:
+        animation: on the source mesh; with triangles.
+        carried: the same on the target mesh.
+        correspondence: the correspondence that carried it.
+        frames: numbers of the frames in which the forehead is looked at.
+
+    Returns:
+        the figures, None where the animation's face shows no eyes; what is wrong, a clause each; and remarks.
+    """
+    source, target = correspondence.features
+    if source is None or target is None:
+        return None, [], []
+    own = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
+    if own[0] is None or own[1] is None:
+        return None, [], []
+    faults, remarks = [], []
+    blink, left = fullest_blink(animation, [edges for edges in own if edges is not None])
+    posed = _laid(correspondence, carried.vertices[blink])
+    new = [lid_edges(correspondence.laid.vertices, target, eye) for eye in (0, 1)]
+    gaps: list[float] | None = None
+    passed: list[float] | None = None
+    inside: list[float] | None = None
+    if left > BLINKS:
+        pass
+    elif correspondence.lids == LIDS_AT_REST:
+        remarks.append("its lids stay at rest")
+    elif new[0] is None or new[1] is None:
+        names = ["right" if new[0] is None else "left"] if (new[0] is None) != (new[1] is None) else ["right", "left"]
+        remarks.append(f"no open {' and '.join(names)} eye was found on it, so that its lids stay at rest")
+    else:
+        whole = Surface(correspondence.laid.vertices, correspondence.target_faces)
+        face = Surface(correspondence.source_vertices, correspondence.source_faces)
+        original = np.asarray(animation.vertices[blink], np.float64)
+        gaps, passed, inside, expected = [], [], [], []
+        for eye in (0, 1):
+            gaps.append(_still_seen(whole, posed, target, eye))
+            expected.append(_still_seen(face, original, source, eye))
+            passed.append(_overshoot(new[eye], whole.vertices, posed))
+            inside.append(_inside_ball(whole, posed, target, eye))
+        worst = int(np.argmax(np.subtract(gaps, expected)))
+        if gaps[worst] > expected[worst] + LEFT_OPEN:
+            faults.append(
+                f"its {('right', 'left')[worst]} eye does not shut: {gaps[worst]:.0%} is left at a full blink"
+            )
+        if max(passed) > PASSED:
+            faults.append(f"its upper lids pass the lower ones by {max(passed):.0%} of the opening")
+        if max(inside) > INSIDE:
+            faults.append(f"its lids sink into the eyeballs: {max(inside):.0%} of their vertices")
+        if abs(gaps[0] - gaps[1]) > abs(expected[0] - expected[1]) + UNEVEN:
+            faults.append("one of its eyes shuts and the other does not")
+    stretch, folded = _forehead(carried, correspondence.laid, target, source, frames, correspondence)
+    own_stretch, own_folded = _forehead(
+        animation, Surface(correspondence.source_vertices, correspondence.source_faces), source, source, frames, None
+    )
+    if stretch > own_stretch + STRETCHED:
+        faults.append(f"its forehead is torn: edges grow or shrink by {stretch:.0%}")
+    if folded > own_folded + FOLDED:
+        faults.append(f"its forehead folds: {folded:.1%} of the moving triangles turn over")
+    figures = EyeFigures(
+        lid_gap=None if gaps is None else max(gaps),
+        overshoot=None if passed is None else max(passed),
+        inside=None if inside is None else max(inside),
+        uneven=None if gaps is None else abs(gaps[0] - gaps[1]),
+        stretch=stretch,
+        folded=folded,
+    )
+    return figures, faults, remarks
+
+
+def fullest_blink(animation: Animation, edges: list[LidEdges]) -> tuple[int, float]:
+    """The frame in which both eyes are shut furthest, and the share of the opening that is left there."""
+    left = np.zeros(len(animation.vertices))
+    for one in edges:
+        moved = one.displacements(animation.vertices, animation.template)
+        gap = (one.gaps[:, 1] + moved[:, 0, :, 1] - moved[:, 1, :, 1]).mean(axis=1) / one.height
+        left = np.maximum(left, gap)
+    frame = int(left.argmin())
+    return frame, float(left[frame])
+
+
+def raised_brows(animation: Animation, source: Features) -> int | None:
+    """The frame in which the skin above the eyes is raised most; None where the face shows no eyes."""
+    eyes = [eye for eye in source.eyes if eye is not None]
+    if not eyes:
+        return None
+    points = np.asarray(animation.template, np.float64)
+    above = np.zeros(len(points), bool)
+    for eye in eyes:
+        away = points - eye.centre
+        above |= (np.abs(away[:, 0]) < 0.6 * eye.width) & (away[:, 1] > 0.45 * eye.width) & (away[:, 1] < eye.width)
+    above &= source.skin
+    if not above.any():
+        return None
+    return int((animation.vertices[:, above, 1] - animation.template[above, 1]).mean(axis=1).argmax())
+
+
+def _laid(correspondence: Correspondence, vertices: npt.NDArray[np.floating]) -> Array:
+    return correspondence.similarity.inverse().apply(np.asarray(vertices, np.float64))
+
+
+def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> float:
+    """Share of an eye's opening, as seen from the front at rest, that shows no lid."""
+    opening = features.eyes[eye]
+    assert opening is not None  # noqa: S101 - for type checkers
+    ball = eyeball_triangles(rest, features, eye)
+    kept = np.union1d(ball, np.flatnonzero(features.skin[rest.faces[:, 0]]))
+    half = 0.7 * opening.width
+    low, step = opening.centre[:2] - half, 2 * half / PIXELS
+    x, y = np.meshgrid(low[0] + step * (np.arange(PIXELS) + 0.5), low[1] + step * (np.arange(PIXELS) + 0.5))
+    top, bottom = (np.interp(x, side[:, 0], side[:, 1], np.nan, np.nan) for side in (opening.upper, opening.lower))
+    # The edges of the lids themselves, which are seen at the border of the opening, are lids.
+    margin = 0.2 * (top - bottom)
+    inner = (y < top - margin) & (y > bottom + margin)
+    if not inner.any():
+        return 0.0
+    shown = [Seen(points, rest.faces).raster(kept, low, step, PIXELS, PIXELS)[0] for points in (rest.vertices, posed)]
+    inside = np.zeros(len(rest.faces) + 1, bool)
+    inside[ball] = True
+    inside[shown[0][inner]] = True  # the socket; and -1, nothing, is the last one
+    inside[-1] = True
+    # What faces away is the inside of a lid, or of the head, that is seen past a torn one.
+    inside[:-1] |= _face_normals(posed, rest.faces)[:, 2] < 0
+    return float(inside[shown[1][inner]].mean())
+
+
+def _overshoot(edges: LidEdges | None, rest: Array, posed: Array) -> float:
+    assert edges is not None  # noqa: S101 - for type checkers
+    moved = edges.displacements(posed[None], rest)[0]
+    gap = edges.gaps[:, 1] + moved[0, :, 1] - moved[1, :, 1]
+    return float(np.maximum(-gap, 0.0).mean() / edges.height)
+
+
+def _inside_ball(rest: Surface, posed: Array, features: Features, eye: int) -> float:
+    """Share of the vertices about the edges of the lids that go into the eyeball, and were not there at rest."""
+    opening = features.eyes[eye]
+    ball = eyeball_depth(rest, features, eye)
+    if ball is None or opening is None:
+        return 0.0
+    some = np.unique(np.concatenate([opening.upper_seeds, opening.lower_seeds]))
+    before, after = (points[some, 2] - ball.at(points[some]) for points in (rest.vertices, posed))
+    before = np.where(np.isfinite(before), before, 0.0)
+    dives = np.isfinite(after) & (after < np.minimum(before, 0.0) - DEEP * opening.width)
+    return float(dives.mean())
+
+
+def _forehead(
+    animation: Animation,
+    rest: Surface,
+    own: Features,
+    source: Features,
+    frames: npt.NDArray[np.integer],
+    correspondence: Correspondence | None,
+) -> tuple[float, float]:
+    """How much edges of the forehead grow or shrink, and the share of its moving triangles that turn over."""
+    eyes = [mine or theirs for mine, theirs in zip(own.eyes, source.eyes, strict=True)]
+    openings = [eye for eye in eyes if eye is not None]
+    width = float(np.mean([eye.width for eye in openings]))
+    level = float(np.mean([eye.centre[1] for eye in openings]))
+    points = rest.vertices
+    # Above the eyes, between and beside them; the lids are looked at by themselves.
+    inside = own.skin & (points[:, 1] > level - 0.2 * width) & (points[:, 1] < level + FOREHEAD * width)
+    middle = np.mean([eye.centre for eye in openings], axis=0)
+    inside &= (np.abs(points[:, 0] - middle[0]) < 2.5 * width) & (points[:, 2] > middle[2] - 1.2 * width)
+    for eye in openings:
+        edges = np.concatenate([eye.upper, eye.lower])
+        near = np.flatnonzero(inside)
+        away = np.linalg.norm(points[near][:, None] - edges[None, ::2], axis=2).min(axis=1)
+        inside[near[away < BESIDE * eye.width]] = False
+    faces = rest.faces[inside[rest.faces].all(axis=1)]
+    if not len(faces):
+        return 0.0, 0.0
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    long = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    # Edges that decimation left almost without length say nothing.
+    pairs = pairs[long > 0.2 * np.median(long)]
+    long = long[long > 0.2 * np.median(long)]
+    normals = _face_normals(points, faces)
+    stretch, turned, moving = 0.0, np.zeros(len(faces), bool), np.zeros(len(faces), bool)
+    for frame in frames:
+        posed = np.asarray(animation.vertices[frame], np.float64)
+        posed = posed if correspondence is None else _laid(correspondence, posed)
+        moves = np.linalg.norm(posed - points, axis=1) > MOVES * width
+        some = moves[pairs].any(axis=1)
+        if not some.any():
+            continue
+        now = np.linalg.norm(posed[pairs[some, 0]] - posed[pairs[some, 1]], axis=1)
+        change = np.abs(np.log(np.maximum(now, 1e-12) / long[some]))
+        stretch = max(stretch, float(np.expm1(np.quantile(change, 0.995))))
+        turned |= (_face_normals(posed, faces) * normals).sum(axis=1) < 0
+        moving |= moves[faces].any(axis=1)
+    return stretch, float((turned & moving).sum() / max(int(moving.sum()), 1))
+
+
+def _face_normals(points: Array, faces: Indices) -> Array:
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.asarray(np.cross(b - a, c - a))
