@@ -14,7 +14,8 @@ from facediff.editing.bounded import Problem, minimise, minimise_sparse
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.mesh import triangle_areas
-from facediff.spaces.arkit import ARKIT, ROTATIONS, absent_from, beyond_arkit, live_link_name, mirror_pairs
+from facediff.spaces.arkit import ARKIT, ROTATIONS, absent_from, beyond_arkit, mirror_pairs
+from facediff.spaces.files.tables import live_link_header, timecode
 from facediff.spaces.rigs import LinearRig
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
@@ -410,7 +411,6 @@ def _residuals(animation: Animation, moving: Moving, values: Array) -> tuple[Arr
 # Weights as CSV, with a JSON file next to the table for what a table cannot say.
 
 FORMAT = "facediff blendshape weights 1"
-DAY = 24 * 3600
 HEAD_COLUMNS = (
     "head in shares of 180 degrees: yaw and roll to its own left and pitch upwards are positive; the eyes were not "
     "solved for, their columns are 0 and say nothing"
@@ -439,7 +439,6 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
             f"{path}: none of the shapes ({', '.join(weights.names[:3])} …) has a name of ARKit's, which are this "
             f"table's columns; rename them, or write a table of their own names with {{plain}}"
         )
-    header = ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
     held = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
     shown, rotations = (
@@ -460,7 +459,7 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
         "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
         "rows_held": len(held) - len(times),
     }
-    _write_both(path, header, rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
+    _write_both(path, live_link_header(), rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
 
 
 def live_link_rotations(weights: Weights) -> Array:
@@ -495,17 +494,6 @@ def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> N
         for frame, values in enumerate(weights.values)
     )
     _write_both(path, header, rows, _about(weights, in_table=weights.names, more={}, key_tolerance=key_tolerance))
-
-
-def timecode(seconds: float) -> str:
-    """HH:MM:SS:FF.fff of a time, from midnight on, with FF.fff in sixtieths of a second.
-
-    Unreal Engine's importer of such tables divides the frames by 60 (its later versions by 30 where no frame number
-    exceeds 30), whatever rate was recorded, and reads the fraction; sixtieths therefore put each frame at its time.
-    """
-    thousandths = round(seconds * 60_000) % (DAY * 60_000)
-    whole, fraction = divmod(thousandths, 60_000)
-    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
 
 
 def _about(

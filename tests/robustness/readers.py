@@ -319,6 +319,27 @@ def read_targets(path: Path) -> object:
     return read_shape_files(path)
 
 
+def recorded(layout: str) -> Callable[[Path], None]:
+    """A writer of a recording in parameters, in a layout."""
+
+    def write(path: Path) -> None:
+        from facediff.spaces.files import ParameterClip, write_parameters
+        from facediff.spaces.layouts import LAYOUTS
+
+        space = LAYOUTS[layout].space
+        values = np.random.default_rng(0).random((4, len(space.channels))).astype(np.float32)
+        write_parameters(path, ParameterClip("take", values, space, 30.0, layout=layout), layout=layout)
+
+    return write
+
+
+def read_recorded(path: Path) -> object:
+    from facediff.spaces.files import read_parameters
+
+    arrays = path.suffix in (".npy", ".npz")
+    return read_parameters(path, layout="flame_diffposetalk" if arrays else None)
+
+
 def read_parts(path: Path) -> object:
     from facediff.mesh.parts import mesh_parts
 
@@ -936,6 +957,11 @@ READERS = {
     **{suffix: Reader(f".{suffix}", mesh, read_a_mesh) for suffix in ("obj", "ply", "stl", "off", "glb")},
     "shapes, a folder": Reader(".obj", mesh, shape_folder),
     "shapes, glb": Reader(".glb", targets, read_targets),
+    "parameters, Live Link Face": Reader(".csv", recorded("live_link"), read_recorded),
+    "parameters, Audio2Face": Reader(".csv", recorded("audio2face"), read_recorded),
+    "parameters, BEAT": Reader(".json", recorded("arkit"), read_recorded),
+    "parameters, npy": Reader(".npy", recorded("flame_diffposetalk"), read_recorded),
+    "parameters, npz": Reader(".npz", recorded("flame_diffposetalk"), read_recorded),
     "parts of a mesh, obj": Reader(".obj", mesh, read_parts),
     "mesh that an animation is added to, glb": Reader(".glb", targets, add_motion),
     "eyes": Reader(".json", eyes, read_the_eyes),

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.editing.blendshapes import Weights, timecode, write_live_link, write_weights
+from facediff.editing.blendshapes import Weights, write_live_link, write_weights
 from facediff.errors import FaceDiffError
+from facediff.spaces.files.tables import timecode
 
 
 @pytest.fixture

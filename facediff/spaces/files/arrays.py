@@ -1,0 +1,208 @@
+"""NumPy's files of FLAME coefficients and ARKit weights, whose layout must be declared (.npy, .npz).
+
+An array does not say what its columns are, and several layouts share a width: DualTalk's predictions and its own ground
+truth have jaw and head in opposite order. So no layout is taken from a shape alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.files.clips import ParameterClip, checked
+from facediff.spaces.layouts import LAYOUTS, Layout, find_layout, layouts_of_width
+from facediff.utils.arrays import open_array, read_arrays
+from facediff.utils.files import atomic
+from facediff.utils.limits import FRAME_RATES, check_number
+
+RATES = ("mocap_frame_rate", "fps", "frame_rate")
+"""Arrays of an archive that state the frames a second."""
+
+
+def read_array(path: Path, layout: str | None, frame_rate: float | None = None) -> ParameterClip:
+    """Read a ``.npy`` (T, width) or (1, T, width), or a ``.npz`` with the arrays of a layout.
+
+    Args:
+        path: the file.
+        layout: name of its layout.
+        frame_rate: frames a second, for layouts and files that do not state it, and against those that do.
+
+    Raises:
+        FaceDiffError: without a layout, naming those that fit; or if the file does not have what the layout says.
+    """
+    if path.suffix.lower() == ".npz":
+        return _read_archive(path, layout, frame_rate)
+    array = open_array(path, kinds="fiu")
+    if array.ndim == 3 and array.shape[0] == 1:
+        array = array[0]
+    if array.ndim != 2:
+        raise FaceDiffError(f"{path}: has shape {array.shape}; expected (frames, channels)")
+    fitting = layouts_of_width(array.shape[1])
+    if layout is None or layout not in fitting:
+        if layout is not None:
+            entry = find_layout(layout)
+        stated = "has no declared layout" if layout is None else f"is declared as {layout} of {entry.width} columns"
+        advice = f"layouts of this width: {', '.join(fitting)}" if fitting else "no layout has so many columns"
+        raise FaceDiffError(f"{path}: has {array.shape[1]} columns and {stated}; give its layout; {advice}")
+    entry = LAYOUTS[layout]
+    rate = _rate(path, frame_rate, entry)
+    numbers = np.asarray(array, np.float64)
+    values = checked(path, numbers[:, entry.identity :], rate)
+    person = None
+    if entry.identity:
+        person = checked(path, numbers[:1, : entry.identity], rate)[0]
+        if (numbers[:, : entry.identity].astype(np.float32) != person).any():
+            raise FaceDiffError(
+                f"{path}: its {entry.space.identity} changes from frame to frame; expected one person's"
+            )
+    return _clip(path, values, entry, rate, layout, person)
+
+
+def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> ParameterClip:
+    names = {key for entry in LAYOUTS.values() if entry.arrays for key in (*entry.arrays, entry.identity_array)}
+    content = read_arrays(path, {*names, *RATES})
+    fitting = [name for name, entry in LAYOUTS.items() if entry.arrays and set(entry.arrays) <= set(content)]
+    if layout is None or layout not in fitting:
+        stated = "has no declared layout" if layout is None else f"has not the arrays of {layout}"
+        if layout is not None:
+            find_layout(layout)
+        advice = f"layouts with its arrays: {', '.join(fitting)}" if fitting else "expected exp and pose, or the like"
+        raise FaceDiffError(f"{path}: {stated}; give its layout; {advice}")
+    entry = LAYOUTS[layout]
+    stated_rate = next((content[key] for key in RATES if key in content and content[key].size == 1), None)
+    rate = _rate(path, frame_rate, entry, None if stated_rate is None else float(stated_rate.reshape(-1)[0]))
+    parts = []
+    for key, columns in (entry.arrays or {}).items():
+        array = _frames(path, key, content[key])
+        if array.shape[1] < columns.stop:
+            raise FaceDiffError(
+                f"{path}: {key} has {array.shape[1]} columns; expected at least {columns.stop} in {layout}: was it "
+                f"written with fewer coefficients?"
+            )
+        # Exact for what belongs to the layout alone; SMPL-X's poses have the body's joints around the jaw.
+        if columns.start == 0 and array.shape[1] != columns.stop:
+            raise FaceDiffError(
+                f"{path}: {key} has {array.shape[1]} columns; expected {columns.stop} in {layout}; cut the leading "
+                f"coefficients with facediff.spaces.operations.truncated"
+            )
+        parts.append(array[:, columns])
+    lengths = {len(part) for part in parts}
+    if len(lengths) > 1:
+        raise FaceDiffError(f"{path}: its arrays have {sorted(lengths)} frames; expected equally many")
+    person = None
+    if entry.identity_array in content:
+        shape = np.asarray(content[entry.identity_array], np.float64)
+        person = checked(path, (shape if shape.ndim == 2 else shape.reshape(1, -1))[:1], rate)[0]
+    return _clip(path, checked(path, np.concatenate(parts, axis=1), rate), entry, rate, layout, person)
+
+
+def _frames(path: Path, key: str, array: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or (array.ndim == 3 and len(array) != 1):
+        raise FaceDiffError(f"{path}: {key} holds {array.dtype} {array.shape}; expected numbers (frames, channels)")
+    return np.asarray(array[0] if array.ndim == 3 else array, np.float64)
+
+
+def _rate(path: Path, given_rate: float | None, entry: Layout, stated: float | None = None) -> float:
+    rate = given_rate or stated or entry.frame_rate
+    if rate is None:
+        raise FaceDiffError(f"{path}: its layout has no rate of its own; give the frame rate of the video")
+    return check_number(path, "frame rate", rate, *FRAME_RATES)
+
+
+def _clip(
+    path: Path,
+    values: npt.NDArray[np.float32],
+    entry: Layout,
+    rate: float,
+    layout: str,
+    person: npt.NDArray[np.float32] | None,
+) -> ParameterClip:
+    return ParameterClip(path.stem, values, entry.space, rate, None, 0.0, person, layout, _remarks(values, entry))
+
+
+def _remarks(values: npt.NDArray[np.float32], entry: Layout) -> tuple[str, ...]:
+    """The community's mix-ups, with the evidence for them; nothing is changed."""
+    notes = []
+    space = entry.space
+    families = [index for index, name in enumerate(space.channels) if name.startswith("expression_")]
+    beyond = [index for index in families if int(space.channels[index].rpartition("_")[2]) >= 50]
+    if beyond and not np.any(values[:, beyond]) and np.any(values[:, families]):
+        notes.append(
+            f"expressions 50 to {len(families) - 1} are 0 in all frames: the fit probably had 50 coefficients of the "
+            f"{len(families)} that the layout has"
+        )
+    turns = {turn.joint: turn for turn in space.rotations if turn.form == "axis_angle"}
+    if {"head", "jaw"} <= set(turns):
+        head, jaw = (values[:, list(turns[joint].channels)] for joint in ("head", "jaw"))
+        # A jaw opens about x, in one direction, and hardly turns about y and z; a head turns about all three.
+        if _jaw_like(head) and not _jaw_like(jaw):
+            notes.append(
+                f"head and jaw may be exchanged: the channels called head turn about x alone, from "
+                f"{head[:, 0].min():.2f} to {head[:, 0].max():.2f} rad, and those called jaw by "
+                f"{jaw[:, 1].std():.3f} and {jaw[:, 2].std():.3f} rad about y and z; compare the layouts "
+                f"{', '.join(layouts_of_width(entry.width))}"
+            )
+    return tuple(notes)
+
+
+ONE_AXIS = 0.2
+"""A jaw's turns about y and z are less than this share of those about x."""
+BACKWARDS = -0.05
+"""Radians that a jaw closes beyond its rest."""
+
+
+def _jaw_like(turns: npt.NDArray[np.float32]) -> bool:
+    about_x = float(turns[:, 0].std())
+    return (
+        about_x > 0 and float(turns[:, 1:].std(0).max()) < ONE_AXIS * about_x and float(turns[:, 0].min()) > BACKWARDS
+    )
+
+
+def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
+    """Write a clip in a layout; the inverse of :func:`read_array`.
+
+    Args:
+        path: the ``.npy`` or ``.npz`` file.
+        clip: with the layout's channels in its order.
+        layout: name of the layout; the clip's own if empty.
+
+    Raises:
+        FaceDiffError: if the clip is not in the layout, or lacks the person that the layout has.
+    """
+    name = layout or clip.layout
+    entry = find_layout(name, str(path))
+    if clip.space.channels != entry.space.channels:
+        raise FaceDiffError(f"{path}: the clip has not the channels of {name}; change its order or rotations first")
+    person = np.zeros(entry.identity, np.float32) if clip.identity is None else clip.identity
+    if path.suffix.lower() == ".npz":
+        if entry.arrays is None:
+            raise FaceDiffError(f"{path}: {name} has no archive; expected .npy")
+        content = dict(_archive(clip, entry))
+        if entry.identity_array and clip.identity is not None:
+            content[entry.identity_array] = clip.identity
+        with atomic(path) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **content)
+        return
+    if len(person) != entry.identity:
+        raise FaceDiffError(f"{path}: the clip's person has {len(person)} coefficients; {name} has {entry.identity}")
+    leading = np.broadcast_to(person, (len(clip.values), entry.identity))
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        np.save(stream, np.concatenate([leading, clip.values], axis=1), allow_pickle=False)
+
+
+def _archive(clip: ParameterClip, entry: Layout) -> Mapping[str, npt.NDArray[np.floating]]:
+    content: dict[str, npt.NDArray[np.floating]] = {"fps": np.array(clip.frame_rate)}
+    first = 0
+    for key, columns in (entry.arrays or {}).items():
+        width = columns.stop - columns.start
+        # Of SMPL-X's 55 joints only the jaw is known; the body is at rest.
+        array = np.zeros((len(clip.values), 165 if columns.start else columns.stop), np.float32)
+        array[:, columns] = clip.values[:, first : first + width]
+        content[key] = array
+        first += width
+    return content

@@ -1,0 +1,117 @@
+"""BEAT's facial motion (.json), and the like that LAM exports."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.arkit import ARKIT
+from facediff.spaces.files.clips import ParameterClip, checked
+from facediff.spaces.files.tables import rate_of
+from facediff.spaces.layouts import LAYOUTS, layout
+from facediff.spaces.space import Space
+from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
+from facediff.utils.plain_files import load_json, write_json
+
+REMEDY = "expected names and frames with weights, as BEAT and LAM write them"
+
+
+def read_beat(path: Path) -> ParameterClip:
+    """Read BEAT's json: ``names``, and ``frames`` with ``weights`` and ``time``; LAM adds ``metadata``.
+
+    BEAT's first frame has the time 1/60, which is kept as the clip's start. Without times, the rate is that of the
+    metadata.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FaceDiffError: if it is anything else.
+    """
+    content = load_json(path, remedy=REMEDY)
+    names = content.get("names") if isinstance(content, dict) else None
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(names, list) or not isinstance(frames, list) or not all(isinstance(name, str) for name in names):
+        raise FaceDiffError(f"{path}: has no names and frames; {REMEDY}")
+    LIMITS.check("frames", len(frames), path)
+    space = _space(path, names)
+    values = np.empty((len(frames), len(names)))
+    for number, frame in enumerate(frames):
+        weights = frame.get("weights") if isinstance(frame, dict) else None
+        if not isinstance(weights, list) or len(weights) != len(names):
+            raise FaceDiffError(f"{path}: frame {number} has not the {len(names)} weights of its names; {REMEDY}")
+        if not all(isinstance(weight, int | float) and not isinstance(weight, bool) for weight in weights):
+            raise FaceDiffError(f"{path}: frame {number} has a weight that is no number; {REMEDY}")
+        values[number] = weights
+    metadata = content.get("metadata")
+    stated = metadata.get("fps") if isinstance(metadata, dict) else None
+    if stated is not None:
+        rate = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
+    times = _times(path, frames)
+    if times is None or len(times) < 2:
+        if stated is None:
+            raise FaceDiffError(f"{path}: has neither times nor metadata.fps; {REMEDY}")
+    elif stated is None:
+        rate = rate_of(times)
+    start = 0.0 if times is None or not len(times) else float(times[0])
+    after = None if times is None else times - start
+    if after is not None and np.abs(after - np.arange(len(after)) / rate).max(initial=0.0) < 0.25 / rate:
+        after = None  # evenly spaced: nothing was dropped
+    clip = ParameterClip(path.stem, checked(path, values, rate), space, rate, after, start)
+    order = next((name for name, entry in LAYOUTS.items() if entry.space.channels == space.channels), "")
+    return replace(clip, layout=order)
+
+
+def _space(path: Path, names: list[str]) -> Space:
+    """ARKit's space with the file's own names in its own order."""
+    orders = [entry.space for entry in LAYOUTS.values() if entry.space.channels == tuple(names)]
+    if orders:
+        return orders[0]
+    folded = [name.casefold() for name in names]
+    beyond = [name for name in names if name.casefold() not in {arkit.casefold() for arkit in ARKIT}]
+    if beyond or len(set(folded)) < len(folded) or not names:
+        raise FaceDiffError(f"{path}: has the names {quoted(beyond or names)}; expected ARKit's, each once")
+    absent = tuple(name for name in ARKIT if name.casefold() not in folded)
+    return replace(layout("arkit"), channels=tuple(names), absent=absent)
+
+
+def _times(path: Path, frames: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+    stated = [frame.get("time") for frame in frames]
+    if any(time is None for time in stated):
+        return None
+    times = np.array([check_number(path, "time", time, 0, LIMITS.seconds, remedy=REMEDY) for time in stated])
+    if (np.diff(times) <= 0).any():
+        row = int(np.argmax(np.diff(times) <= 0)) + 1
+        raise FaceDiffError(f"{path}: frame {row} is no later than the one before it; write it again")
+    return times
+
+
+def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> None:
+    """Write a clip as BEAT does.
+
+    Args:
+        path: the file.
+        clip: in a space of ARKit's, whose order is kept.
+        metadata: add frame rate and number of frames, as LAM does.
+
+    Raises:
+        FaceDiffError: if the clip is in another space.
+    """
+    if clip.space.kind != "arkit":
+        raise FaceDiffError(f"{path}: the clip is in a space of {clip.space.kind}; expected ARKit's weights")
+    turning = {*clip.space.head, *clip.space.eyes}
+    shapes = [index for index, name in enumerate(clip.space.channels) if index not in turning]
+    times = np.arange(len(clip.values)) / clip.frame_rate if clip.times is None else clip.times
+    frames = [
+        # Text and back keeps the shortest decimal of each float32 instead of the digits of its float64.
+        {"weights": [float(str(weight)) for weight in row[shapes]], "time": clip.start + float(time), "rotation": []}
+        for row, time in zip(clip.values, times, strict=True)
+    ]
+    content: dict[str, Any] = {"names": [clip.space.channels[index] for index in shapes], "frames": frames}
+    if metadata:
+        content = {"metadata": {"fps": clip.frame_rate, "frame_count": len(frames)}, **content}
+    write_json(path, content)

@@ -1,0 +1,108 @@
+"""One recording in parameters, as a file holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.operations import at_times
+from facediff.spaces.space import Space
+from facediff.utils.limits import FRAME_RATES, LIMITS, check_number
+
+Values = npt.NDArray[np.float32]
+Array = npt.NDArray[np.float64]
+
+LARGEST = 1e6
+"""Largest absolute value of a channel; weights, radians and coefficients in standard deviations are far below."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterClip:
+    """Values of a recording and what they mean.
+
+    Attributes:
+        name: of the recording.
+        values: (T, C) as the file has them: weights above 1 and below 0 are kept.
+        space: their space.
+        frame_rate: frames a second.
+        times: (T,) seconds from the first row on, for files that state them; None where rows follow evenly.
+        start: seconds since midnight of the first row, by its timecode.
+        identity: (S,) the person's coefficients, where the file has them.
+        layout: name of the layout that the file is in.
+        notes: what readers found that users should know, a sentence each.
+    """
+
+    name: str
+    values: Values
+    space: Space
+    frame_rate: float
+    times: Array | None = None
+    start: float = 0.0
+    identity: Values | None = None
+    layout: str = ""
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def dropped(self) -> int:
+        """Rows that are missing between others, by their times."""
+        if self.times is None or len(self.times) < 2:
+            return 0
+        return int(np.maximum(np.rint(np.diff(self.times) * self.frame_rate) - 1, 0).sum())
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first row to the end of the last one."""
+        last = (len(self.values) - 1) / self.frame_rate if self.times is None else float(self.times[-1])
+        return last + 1 / self.frame_rate
+
+
+def even(clip: ParameterClip) -> ParameterClip:
+    """The clip with a row at every multiple of its frame's length: what was dropped is interpolated."""
+    if clip.times is None:
+        return clip
+    count = round(float(clip.times[-1]) * clip.frame_rate) + 1
+    LIMITS.check("frames", count, clip.name)
+    values = at_times(clip.values, clip.space, clip.times, np.arange(count) / clip.frame_rate)
+    return replace(clip, values=values.astype(np.float32), times=None)
+
+
+def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> Values:
+    """Values of a file (T, C) as float32, within the budget and finite.
+
+    Raises:
+        FaceDiffError: naming the file, if they are not.
+    """
+    check_number(path, "frame rate", frame_rate, *FRAME_RATES)
+    LIMITS.check("frames", len(values), path)
+    if not len(values):
+        raise FaceDiffError(f"{path}: holds no frames; record it again")
+    if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > LARGEST:
+        row = int(np.argmin((np.abs(values) <= LARGEST).all(axis=1)))
+        raise FaceDiffError(f"{path}: frame {row} holds NaN or a number beyond {LARGEST:g}; write it again")
+    return np.ascontiguousarray(values, np.float32)
+
+
+def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
+    """Where each channel of a space stands in a header, whatever its case.
+
+    Raises:
+        FaceDiffError: naming a channel that is missing.
+    """
+    folded = [name.strip().casefold() for name in header]
+    lacking = [name for name in space.channels if name.casefold() not in folded]
+    if lacking:
+        raise FaceDiffError(
+            f"{path}: has no column {', '.join(lacking[:3])}{' …' if len(lacking) > 3 else ''}; expected those of "
+            f"{len(space.channels)} channels"
+        )
+    return [folded.index(name.casefold()) for name in space.channels]
+
+
+def shortest(value: np.float32) -> str:
+    """The shortest decimal that is read as the same float32."""
+    return np.format_float_positional(value, unique=True, trim="0")

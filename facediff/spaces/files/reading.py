@@ -1,0 +1,65 @@
+"""Any file of motion in parameters, by its suffix and what it says of itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.files.arrays import read_array, write_array
+from facediff.spaces.files.beat import read_beat, write_beat
+from facediff.spaces.files.clips import ParameterClip
+from facediff.spaces.files.tables import (
+    COUNT,
+    REMEDY,
+    read_audio2face,
+    read_live_link,
+    write_audio2face,
+    write_live_link,
+)
+from facediff.utils.plain_files import read_table
+
+SUFFIXES = (".csv", ".json", ".npy", ".npz")
+
+
+def read_parameters(path: Path, *, layout: str | None = None, frame_rate: float | None = None) -> ParameterClip:
+    """Read a recording in parameters.
+
+    Args:
+        path: a ``.csv`` of Live Link Face or Audio2Face, a ``.json`` of BEAT or LAM, a ``.npy`` or ``.npz``.
+        layout: name of the layout of a ``.npy`` or ``.npz``, which does not say it; the other files name their columns.
+        frame_rate: frames a second of an array whose layout has no rate of its own.
+
+    Raises:
+        FaceDiffError: if it is none of these, or something in it is wrong.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(SUFFIXES)}')
+    if suffix in (".npy", ".npz"):
+        return read_array(path, layout, frame_rate)
+    if layout is not None:
+        raise FaceDiffError(f"{path}: names its columns itself; omit the layout {layout}")
+    if suffix == ".json":
+        return read_beat(path)
+    header = next(read_table(path, remedy=REMEDY), [])
+    is_live_link = any(name.strip().casefold() == COUNT for name in header)
+    return read_live_link(path) if is_live_link else read_audio2face(path)
+
+
+def write_parameters(path: Path, clip: ParameterClip, *, layout: str = "") -> None:
+    """Write a recording in parameters; it appears whole or not at all.
+
+    Args:
+        path: the suffix chooses the format: ``.csv``, ``.json`` (BEAT's), ``.npy`` or ``.npz``.
+        clip: the recording.
+        layout: of a ``.npy`` or ``.npz``, the clip's own if empty; ``audio2face`` for that table.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        (write_audio2face if layout == "audio2face" else write_live_link)(path, clip)
+    elif suffix == ".json":
+        write_beat(path, clip)
+    elif suffix in (".npy", ".npz"):
+        write_array(path, clip, layout)
+    else:
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(SUFFIXES)}')

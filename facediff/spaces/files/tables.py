@@ -1,0 +1,224 @@
+"""Tables: recordings of Live Link Face, and the weights that Audio2Face writes (.csv)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
+from facediff.spaces.files.clips import Array, ParameterClip, checked, columns_of, shortest
+from facediff.spaces.layouts import layout
+from facediff.spaces.operations import permuted
+from facediff.utils.files import atomic
+from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.plain_files import read_table, write_table
+
+DAY = 24 * 3600
+COUNT = "blendshapecount"
+REMEDY = "expected a table as Live Link Face or Audio2Face writes it"
+SIXTIETHS = 60
+"""Parts of a second that the last field of a timecode counts, whatever rate was recorded."""
+USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
+NEAR_RATE = 0.01
+"""Share by which the rate of a table's rows may differ from a usual one and still be it."""
+_TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,2}(?:\.\d{1,9})?)")
+
+
+def live_link_header() -> list[str]:
+    """The columns of a recording: timecode, number of values, ARKit's 52 names, rotations of head and eyes."""
+    return ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
+
+
+def timecode(seconds: float) -> str:
+    """HH:MM:SS:FF.fff of a time, from midnight on, with FF.fff in sixtieths of a second.
+
+    Unreal Engine's importer of such tables divides the frames by 60 (its later versions by 30 where no frame number
+    exceeds 30), whatever rate was recorded, and reads the fraction; sixtieths therefore put each frame at its time.
+    """
+    thousandths = round(seconds * 60_000) % (DAY * 60_000)
+    whole, fraction = divmod(thousandths, 60_000)
+    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
+
+
+def seconds_of(text: str) -> float | None:
+    """Seconds since midnight of a timecode, the inverse of :func:`timecode`; None for anything else.
+
+    Example:
+        >>> seconds_of("00:00:01:30.000"), seconds_of("1:30")
+        (1.5, None)
+    """
+    match = _TIMECODE.fullmatch(text.strip())
+    if match is None:
+        return None
+    hours, minutes, seconds = (int(part) for part in match.groups()[:3])
+    parts = float(match[4])
+    if hours > 23 or minutes > 59 or seconds > 59 or parts >= SIXTIETHS:
+        return None
+    return hours * 3600 + minutes * 60 + seconds + parts / SIXTIETHS
+
+
+def rate_of(times: Array) -> float:
+    """Rows a second by the median step between times (T,): a usual rate where it is near one, else as measured.
+
+    The number of rows says nothing, since the app drops some.
+    """
+    measured = 1.0 / float(np.median(np.diff(times)))
+    nearest = min(USUAL_RATES, key=lambda rate: abs(rate - measured))
+    return nearest if abs(measured / nearest - 1) < NEAR_RATE else round(measured, 3)
+
+
+def read_live_link(path: Path) -> ParameterClip:
+    """Read a recording of Live Link Face.
+
+    Columns are matched by name, whatever their case; a recording without rotations of head and eyes has them declared
+    as absent. Rotations are radians. The rate comes from the timecode; where its steps are longer, rows were dropped,
+    which :func:`~facediff.spaces.files.clips.even` interpolates.
+
+    Args:
+        path: the table.
+
+    Raises:
+        FaceDiffError: if it is no such table, or a row's time or number cannot be read.
+    """
+    rows = read_table(path, remedy=REMEDY)
+    header = next(rows, [])
+    folded = [name.strip().casefold() for name in header]
+    if "timecode" not in folded or COUNT not in folded:
+        raise FaceDiffError(f"{path}: has no columns Timecode and BlendShapeCount; {REMEDY}")
+    space = layout("live_link")
+    missing = [name for name in space.channels if name.casefold() not in folded]
+    # Rotations are the one part that the app can leave out, and tongueOut came with a later version.
+    if missing and set(missing) <= {*ROTATIONS, "tongueOut"}:
+        folded, header = [*folded, *(name.casefold() for name in missing)], [*header, *missing]
+    columns = columns_of(path, header, space)
+    at_time = folded.index("timecode")
+    times, values = [], []
+    for number, row in enumerate(rows, start=2):
+        LIMITS.check("frames", number, path)
+        if not any(cell.strip() for cell in row[2:]):
+            continue  # a frame in which the phone saw no face: its row has a timecode and nothing else
+        seconds = seconds_of(row[at_time]) if len(row) > at_time else None
+        if seconds is None:
+            raise FaceDiffError(
+                f"{path}: row {number} has the timecode {quoted(row[at_time] if len(row) > at_time else '')}; expected "
+                f"hours:minutes:seconds:sixtieths"
+            )
+        times.append(seconds)
+        values.append(_numbers(path, number, [*row, *("0" for _ in missing)], columns, len(header)))
+    return _timed(path, np.array(times), np.array(values), missing)
+
+
+def _timed(path: Path, clock: Array, values: Array, missing: list[str]) -> ParameterClip:
+    if len(clock) < 2:
+        raise FaceDiffError(f"{path}: holds {len(clock)} rows; expected two at least, for their rate; record it again")
+    # Past midnight the clock begins again.
+    clock = clock + DAY * np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY / 2)
+    steps = np.diff(clock)
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0)) + 3
+        raise FaceDiffError(f"{path}: row {row} is no later than the one before it; sort the rows by their timecode")
+    rate = rate_of(clock)
+    space = layout("live_link")
+    space = replace(space, absent=(*space.absent, *missing))
+    clip = ParameterClip(
+        path.stem, checked(path, values, rate), space, rate, clock - clock[0], float(clock[0]), layout="live_link"
+    )
+    notes = [f"{clip.dropped} rows were dropped in the recording"] if clip.dropped else []
+    return replace(clip, notes=tuple(notes))
+
+
+def write_live_link(path: Path, clip: ParameterClip) -> None:
+    """Write a recording as Live Link Face does; it appears whole or not at all.
+
+    Args:
+        path: the table.
+        clip: in a space of ARKit's; channels that it lacks or declares as absent are 0.
+
+    Raises:
+        FaceDiffError: if the clip is in another space.
+    """
+    values = permuted(clip.values, clip.space, layout("live_link"))[0]
+    times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
+    count = str(len(ARKIT) + len(ROTATIONS))
+    rows = (
+        [timecode(clip.start + float(seconds)), count, *map(shortest, row)]
+        for seconds, row in zip(times, values, strict=True)
+    )
+    with atomic(path) as temporary:
+        write_table(temporary, [live_link_header(), *rows])
+
+
+PREFIX = "blendShapes."
+
+
+def read_audio2face(path: Path) -> ParameterClip:
+    """Read the weights that Audio2Face's service writes: ``timeCode`` in seconds and ``blendShapes.<name>``.
+
+    Args:
+        path: the table.
+
+    Raises:
+        FaceDiffError: if it is no such table, or a number cannot be read.
+    """
+    rows = read_table(path, remedy=REMEDY)
+    header = next(rows, [])
+    folded = [name.strip().casefold() for name in header]
+    shapes = [name.strip()[len(PREFIX) :] for name in header if name.strip().casefold().startswith(PREFIX.casefold())]
+    if "timecode" not in folded or not shapes:
+        raise FaceDiffError(f"{path}: has no columns timeCode and {PREFIX}jawOpen …; {REMEDY}")
+    space = layout("audio2face")
+    short = [name.strip()[len(PREFIX) :] if name.strip()[len(PREFIX) :] in shapes else "" for name in header]
+    absent = [name for name in space.channels if name.casefold() not in {one.casefold() for one in shapes}]
+    columns = columns_of(path, [*short, *absent], space)
+    wide = len(header) + len(absent)
+    at_time = folded.index("timecode")
+    values = []
+    times = []
+    for number, row in enumerate(islice(rows, int(LIMITS.frames)), start=2):
+        full = [*row, *("0" for _ in absent)]
+        times.append(_numbers(path, number, full, [at_time], wide)[0])
+        values.append(_numbers(path, number, full, columns, wide))
+    clock = np.array(times)
+    if len(clock) < 2 or (np.diff(clock) <= 0).any():
+        raise FaceDiffError(f"{path}: its times do not ascend, or there is one row only; write it again")
+    rate = rate_of(clock)
+    known = replace(space, absent=tuple(absent))
+    return ParameterClip(
+        path.stem,
+        checked(path, np.array(values), rate),
+        known,
+        rate,
+        clock - clock[0],
+        float(clock[0]),
+        None,
+        "audio2face",
+    )
+
+
+def write_audio2face(path: Path, clip: ParameterClip) -> None:
+    """Write weights as Audio2Face's service does; the arguments are those of :func:`write_live_link`."""
+    values, space = permuted(clip.values, clip.space, layout("audio2face"))
+    kept = [index for index, name in enumerate(space.channels) if name not in space.absent]
+    times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
+    header = ["timeCode", *(f"{PREFIX}{space.channels[index]}" for index in kept)]
+    rows = (
+        [repr(round(clip.start + float(seconds), 9)), *map(shortest, row[kept])]
+        for seconds, row in zip(times, values, strict=True)
+    )
+    with atomic(path) as temporary:
+        write_table(temporary, [header, *rows])
+
+
+def _numbers(path: Path, number: int, row: list[str], columns: list[int], width: int) -> list[float]:
+    """Cells of a row as numbers."""
+    if len(row) != width:
+        raise FaceDiffError(f"{path}: row {number} has another number of cells than the header; write it again")
+    try:
+        return [float(row[column]) for column in columns]
+    except ValueError as error:
+        raise FaceDiffError(f"{path}: row {number} has a cell that is no number ({quoted(str(error))})") from error

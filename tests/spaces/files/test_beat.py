@@ -1,0 +1,73 @@
+"""BEAT's json and LAM's like it: read, written and read again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.spaces import layout
+from facediff.spaces.files import read_parameters, write_parameters
+from facediff.spaces.files.beat import write_beat
+
+WEIGHTS = np.random.default_rng(0).random((6, 51)).astype(np.float32)
+
+
+def beat(**changes: object) -> dict[str, Any]:
+    frames = [
+        {"weights": [float(w) for w in row], "time": (k + 1) / 60, "rotation": []} for k, row in enumerate(WEIGHTS)
+    ]
+    return {"names": list(layout("arkit_51").channels), "frames": frames, **changes}
+
+
+def written(path: Path, content: dict[str, Any]) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_read_beat_has_its_rate_order_and_start(tmp_path: Path) -> None:
+    clip = read_parameters(written(tmp_path / "1_a_0_1_1.json", beat()))
+    assert (clip.frame_rate, clip.layout, clip.dropped) == (60.0, "arkit_51", 0)
+    assert abs(clip.start - 1 / 60) < 1e-12
+    assert clip.space.absent == ("tongueOut",)
+    assert np.array_equal(clip.values, WEIGHTS)
+
+
+@pytest.mark.parametrize("metadata", [False, True])
+def test_beat_written_and_read_again_is_the_same(tmp_path: Path, metadata: bool) -> None:
+    clip = read_parameters(written(tmp_path / "a.json", beat()))
+    write_beat(tmp_path / "b.json", clip, metadata=metadata)
+    again = read_parameters(tmp_path / "b.json")
+    assert np.array_equal(again.values, clip.values)
+    assert (again.space, again.start, again.frame_rate) == (clip.space, clip.start, clip.frame_rate)
+    write_parameters(tmp_path / "c.json", again)
+    assert metadata or (tmp_path / "c.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
+def test_read_beat_of_lam_takes_the_rate_of_its_metadata(tmp_path: Path) -> None:
+    frames = [{"weights": [0.5] * 52, "time": k / 30, "rotation": []} for k in range(4)]
+    for one in (frames, [{"weights": [0.5] * 52} for _ in frames]):
+        content = {"names": list(layout("arkit").channels), "metadata": {"fps": 30, "frame_count": 4}, "frames": one}
+        clip = read_parameters(written(tmp_path / "lam.json", content))
+        assert (clip.frame_rate, clip.layout) == (30.0, "arkit")
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"names": ["jawOpen"]}, "weights"),
+        ({"names": ["nose", *layout("arkit_51").channels[1:]]}, "nose"),
+        ({"frames": [{"weights": [0.0] * 51}]}, "time"),
+        ({"frames": [{"weights": [0.0] * 50 + ["x"], "time": 0}]}, "frame 0"),
+        ({"frames": [{"weights": [0.0] * 51, "time": t} for t in (0, 0)]}, "frame 1"),
+        ({"frames": 3}, "frames"),
+        ({"metadata": {"fps": -1}}, "fps"),
+    ],
+)
+def test_read_beat_names_what_is_wrong(tmp_path: Path, changes: dict[str, Any], fault: str) -> None:
+    with pytest.raises(FaceDiffError, match=fault):
+        read_parameters(written(tmp_path / "a.json", beat(**changes)))

@@ -1,0 +1,129 @@
+"""Recordings of Live Link Face and tables of Audio2Face: read, written and read again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.errors import FaceDiffError
+from facediff.spaces import layout
+from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
+from facediff.spaces.files import ParameterClip, even, read_parameters, write_parameters
+from facediff.spaces.files.tables import seconds_of, timecode
+
+# The first rows of a real take have such steps: two sixtieths less a thousandth now and then.
+CODES = ("13:13:04:31.652", "13:13:04:33.651", "13:13:04:35.651", "13:13:04:41.650", "13:13:04:43.650")
+VALUES = np.random.default_rng(0).random((5, 61)).round(10)
+VALUES[2, 3] = 1.0531234567  # as files have them
+
+
+def write_take(path: Path, codes: tuple[str, ...] = CODES, *, count: str = "BlendShapeCount", wide: int = 61) -> Path:
+    names = [*map(live_link_name, ARKIT), *ROTATIONS][:wide]
+    rows = [
+        f"{code},{wide}," + ",".join(f"{v:.10f}" for v in row[:wide]) for code, row in zip(codes, VALUES, strict=True)
+    ]
+    path.write_text("\n".join([f"Timecode,{count}," + ",".join(names), *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("count", ["BlendShapeCount", "BlendshapeCount"])
+def test_read_live_link_takes_the_rate_from_the_timecode(tmp_path: Path, count: str) -> None:
+    clip = read_parameters(write_take(tmp_path / "take.csv", count=count))
+    assert clip.frame_rate == 30.0
+    assert clip.dropped == 2
+    assert np.array_equal(clip.values, VALUES.astype(np.float32))
+    assert clip.values.max() > 1
+    assert clip.space == layout("live_link")
+    whole = even(clip)
+    assert len(whole.values) == 7
+    assert np.abs(whole.values[2] - VALUES[2]).max() < 0.002
+    assert np.abs(whole.values[3, :52] - (2 * VALUES[2] + VALUES[3])[:52] / 3).max() < 0.002
+
+
+def test_live_link_written_and_read_again_is_the_same(tmp_path: Path) -> None:
+    clip = read_parameters(write_take(tmp_path / "take.csv"))
+    write_parameters(tmp_path / "again.csv", clip)
+    again = read_parameters(tmp_path / "again.csv")
+    assert np.array_equal(again.values, clip.values)
+    assert clip.times is not None
+    assert again.times is not None
+    assert np.array_equal(again.times, clip.times)
+    assert [line.split(",")[0] for line in (tmp_path / "again.csv").read_text().splitlines()[1:]] == list(CODES)
+
+
+def test_read_live_link_without_rotations_declares_them_absent(tmp_path: Path) -> None:
+    clip = read_parameters(write_take(tmp_path / "take.csv", wide=52))
+    assert clip.space.absent == ROTATIONS
+    assert not clip.values[:, 52:].any()
+
+
+def test_timecodes_of_all_times() -> None:
+    for seconds in np.random.default_rng(1).integers(0, 86_400 * 60_000, 200) / 60_000:
+        back = seconds_of(timecode(seconds))
+        assert back is not None
+        assert abs(back - seconds) < 1e-9
+    assert seconds_of("00:00:61:00.0") is None
+
+
+def test_read_live_link_goes_on_after_midnight(tmp_path: Path) -> None:
+    codes = ("23:59:59:56.000", "23:59:59:58.000", "00:00:00:00.000", "00:00:00:02.000", "00:00:00:04.000")
+    clip = read_parameters(write_take(tmp_path / "take.csv", codes))
+    assert clip.times is not None
+    assert np.allclose(clip.times, np.arange(5) / 30)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("Timecode,BlendShapeCount,EyeBlinkLeft\n00:00:00:00.000,61,0\n", "eyeLookDownLeft"),
+        ("a,b\n1,2\n", "timeCode"),
+        ("Timecode,BlendShapeCount\n", "eyeBlinkLeft"),
+    ],
+)
+def test_read_live_link_names_what_is_missing(tmp_path: Path, text: str, fault: str) -> None:
+    (tmp_path / "take.csv").write_text(text)
+    with pytest.raises(FaceDiffError, match=fault):
+        read_parameters(tmp_path / "take.csv")
+
+
+def test_read_live_link_names_the_row(tmp_path: Path) -> None:
+    good = write_take(tmp_path / "take.csv").read_text()
+    for old, new in ((CODES[1], "25:00:00:00"), (CODES[1], CODES[0]), (f"{VALUES[1, 5]:.10f}", "x"), ("61,", "61,7,")):
+        lines = good.splitlines()
+        lines[2] = lines[2].replace(old, new, 1)
+        (tmp_path / "take.csv").write_text("\n".join(lines))
+        with pytest.raises(FaceDiffError, match="row 3"):
+            read_parameters(tmp_path / "take.csv")
+
+
+def test_audio2face_read_written_and_read_again(tmp_path: Path) -> None:
+    space = layout("audio2face")
+    values = np.random.default_rng(2).random((4, 52)).astype(np.float32)
+    header = "timeCode," + ",".join(f"blendShapes.{name[:1].upper()}{name[1:]}" for name in space.channels[:-1])
+    rows = [f"{time / 30}," + ",".join(map(str, row[:-1])) for time, row in enumerate(values)]
+    (tmp_path / "a.csv").write_text("\n".join([header, *rows]))
+    clip = read_parameters(tmp_path / "a.csv")
+    assert clip.frame_rate == 30.0
+    assert clip.space.absent == ("tongueOut",)
+    assert np.array_equal(clip.values[:, :-1], values[:, :-1])
+    write_parameters(tmp_path / "b.csv", clip, layout="audio2face")
+    again = read_parameters(tmp_path / "b.csv")
+    assert np.array_equal(again.values, clip.values)
+    assert again.space == clip.space
+
+
+def test_every_arkit_order_reaches_a_live_link_table(tmp_path: Path) -> None:
+    for name in ("arkit", "arkit_51", "audio2face", "mediapipe"):
+        space = layout(name)
+        values = np.random.default_rng(3).random((3, len(space.channels))).astype(np.float32)
+        write_parameters(tmp_path / "t.csv", ParameterClip("t", values, space, 30.0))
+        read = read_parameters(tmp_path / "t.csv")
+        for column, channel in enumerate(space.channels):
+            if channel != "_neutral":
+                assert np.array_equal(read.values[:, read.space.index(channel)], values[:, column]), (name, channel)
+    flame = ParameterClip("f", np.zeros((3, 106), np.float32), layout("flame_artalk"), 25.0)
+    with pytest.raises(FaceDiffError, match="flame"):
+        write_parameters(tmp_path / "t.csv", replace(flame, name="g"))
