@@ -274,6 +274,7 @@ model = Kind(
     "facediff.models.style_content "
     "facediff.models.published.codetalker facediff.models.published.codetalker_checkpoints "
     "facediff.models.published.diffspeaker "
+    "facediff.models.published.emotalk "
     "facediff.models.published.facediffuser "
     "facediff.models.published.faceformer "
     "facediff.models.published.selftalk "

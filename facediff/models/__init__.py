@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from facediff.models.inference import Style as Style
     from facediff.models.published.codetalker import CodeTalker as CodeTalker
     from facediff.models.published.diffspeaker import DiffSpeaker as DiffSpeaker
+    from facediff.models.published.emotalk import EmoTalk as EmoTalk
     from facediff.models.published.facediffuser import FaceDiffuser as FaceDiffuser
     from facediff.models.published.faceformer import FaceFormer as FaceFormer
     from facediff.models.published.importing import import_checkpoint as import_checkpoint
@@ -28,6 +29,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "inference": "Style",
         "published.codetalker": "CodeTalker",
         "published.diffspeaker": "DiffSpeaker",
+        "published.emotalk": "EmoTalk",
         "published.facediffuser": "FaceDiffuser",
         "published.faceformer": "FaceFormer",
         "published.importing": "import_checkpoint",

@@ -143,7 +143,7 @@ class Wav2Vec2Encoder(AudioEncoder):
         """Encode; see :class:`AudioEncoder`."""
         if features is None or feature_lengths is None:
             features, feature_lengths = self.frozen_features(audio, audio_lengths)
-        hidden, steps = by_length(features, feature_lengths, self._hidden)
+        hidden, steps = by_length(features, feature_lengths, self.hidden_states)
         return interpolate_frames(hidden if self.out is None else self.out(hidden), steps, frame_lengths)
 
     def at_steps(
@@ -159,12 +159,12 @@ class Wav2Vec2Encoder(AudioEncoder):
             return x[:, :count] if rule.endswith("cut") else interpolate_ends(x, count)
 
         def encode(x: Tensor, count: int) -> Tensor:
-            return self._hidden(resampled(x, count)) if early else resampled(self._hidden(x), count)
+            return self.hidden_states(resampled(x, count)) if early else resampled(self.hidden_states(x), count)
 
         hidden = by_lengths(features, lengths, steps, encode)
         return hidden if self.out is None else self.out(hidden)
 
-    def _hidden(self, features: Tensor) -> Tensor:
+    def hidden_states(self, features: Tensor) -> Tensor:
         """Hidden states of the last layer, of clips of one length."""
         network, settings = self.network, self.network.config
         encoder, large = network.encoder, bool(getattr(settings, "do_stable_layer_norm", False))

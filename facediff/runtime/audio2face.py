@@ -138,9 +138,8 @@ class Audio2Face:
         else:
             emotions = np.broadcast_to(self.emotion(emotion), (count, facts.implicit + len(facts.emotions)))
         if emotions.shape != (count, facts.implicit + len(facts.emotions)):
-            raise FaceDiffError(
-                f"emotion: has the shape {np.shape(emotion)}; expected ({count}, {len(facts.emotions)})"
-            )
+            given = (len(emotions), emotions.shape[1] - facts.implicit)
+            raise FaceDiffError(f"emotion: has the shape {given}; expected ({count}, {len(facts.emotions)})")
         # The moments are whole samples, rounded down, in exact arithmetic: 29.97 frames a second must not drift.
         moments = [math.floor((start + frame) * rate) for frame in range(count)]
         padded = np.pad(audio.astype(np.float32), (facts.before, facts.buffer)) * np.float32(

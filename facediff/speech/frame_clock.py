@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 from facediff.utils import SAMPLE_RATE
 
-Rule = Literal["rounded", "steps", "pairs", "seconds", "seconds_or_pairs", "rows"]
+Rule = Literal["rounded", "steps", "pairs", "seconds", "seconds_or_pairs", "rows", "up"]
 
 STEP_RATE = 50.0
 """Steps a second of pretrained speech networks."""
@@ -29,7 +30,7 @@ class FrameClock:
         rule: ``rounded``: as many as fit the speech, which is then cut or filled up to whole frames. With all others
             the model takes every sample: ``steps``: by the network's steps; ``pairs``: two steps a frame; ``seconds``:
             a frame less than the speech lasts; ``seconds_or_pairs``: the smaller of the two; ``rows``: one of every so
-            many rows of a finer clock, from the first on.
+            many rows of a finer clock, from the first on; ``up``: a frame for every part of one.
         convolutions: kernel and stride of each convolution of the speech network.
         rows: rows a frame of the finer clock.
 
@@ -62,6 +63,8 @@ class FrameClock:
                 return min(seconds, pairs)
             case "rows":
                 return -(-self.row_count(samples) // self.rows)
+            case "up":
+                return math.ceil(samples / SAMPLE_RATE * self.frame_rate)
 
     def row_count(self, samples: int) -> int:
         """Rows of the finer clock."""

@@ -33,6 +33,7 @@ STYLE_CONTENT = {"dim": 16, "content_dim": 16}
 PUBLISHED = {"audio_dim": 16, "dim": 16}
 SELFTALK = {**PUBLISHED, "lip_reader": "none"}
 VOCA = {**PUBLISHED, "components": 8, "channels": (8, 8)}
+EMOTALK = {**PUBLISHED, "emotion_encoder": MEL, "emotion_dim": 4, "level_dim": 2, "person_dim": 2}
 FACEDIFFUSER = {**PUBLISHED, "diffusion_steps": 8}
 DIFFSPEAKER = {**PUBLISHED, "sampling_steps": 8, "smooth": True}
 OWN = {"audio_dim": None}  # the encoder's own channels
@@ -44,6 +45,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "SelfTalk": ("SelfTalk", SELFTALK),
     "SelfTalk at 25, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2"}),
     "SelfTalk at 30, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2", "frame_rate": 30.0}),
+    "EmoTalk": ("EmoTalk", EMOTALK),
     "FaceDiffuser": ("FaceDiffuser", FACEDIFFUSER),
     "FaceDiffuser, folded, HuBERT": (
         "FaceDiffuser",

@@ -38,6 +38,7 @@ from facediff.models.published.recognition import (
     dataset_facts,
 )
 from facediff.registry import component_class
+from facediff.spaces.layouts import layout
 from facediff.utils.licences import Licence, merged, network_licences
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
@@ -201,6 +202,8 @@ def facts_of(
     Raises:
         FaceDiffError: if they contradict each other, or do not follow.
     """
+    if method.layout:
+        return parametric_facts(weights, method, options)
     datasets, count, vertices = dataset_facts(), method.count(weights), method.vertices(weights)
     name: str | None = options.dataset
     if name is not None and name not in datasets:
@@ -224,10 +227,7 @@ def facts_of(
             f"{len(identities)} {'are given' if options.identities is not None else f'is what {name} usually has'}; "
             f"give {{identities}} with {count} names in the order of the training command"
         )
-    if not all(map(is_name, identities)) or len(set(identities)) < len(identities):
-        raise OptionError.naming(
-            f"{{identities}}: {quoted(identities)}; expected different names without path separators"
-        )
+    check_names(identities)
     asked = options.all_model_options()
     return CheckpointFacts(
         dataset=name,
@@ -238,6 +238,49 @@ def facts_of(
         model_options={key: value for key, value in asked.items() if key not in ("ignore", method.graph)},
         graph=the_graph(graphs, asked.get(method.graph), method),
     )
+
+
+def parametric_facts(weights: AuthorsWeights, method: Recogniser, options: ImportOptions) -> CheckpointFacts:
+    """The facts of a method that animates channels: its layout says what they are.
+
+    Raises:
+        FaceDiffError: if the tensors have another number of channels or identities, or an option is for vertices.
+    """
+    for name in ("dataset", "templates", "regions", "mesh"):
+        if getattr(options, name) is not None:
+            raise OptionError.naming(
+                f"{{{name}}}: is for methods that animate vertices, and {method.method} animates channels; omit it"
+            )
+    space, channels, count = layout(method.layout), method.vertices(weights), method.count(weights)
+    if channels != len(space.channels):
+        raise FaceDiffError(
+            f"{weights.source}: gives {channels} channels, and {method.method} has {len(space.channels)} "
+            f"({method.layout}); expected a checkpoint as its authors distribute it"
+        )
+    identities = [str(number) for number in range(max(1, count))]
+    if options.identities is not None:
+        identities = list(options.identities)
+        if count and len(identities) != count:
+            raise OptionError.naming(f"{{identities}}: are {len(identities)}, and the checkpoint has {count}")
+        check_names(identities)
+    asked = options.all_model_options()
+    return CheckpointFacts(
+        dataset=method.method,
+        frame_rate=rate_of(DatasetFacts(channels, method.frame_rate or 0.0, (), "m"), method, asked.get("frame_rate")),
+        identities=identities,
+        n_vertices=channels,
+        space=space,
+        audio_config=read_config(options.audio_config),
+        model_options={key: value for key, value in asked.items() if key != "ignore"},
+    )
+
+
+def check_names(identities: Sequence[str]) -> None:
+    """Refuse names of identities that are none, or occur twice."""
+    if not all(map(is_name, identities)) or len(set(identities)) < len(identities):
+        raise OptionError.naming(
+            f"{{identities}}: {quoted(identities)}; expected different names without path separators"
+        )
 
 
 def rate_of(dataset: DatasetFacts, method: Recogniser, option: object) -> float:
@@ -279,7 +322,7 @@ def with_options(method: str, converted: dict[str, Any], chosen: Mapping[str, An
     """
     own = parameters(registry.model.get(method))
     encoders = parameters(component_class(converted["audio_encoder"])) if "audio_encoder" in converted else {}
-    for name in ("n_vertices", "identities", "frame_rate", "audio_encoder"):
+    for name in ("n_vertices", "identities", "frame_rate", "space", "audio_encoder", "emotion_encoder"):
         own.pop(name, None)
     for name in ("dim", "config", "source"):
         encoders.pop(name, None)
@@ -339,6 +382,8 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     from facediff.data.corpus import as_template
     from facediff.mesh import read_mesh
 
+    if not facts.space.is_vertices:
+        return parametric_assets(facts), []
     templates, regions, mesh = options.templates, options.regions, options.mesh
     count, notes = facts.n_vertices, []
     if templates is None:
@@ -390,6 +435,23 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     return assets, notes
 
 
+def parametric_assets(facts: CheckpointFacts) -> Assets:
+    """Faces at rest, whose channels are all 0, and the regions by the channels' names."""
+    rest = torch.zeros(facts.n_vertices, 1)
+    regions = {name: torch.tensor(facts.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
+    return Assets(
+        corpus=facts.dataset,
+        synthetic=False,
+        unit="m",
+        frame_rate=facts.frame_rate,
+        identities=facts.identities,
+        templates=dict.fromkeys(facts.identities, rest),
+        faces=None,
+        regions=regions,
+        space=facts.space,
+    )
+
+
 def read_region(path: Path, n_vertices: int) -> Tensor:
     """Indices of a region's vertices.
 
@@ -412,9 +474,14 @@ def build(
         FaceDiffError: if a tensor is missing or of another shape.
     """
     model: AnimationModel = registry.model.get(method.method)(
-        n_vertices=facts.n_vertices, identities=facts.identities, frame_rate=facts.frame_rate, **options
+        n_vertices=facts.n_vertices,
+        identities=facts.identities,
+        frame_rate=facts.frame_rate,
+        **({} if facts.space.is_vertices else {"space": facts.space}),
+        **options,
     )
     own = model.state_dict()
+    own.pop("geometry", None)  # what channels count in training, which no author's file holds
     for name, value in own.items():
         if name not in weights.renamed:
             raise FaceDiffError(
@@ -432,7 +499,8 @@ def build(
             f"{weights.source}: {method.method} has no place for {listed(extra)}; it does not fit the other tensors"
         )
     check_weights(weights.source, weights.renamed, own)
-    model.load_state_dict({name: value.to(own[name].dtype) for name, value in weights.renamed.items()})
+    renamed = {name: value.to(own[name].dtype) for name, value in weights.renamed.items()}
+    model.load_state_dict(model.state_dict() | renamed)
     for name, parameter in model.named_parameters():
         if not parameter.isfinite().all():
             raise FaceDiffError(

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.spaces import VERTICES, Space
 from facediff.utils.licences import Commercial
 from facediff.utils.limits import quoted
 
@@ -136,7 +137,7 @@ class AuthorsWeights:
         return new
 
     def move_all(self, old: str, new: str, renames: Iterable[tuple[str, str]] = ()) -> None:
-        """Use all tensors whose names begin with ``old`` under names that begin with ``new``.
+        """Use all tensors whose names begin with ``old``, but for ignored ones, under names that begin with ``new``.
 
         Args:
             old: how the authors' names begin.
@@ -144,6 +145,8 @@ class AuthorsWeights:
             renames: parts of the rest of a name and what becomes of them, each applied in turn.
         """
         for name in self.names(old):
+            if name in self.ignored:
+                continue
             rest = name.removeprefix(old)
             for before, after in renames:
                 rest = rest.replace(before, after)
@@ -163,6 +166,7 @@ class AuthorsWeights:
         *,
         kind: Literal["wav2vec2", "hubert"],
         facts: CheckpointFacts,
+        into: str = "audio_encoder",
         **settings: Any,  # noqa: ANN401
     ) -> Callable[..., Any]:
         """Use a complete wav2vec 2.0 or HuBERT under ``audio_encoder``, and give the encoder that it belongs to.
@@ -171,11 +175,12 @@ class AuthorsWeights:
             prefix: how its names begin, with the dot.
             kind: which network it is.
             facts: may hold the network's configuration; else it follows from the shapes.
+            into: what the model calls the encoder.
             settings: options of the encoder, such as ``epsilon``.
         """
         config = backbone_config(self, prefix, kind, facts.audio_config)
         old = ("weight_g", "parametrizations.weight.original0"), ("weight_v", "parametrizations.weight.original1")
-        self.move_all(prefix, "audio_encoder.network.", old)
+        self.move_all(prefix, f"{into}.network.", old)
         # Without the vector that SpecAugment puts on masked frames, the network is made without masking.
         if f"{prefix}masked_spec_embed" not in self:
             config.update(mask_time_prob=0.0, mask_feature_prob=0.0)
@@ -259,7 +264,8 @@ class CheckpointFacts:
         dataset: the data set's name.
         frame_rate: frames a second.
         identities: training identities, in the order of the table's rows.
-        n_vertices: vertices V.
+        n_vertices: vertices V, or channels of the space.
+        space: what the motion's numbers mean.
         audio_config: configuration of the audio encoder, where the user gives it.
         model_options: options of the model or its audio encoder that the user gives.
         graph: file of the frozen graph that the method needs as well.
@@ -269,6 +275,7 @@ class CheckpointFacts:
     frame_rate: float
     identities: list[str]
     n_vertices: int
+    space: Space = VERTICES
     audio_config: Mapping[str, Any] | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     graph: Path | None = None
@@ -283,8 +290,9 @@ class Recogniser:
         marks: tensors that all of its checkpoints have, by the authors' names.
         unless: beginnings of names that none of them has.
         convert: makes the model's options, but for those that every model has, and uses or ignores the tensors.
-        vertices: the number of vertices by the tensors' shapes.
+        vertices: the number of vertices, or channels, by the tensors' shapes.
         count: the number of training identities by the tensors' shapes; 0 where the method knows no identities.
+        layout: of its channels, by :func:`facediff.spaces.layouts.layout`; empty where it animates vertices.
         frame_rate: frames a second that its checkpoints animate, where they are not those of the data set; the option
             ``frame_rate`` then says otherwise.
         graph: the option that names the frozen graph that the method needs as well; empty if it needs none.
@@ -299,6 +307,7 @@ class Recogniser:
     convert: Callable[[AuthorsWeights, CheckpointFacts], dict[str, Any]]
     vertices: Callable[[AuthorsWeights], int]
     count: Callable[[AuthorsWeights], int]
+    layout: str = ""
     frame_rate: float | None = None
     graph: str = ""
     licence: str = "unknown"

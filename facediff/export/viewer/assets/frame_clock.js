@@ -1,6 +1,6 @@
 // How many frames a model gives for speech: the rules of facediff.speech.frame_clock, in their orders of operations.
 
-const CLOCK_RULES = ["rounded", "steps", "pairs", "seconds", "seconds_or_pairs", "rows"];
+const CLOCK_RULES = ["rounded", "steps", "pairs", "seconds", "seconds_or_pairs", "rows", "up"];
 const STEP_RATE = 50; // steps a second of pretrained speech networks
 /** Kernels and strides of the convolutions of wav2vec 2.0 and HuBERT. */
 const CONVOLUTIONS = [[10, 5], [3, 2], [3, 2], [3, 2], [3, 2], [2, 2], [2, 2]];
@@ -26,6 +26,7 @@ class FrameClock {
       case "pairs": return pairs();
       case "seconds": return whole();
       case "seconds_or_pairs": return Math.min(whole(), pairs());
+      case "up": return Math.ceil((samples / SAMPLE_RATE) * frameRate);
       default: return Math.ceil(nearest((samples / SAMPLE_RATE) * (frameRate * rows)) / rows);
     }
   }

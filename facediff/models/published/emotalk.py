@@ -1,0 +1,378 @@
+"""EmoTalk (Peng et al.: "EmoTalk: Speech-Driven Emotional Disentanglement for 3D Face Animation", 2023).
+
+Two speech networks, one for what is said and one for how: features of both, how strong the emotion is and whose face it
+is go through a decoder of one layer to the 52 weights of ARKit's face shapes, 30 frames a second. The authors have not
+released how they train it, so that it is imported; training goes on with the plain error of the weights. From top to
+bottom: the model, its network, the authors' checkpoint. docs/methods.md says what of the published code is an option.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.errors import ArgumentError
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.graphs import Spoken
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
+from facediff.models.published.autoregressive import DecoderLayer, Period, decoder_sizes, periodic_bias
+from facediff.models.published.base import DirectModel, SpeakerTable, make_encoder, masked_mean
+from facediff.models.published.faceformer import LAYER_NAMES
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
+from facediff.spaces import Space
+from facediff.speech.frame_clock import STEP_RATE, FrameClock
+from facediff.utils.ranges import Range
+
+EMOTION_RATE = 30
+"""Steps a second of the emotion network's Transformer, whatever the motion's frame rate is."""
+
+FINISHING = ("smooth", "blinks")
+"""What the authors' demonstration does with the weights, in its order."""
+
+BLINKS = np.array(
+    [
+        [0.36537236, 0.950235724, 0.95593375, 0.916715622, 0.367256105, 0.119113259, 0.025357503],
+        [0.234776169, 0.909951985, 0.944758058, 0.777862132, 0.191071674, 0.235437036, 0.089163929],
+        [0.870040774, 0.949833691, 0.949418545, 0.695911646, 0.191071674, 0.072576277, 0.007108896],
+        [0.000307991, 0.556701422, 0.952656746, 0.942345619, 0.425857186, 0.148335218, 0.017659493],
+    ]
+)
+"""The demonstration's courses of a lid over seven frames."""
+
+
+@registry.model.register("EmoTalk")
+class EmoTalk(DirectModel):
+    """EmoTalk: what is said and how it is said, from two speech networks, to weights of face shapes.
+
+    Args:
+        dim: channels of the decoder: those of the content, the emotion, its strength and the person together.
+        content_dim: channels of what is said.
+        emotion_dim: channels of how it is said.
+        level_dim: channels of the emotion's strength.
+        person_dim: channels of the person.
+        num_layers: layers of the decoder.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its feed-forward layers; ``dim`` if None.
+        dropout: in the decoder.
+        period: frames that count alike in its attention; those of a second if None.
+        levels: how many strengths of emotion there are.
+        level: the strength that motion is generated with; the authors' demonstration takes 1.
+        emotion_encoder: speech to features of how it is said; the method's own pretrained network if None.
+        finish: what is done with the weights, as the demonstration does: ``smooth`` (Savitzky-Golay, a parabola
+            through five frames) and ``blinks`` (stored blinks at random in place of the lids' motion); joined by ``+``.
+        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+    """
+
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder, source="jonatasgrosman/wav2vec2-large-xlsr-53-english", edges=False
+    )
+    published_emotion_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder, source="r-f/wav2vec-english-speech-emotion-recognition", edges=False
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width = 832,
+        content_dim: Width | None = None,
+        emotion_dim: Width = 256,
+        level_dim: Width = 32,
+        person_dim: Width = 32,
+        num_layers: Layers = 1,
+        num_heads: Heads = 4,
+        feed_forward_dim: Width | None = None,
+        dropout: Share = 0.1,
+        period: Period | None = None,
+        levels: Annotated[int, Range(1, 1000)] = 2,
+        level: Annotated[int, Range(0, 999)] = 1,
+        emotion_encoder: AudioEncoderFactory | None = None,
+        finish: str = "",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(**options)
+        content_dim = dim - emotion_dim - level_dim - person_dim if content_dim is None else content_dim
+        if dim % num_heads or content_dim < 1 or content_dim + emotion_dim + level_dim + person_dim != dim:
+            raise ArgumentError(
+                {"dim": dim, "num_heads": num_heads},
+                "dim must be a multiple of num_heads, and the sum of what content, emotion, level and person have",
+            )
+        if not level < levels:
+            raise ArgumentError({"level": level}, f"there are {levels} levels, counted from 0")
+        self.level = level
+        self.finish = read_finish(finish, self.space)
+        self.emotion_encoder, emotion_width = make_encoder(
+            emotion_encoder or self.published_emotion_encoder, options.get("audio_dim")
+        )
+        self.network = EmoTalkNetwork(
+            widths=(self.audio_width, emotion_width),
+            coordinates=self.dims * self.n_vertices,
+            n_identities=len(self.identities),
+            levels=levels,
+            dim=dim,
+            content_dim=content_dim,
+            emotion_dim=emotion_dim,
+            level_dim=level_dim,
+            person_dim=person_dim,
+            num_layers=num_layers,
+            num_heads=num_heads,
+            hidden_dim=feed_forward_dim or dim,
+            dropout=dropout,
+            period=period or max(1, round(self.frame_rate)),
+        )
+
+    def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
+        """Save the arguments as every model does, with the published emotion network where none was given."""
+        chosen = arguments.get("emotion_encoder") or self.published_emotion_encoder
+        super().keep_hyperparameters({**arguments, "emotion_encoder": chosen})
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The table of persons."""
+        return [self.network.style]
+
+    @property
+    def clock(self) -> FrameClock:
+        """A frame for every part of one that speech lasts."""
+        return FrameClock(self.frame_rate, "up")
+
+    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
+        """All of the motion."""
+        return batch.frame_lengths
+
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Hidden states of both speech networks side by side, at the frames."""
+        cached = heard.cached_features or ()
+        content = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "features", *cached)
+        return torch.cat([content, self._emotion(heard, frames)], -1)
+
+    def _emotion(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Hidden states of the emotion network, which is resampled twice."""
+        encoder = self.emotion_encoder
+        if not isinstance(encoder, Wav2Vec2Encoder):
+            return encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden")
+        features, steps = encoder.frozen_features(heard.audio, heard.audio_lengths)
+
+        def encode(x: Tensor, count: int) -> Tensor:
+            # The published class is never told how many frames there are, and counts 30 a second of its own steps
+            # before its Transformer; its hidden states are then resampled to the frames. In floating point as there:
+            # 205 steps are 122, not 123.
+            own = x.shape[1] * EMOTION_RATE // int(STEP_RATE)
+            if not exporting():
+                own = int(x.shape[1] / STEP_RATE * EMOTION_RATE)
+            return interpolate_ends(encoder.hidden_states(interpolate_ends(x, max(1, own))), count)
+
+        hidden = by_lengths(features, steps, frames, encode)
+        return hidden if encoder.out is None else encoder.out(hidden)
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The mean squared error; the authors' own losses are not released."""
+        frames = self.trained_frames(batch)
+        predicted = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
+        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        error = masked_mean((predicted - truth).square(), frames)
+        return {"reconstruction": error, "loss": error}
+
+    def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
+        """Every frame sees those before it, and its own moment of the emotion; later frames and padding change none."""
+        motion: Tensor = self.network(features, weights, self.level)
+        return motion
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """All frames in one pass, then what was chosen to finish them."""
+        motion = super().generate_frames(batch, frames, seeds=seeds, progress=progress)
+        for row, (count, seed) in enumerate(zip(frames.tolist(), seeds, strict=True) if self.finish else ()):
+            values = finished(motion[row, :count, :, 0].float().cpu().numpy(), self.finish, self.space, seed)
+            motion[row, :count, :, 0] = torch.from_numpy(values).to(motion)
+        return motion
+
+
+class EmoTalkNetwork(nn.Module):
+    """Features of two speech networks, the level and the person to values of channels.
+
+    Args:
+        widths: channels of the features of content and of emotion.
+        coordinates: numbers of a frame.
+        n_identities: rows of the table of persons.
+        levels: rows of the table of levels.
+        dim: channels of the decoder.
+        content_dim: its channels of content.
+        emotion_dim: its channels of emotion.
+        level_dim: its channels of the level.
+        person_dim: its channels of the person.
+        num_layers: its layers.
+        num_heads: its attention heads.
+        hidden_dim: channels of its feed-forward layers.
+        dropout: in the decoder.
+        period: frames that count alike.
+    """
+
+    def __init__(
+        self,
+        *,
+        widths: tuple[int, int],
+        coordinates: int,
+        n_identities: int,
+        levels: int,
+        dim: int,
+        content_dim: int,
+        emotion_dim: int,
+        level_dim: int,
+        person_dim: int,
+        num_layers: int,
+        num_heads: int,
+        hidden_dim: int,
+        dropout: float,
+        period: int,
+    ) -> None:
+        super().__init__()
+        self.widths, self.num_heads, self.period = widths, num_heads, period
+        self.content_map = nn.Linear(widths[0], content_dim)
+        self.memory_map = nn.Linear(widths[1], dim)
+        self.emotion_map = nn.Linear(dim, emotion_dim)
+        self.level = SpeakerTable(levels, level_dim)
+        self.style = SpeakerTable(n_identities, person_dim)
+        self.layers = nn.ModuleList(DecoderLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
+        self.motion_out = nn.Linear(dim, coordinates)
+        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
+        nn.init.zeros_(self.motion_out.bias)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames width"],
+        weights: Float[Tensor, "batch identities"],
+        level: int,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Values of the channels, which nothing bounds."""
+        content, emotion = torch.split(features, self.widths, -1)
+        frames = features.shape[1]
+        memory = self.memory_map(emotion)
+        chosen = self.level.weight[level].expand(*features.shape[:2], -1)
+        person = self.style(weights)[:, None].expand(-1, frames, -1)
+        parts = [self.content_map(content), torch.relu(self.emotion_map(memory)), chosen, person]
+        x = torch.cat([part.to(memory) for part in parts], -1)
+        bias = periodic_bias(frames, self.num_heads, self.period, device=x.device)
+        for layer in self.layers:
+            # A frame attends to its own moment of the emotion only.
+            moments = layer.cross_attention.keys_values(memory)  # type: ignore[union-attr, operator]
+            x = layer(x, moments, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
+        motion: Tensor = self.motion_out(x)
+        return motion
+
+
+# What the demonstration does with the weights.
+
+
+def read_finish(text: str, space: Space) -> frozenset[str]:
+    """Steps by their names, joined by ``+``.
+
+    Raises:
+        ArgumentError: if there is no such step, or the motion is not of ARKit's channels.
+    """
+    steps = frozenset(filter(None, text.split("+")))
+    if odd := sorted(steps - set(FINISHING)):
+        raise ArgumentError({"finish": text}, f"there is no step {odd[0]}; choose from {', '.join(FINISHING)}")
+    if steps and space.kind != "arkit":
+        raise ArgumentError({"finish": text}, "is for the channels of ARKit; leave it out")
+    return steps
+
+
+def finished(
+    values: npt.NDArray[np.float32], steps: frozenset[str], space: Space, seed: int
+) -> npt.NDArray[np.float32]:
+    """Weights (T, C) after the steps that are chosen.
+
+    Random numbers are those of Python's generator, so that ``random.seed`` gives the demonstration the same blinks.
+    """
+    result = values.astype(np.float64)
+    if "smooth" in steps and len(result) >= 5:  # fewer frames are fewer than the filter has
+        from scipy.signal import savgol_filter
+
+        result = savgol_filter(result, 5, 2, axis=0)
+    if "blinks" in steps:
+        drawn, length = random.Random(seed), BLINKS.shape[1]  # noqa: S311 - no secret
+        lids = [space.index("eyeBlinkLeft"), space.index("eyeBlinkRight")]
+        result[:, lids] = 0
+        start = drawn.randint(0, 60)
+        while start < len(result) - length:
+            result[start : start + length, lids] = BLINKS[drawn.randint(1, 4) - 1][:, None]
+            start += drawn.randint(60, 180)
+    return result.astype(np.float32)
+
+
+# The authors' checkpoint.
+
+
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
+    """The tensors under the names of this file, and the model's options."""
+    content, emotion = "audio_encoder_cont.", "audio_encoder_emo.wav2vec2."
+    for prefix in (content, emotion):
+        weights.ignore(f"{prefix}lm_head.", "the speech recogniser's letters")
+    weights.ignore("audio_encoder_emo.classifier.", "the names of emotions, which only training needs")
+    encoders = {
+        name: weights.backbone(prefix, kind="wav2vec2", facts=with_own_config(facts, name), into=name, **settings)
+        for name, prefix, settings in (
+            ("audio_encoder", content, EmoTalk.encoder_settings()),
+            ("emotion_encoder", emotion, EmoTalk.encoder_settings()),
+        )
+    }
+    for old, new in (
+        ("audio_feature_map_cont", "content_map"),
+        ("audio_feature_map_emo", "memory_map"),
+        ("audio_feature_map_emo2", "emotion_map"),
+        ("bs_map_r", "motion_out"),
+    ):
+        weights.move_all(f"{old}.", f"network.{new}.")
+    sizes = {}
+    for old, new in (("obj_vector_level", "level"), ("obj_vector_person", "style")):
+        # The published maps of one-hot rows have a bias, which every row gets here.
+        rows = weights.get(f"{old}.weight").T + weights.get(f"{old}.bias")
+        weights.renamed[f"network.{new}.weight"] = rows.contiguous()
+        sizes[new] = rows.shape[1]
+    weights.move_all("transformer_decoder.layers.", "network.layers.", LAYER_NAMES)
+    dim, _ = weights.shape("audio_feature_map_emo.weight")
+    return {
+        **encoders,
+        **decoder_sizes(weights, "transformer_decoder.", dim),
+        "content_dim": weights.shape("audio_feature_map_cont.weight")[0],
+        "emotion_dim": weights.shape("audio_feature_map_emo2.weight")[0],
+        "level_dim": sizes["level"],
+        "person_dim": sizes["style"],
+        "levels": weights.shape("obj_vector_level.weight")[1],
+    }
+
+
+def with_own_config(facts: CheckpointFacts, name: str) -> CheckpointFacts:
+    """The facts with the configuration of one of the two speech networks, where they are given by name."""
+    own = (facts.audio_config or {}).get(name)
+    return replace(facts, audio_config=own) if isinstance(own, Mapping) else facts
+
+
+register(
+    Recogniser(
+        method="EmoTalk",
+        marks=("audio_feature_map_cont.weight", "audio_feature_map_emo2.weight", "obj_vector_level.weight"),
+        unless=(),
+        convert=convert,
+        vertices=lambda weights: weights.shape("bs_map_r.weight")[0],
+        count=lambda weights: weights.shape("obj_vector_person.weight")[1],
+        layout="arkit",
+        frame_rate=30.0,
+        licence="CC-BY-NC-4.0",
+        commercial="forbidden",
+        licence_source="github.com/psyai-net/EmoTalk_release",
+    )
+)

@@ -1,0 +1,146 @@
+"""EmoTalk's checkpoint gives what the published inference gives, by a reference that shares no code with the model."""
+
+from __future__ import annotations
+
+import math
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import savgol_filter
+from torch import Tensor
+
+from facediff.errors import FaceDiffError
+from facediff.models import EmoTalk, import_checkpoint
+from facediff.models.published.emotalk import BLINKS, finished
+from facediff.spaces.layouts import layout
+from facediff.utils.licences import commercial_use
+from tests.fakes import published
+from tests.fakes.published import HIDDEN, State, features_of, hidden_of, interpolated, linear
+from tests.models.published.author import speech_of
+
+CONTENT, EMOTION, LEVEL, PERSON = 8, 8, 4, 4
+DIM = CONTENT + EMOTION + LEVEL + PERSON
+PERSONS = 5
+
+
+def emotalk_state(seed: int = 0) -> State:
+    """A tiny EmoTalk.pth, with all that the authors' file holds and inference does not need."""
+    draw = published.Drawn(seed)
+    state = published.backbone_state("audio_encoder_cont.", draw, large=True)
+    state |= published.backbone_state("audio_encoder_emo.wav2vec2.", draw, large=True)
+    for name in ("audio_encoder_cont.lm_head", "audio_encoder_emo.wav2vec2.lm_head"):
+        state |= published.linear_state(name, 32, 1024, draw)
+    state |= published.linear_state("audio_encoder_emo.classifier.dense", HIDDEN, HIDDEN, draw)
+    state |= published.linear_state("audio_encoder_emo.classifier.out_proj", 7, HIDDEN, draw)
+    state |= published.linear_state("audio_feature_map_cont", CONTENT, HIDDEN, draw)
+    state |= published.linear_state("audio_feature_map_emo", DIM, HIDDEN, draw)
+    state |= published.linear_state("audio_feature_map_emo2", EMOTION, DIM, draw)
+    state |= published.linear_state("obj_vector_level", LEVEL, 2, draw)
+    state |= published.linear_state("obj_vector_person", PERSON, PERSONS, draw)
+    state |= published.decoder_state("transformer_decoder.", DIM, 1, draw, hidden=DIM)
+    return state | published.linear_state("bs_map_r", 52, DIM, draw)
+
+
+def reference(s: State, speech: Tensor, level: int, person: int) -> Tensor:
+    """All 52 weights of every frame."""
+    frames = math.ceil(len(speech) / 16000 * 30)
+    wave = published.standardised(speech, 1e-7)
+    content = features_of(wave, s, "audio_encoder_cont.")
+    content = linear(hidden_of(interpolated(content, frames), s, "audio_encoder_cont."), s, "audio_feature_map_cont")
+    emotion = features_of(wave, s, "audio_encoder_emo.wav2vec2.")
+    emotion = hidden_of(interpolated(emotion, int(len(emotion) / 50.0 * 30)), s, "audio_encoder_emo.wav2vec2.")
+    memory = linear(interpolated(emotion, frames), s, "audio_feature_map_emo")
+    mood = torch.relu(linear(memory, s, "audio_feature_map_emo2"))
+    rows = [
+        linear(torch.eye(count)[chosen], s, name).expand(frames, -1)
+        for name, count, chosen in (("obj_vector_level", 2, level), ("obj_vector_person", PERSONS, person))
+    ]
+    tokens = torch.cat([content, mood, *rows], 1)
+    return linear(published.decoded(tokens, memory, s, "transformer_decoder.", "vocaset"), s, "bs_map_r")
+
+
+def imported(state: State, folder: Path, **options: Any) -> EmoTalk:  # noqa: ANN401
+    torch.save(state, folder / "EmoTalk.pth")
+    model = import_checkpoint(folder / "EmoTalk.pth", audio_config=published.AUDIO_CONFIG, **options)
+    assert isinstance(model, EmoTalk)
+    return model
+
+
+def predict(model: EmoTalk, speech: Tensor, person: str) -> Tensor:
+    clip = model.clip_of(speech, person, None)
+    frames = torch.tensor([model.frames_of(len(speech))])
+    with torch.no_grad():
+        return model.generate_frames(clip, frames, seeds=[0])[0, ..., 0]
+
+
+@pytest.mark.parametrize(("steps", "level", "person"), [(40, 1, 0), (41, 0, 3), (205, 1, 4)])
+def test_it_animates_as_published(steps: int, level: int, person: int, tmp_path: Path) -> None:
+    state, speech = emotalk_state(), speech_of(steps)
+    model = imported(state, tmp_path, level=level)
+    expected = reference(state, speech, level, person)
+    torch.testing.assert_close(predict(model, speech, str(person)), expected, rtol=0, atol=1e-5)
+
+
+def test_the_first_resampling_of_the_emotion_matters(tmp_path: Path) -> None:
+    """Without it, as one might read the paper, the motion is another one; the reference has it."""
+    state, speech = emotalk_state(), speech_of(58)
+    model = imported(state, tmp_path)
+    before = predict(model, speech, "0")
+    encoder = model.emotion_encoder
+    encoded = encoder.at_steps(speech[None], torch.tensor([len(speech)]), torch.tensor([len(before)]), "hidden")
+    heard = model.hear(model.clip_of(speech, "0", None), torch.tensor([len(before)]))
+    assert not torch.allclose(heard[..., HIDDEN:], encoded, atol=1e-3)
+
+
+def test_each_speech_network_may_have_its_own_configuration(tmp_path: Path) -> None:
+    state, speech = emotalk_state(), speech_of(40)
+    torch.save(state, tmp_path / "EmoTalk.pth")
+    both = {"audio_encoder": published.AUDIO_CONFIG, "emotion_encoder": published.AUDIO_CONFIG}
+    model = import_checkpoint(tmp_path / "EmoTalk.pth", audio_config=both)
+    assert isinstance(model, EmoTalk)
+    torch.testing.assert_close(predict(model, speech, "1"), reference(state, speech, 1, 1), rtol=0, atol=1e-5)
+
+
+def test_an_imported_model_is_of_arkits_channels_and_not_for_commerce(tmp_path: Path) -> None:
+    model = imported(emotalk_state(), tmp_path)
+    assert (model.space, model.frame_rate) == (layout("arkit"), 30.0)
+    assert model.identities == [str(number) for number in range(PERSONS)]
+    assert commercial_use(model.licences) == "forbidden"
+    with pytest.raises(FaceDiffError, match="templates"):
+        import_checkpoint(tmp_path / "EmoTalk.pth", templates={})
+    with pytest.raises(FaceDiffError, match="identities"):
+        import_checkpoint(tmp_path / "EmoTalk.pth", identities=["one"])
+
+
+def test_another_number_of_channels_is_refused(tmp_path: Path) -> None:
+    state = emotalk_state()
+    state |= {"bs_map_r.weight": state["bs_map_r.weight"][:51], "bs_map_r.bias": state["bs_map_r.bias"][:51]}
+    with pytest.raises(FaceDiffError, match="51 channels"):
+        imported(state, tmp_path)
+
+
+def test_finished_is_the_demonstration() -> None:
+    values = np.random.default_rng(0).random((400, 52)).astype(np.float32)
+    result = finished(values, frozenset({"smooth", "blinks"}), layout("arkit"), seed=3)
+    expected = np.stack([savgol_filter(values[:, column].astype(float), 5, 2) for column in range(52)], 1)
+    expected[:, 8:10] = 0
+    drawn = random.Random(3)  # noqa: S311 - no secret
+    start = drawn.randint(0, 60)
+    while start < 400 - 7:
+        expected[start : start + 7, 8:10] = BLINKS[drawn.randint(1, 4) - 1][:, None]
+        start += drawn.randint(60, 180)
+    np.testing.assert_allclose(result, expected, atol=1e-6)
+    assert (finished(values[:4], frozenset({"smooth"}), layout("arkit"), 0) == values[:4]).all()
+
+
+def test_finishing_is_an_option_of_the_import(tmp_path: Path) -> None:
+    state, speech = emotalk_state(), speech_of(205)
+    model = imported(state, tmp_path, finish="smooth")
+    expected = savgol_filter(reference(state, speech, 1, 2).numpy().astype(float), 5, 2, axis=0)
+    np.testing.assert_allclose(predict(model, speech, "2"), expected, atol=1e-5)
+    with pytest.raises(FaceDiffError, match="smoth"):
+        imported(state, tmp_path, finish="smoth")
