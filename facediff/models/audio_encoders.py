@@ -61,6 +61,11 @@ class AudioEncoder(nn.Module, ABC):
     takes_padding: ClassVar[bool] = True
     _level: tuple[float, float] | tuple[Tensor, Tensor] | None = None
 
+    @property
+    def has_level(self) -> bool:
+        """Whether speech is standardised by a level that is set, and not by its own."""
+        return self._level is not None
+
     @contextmanager
     def at_level(self, mean: float | Tensor, deviation: float | Tensor) -> Iterator[None]:
         """A context in which speech is standardised by this mean and standard deviation instead of its own."""

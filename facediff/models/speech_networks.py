@@ -1,4 +1,4 @@
-"""Pretrained wav2vec 2.0 and HuBERT, base and large, as the published methods of the field use them.
+"""Pretrained wav2vec 2.0, HuBERT and WavLM, base and large, as the published methods of the field use them.
 
 The methods differ in where they leave the network's 50 steps a second for the motion's frames
 (:data:`~facediff.models.audio_encoders.StepRule`), in the constant by which speech is standardised, and in what is
@@ -33,13 +33,13 @@ from facediff.utils.ranges import Range
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
-NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert"}
+NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
 """Types of networks that are built alike, and how their classes' names begin."""
 
 
 @audio_encoder.register("wav2vec2")
 class Wav2Vec2Encoder(AudioEncoder):
-    """Pretrained wav2vec 2.0 or HuBERT, base or large; all but its convolutions is fine-tuned.
+    """Pretrained wav2vec 2.0, HuBERT or WavLM, base or large; all but its convolutions is fine-tuned.
 
     The published methods that facediff has (FaceFormer and others) encode speech by it; a model of facediff's own
     may as well. ``hubert`` is the encoder that keeps more of the network frozen, whose frozen layers run once a clip.
@@ -56,6 +56,7 @@ class Wav2Vec2Encoder(AudioEncoder):
             had in 2021.
         edges: add 40 zeros at either end of speech, so that every step is centred in its own stretch of it; the
             published methods do not.
+        do_normalize: standardise speech first; without it, the network takes the waveform as it is.
         config: the network's configuration as plain data; if given, the weights are not read from ``source`` but left
             for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
 
@@ -76,13 +77,14 @@ class Wav2Vec2Encoder(AudioEncoder):
         layer_drop: Share = 0.0,
         epsilon: Annotated[float, Range(0, 1, above=True)] = 1e-7,
         edges: bool = True,
+        do_normalize: bool = True,
         config: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.network: Any = load_network(source, config)
         settings = self.network.config
         settings.apply_spec_augment, settings.layerdrop = spec_augment, layer_drop
-        self.epsilon, self.edges = epsilon, edges
+        self.epsilon, self.edges, self.do_normalize = epsilon, edges, do_normalize
         depth = len(self.network.encoder.layers)
         if frozen_layers > depth:
             raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
@@ -118,12 +120,14 @@ class Wav2Vec2Encoder(AudioEncoder):
         """A hash of the convolutions' weights, the configuration, and how speech is standardised."""
         parts = {"feature_extractor": self.network.feature_extractor}
         facts = {**self.network.config.to_dict(), "epsilon": self.epsilon, "edges": self.edges}
+        if not self.do_normalize:
+            facts["do_normalize"] = False
         return fingerprint(0, facts, parts)
 
     @torch.no_grad()
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
         """What the convolutions give, at 50 steps a second."""
-        wave = self.standardise(audio, audio_lengths, self.epsilon)
+        wave = self.standardise(audio, audio_lengths, self.epsilon) if self.do_normalize else audio
         return by_length(wave, audio_lengths, self._convolve)
 
     def _convolve(self, wave: Tensor) -> Tensor:
@@ -181,10 +185,16 @@ class Wav2Vec2Encoder(AudioEncoder):
         # last layer.
         hidden = hidden + encoder.pos_conv_embed(hidden)
         hidden = encoder.dropout(hidden if large else encoder.layer_norm(hidden))
-        for layer in encoder.layers:
-            if self.training and settings.layerdrop > 0 and float(torch.rand(())) < settings.layerdrop:
+        # WavLM's first layer makes the bias of relative positions that all others take, so it is never skipped.
+        related, bias = settings.model_type == "wavlm", None
+        for number, layer in enumerate(encoder.layers):
+            droppable = self.training and settings.layerdrop > 0 and not (related and number == 0)
+            if droppable and float(torch.rand(())) < settings.layerdrop:
                 if processes:  # where every process must give every weight a gradient in every step
                     hidden = hidden + 0.0 * torch.stack([p.sum() for p in layer.parameters()]).sum()
+                continue
+            if related:
+                hidden, bias = layer(hidden, position_bias=bias, **({} if large else {"index": number}))[:2]
                 continue
             hidden = layer(hidden)
             hidden = hidden[0] if isinstance(hidden, tuple) else hidden
@@ -205,5 +215,5 @@ def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[
 
 
 def load_network(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
-    """A wav2vec 2.0 or HuBERT from a directory, from the hub, or from a plain configuration without weights."""
+    """A wav2vec 2.0, HuBERT or WavLM from a directory, from the hub, or from a plain configuration without weights."""
     return load_typed(source, config, NETWORKS, "Model", "network", encoder="wav2vec2")
