@@ -277,8 +277,10 @@ model = Kind(
     "facediff.models.published.emotalk "
     "facediff.models.published.facediffuser "
     "facediff.models.published.faceformer "
+    "facediff.models.published.lam "
     "facediff.models.published.selftalk "
     "facediff.models.published.talkingstyle "
+    "facediff.models.published.unitalker facediff.models.published.unitalker_checkpoints "
     "facediff.models.published.voca",
     "a method, as a LightningModule",
     aliases=False,  # Lightning refuses to reload a module that is named by a nested alias

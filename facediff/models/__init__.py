@@ -15,8 +15,10 @@ if TYPE_CHECKING:
     from facediff.models.published.facediffuser import FaceDiffuser as FaceDiffuser
     from facediff.models.published.faceformer import FaceFormer as FaceFormer
     from facediff.models.published.importing import import_checkpoint as import_checkpoint
+    from facediff.models.published.lam import LamAudio2Expression as LamAudio2Expression
     from facediff.models.published.selftalk import SelfTalk as SelfTalk
     from facediff.models.published.talkingstyle import TalkingStyle as TalkingStyle
+    from facediff.models.published.unitalker import UniTalker as UniTalker
     from facediff.models.published.voca import Voca as Voca
     from facediff.models.style_content import StyleContentDisentanglement as StyleContentDisentanglement
 
@@ -33,8 +35,10 @@ __getattr__, __dir__, __all__ = lazy_names(
         "published.facediffuser": "FaceDiffuser",
         "published.faceformer": "FaceFormer",
         "published.importing": "import_checkpoint",
+        "published.lam": "LamAudio2Expression",
         "published.selftalk": "SelfTalk",
         "published.talkingstyle": "TalkingStyle",
+        "published.unitalker": "UniTalker",
         "published.voca": "Voca",
         "style_content": "StyleContentDisentanglement",
     },

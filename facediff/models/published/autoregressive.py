@@ -488,8 +488,8 @@ def decoder_sizes(weights: AuthorsWeights, prefix: str, dim: int) -> dict[str, A
     return {"dim": dim, "num_layers": len(layers), "feed_forward_dim": hidden}
 
 
-def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts) -> int:
-    """The period of a table of positions, which must be what the formula gives and fit the data set.
+def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts, *, any_rate: bool = False) -> int:
+    """The period of a table of positions, which must be what the formula gives and, unless ``any_rate``, fit the data.
 
     Raises:
         FaceDiffError: if it is another table, or that of another frame rate.
@@ -506,7 +506,7 @@ def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts) -> i
             f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
             f"is of a variant of the method"
         )
-    if period != round(facts.frame_rate):
+    if not any_rate and period != round(facts.frame_rate):
         raise OptionError.naming(
             f"{{dataset}} {facts.dataset}: the positions of {weights.source} repeat every {period} frames, and "
             f"{facts.dataset} has {facts.frame_rate:g} a second; give the data set that it was trained on"

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from facediff.errors import OptionError
 from facediff.utils.option import Option
+from facediff.utils.plain_files import load_json
+from facediff.utils.ranges import Range
+
+ALIASES = {"encoder_config": "audio_config"}
+"""Names of a file of hyper-parameters that stand for an option of another name."""
+
+HPARAMS: dict[str, Callable[[Any], bool]] = {
+    "dataset": lambda value: isinstance(value, str),
+    "identities": lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value),
+    "audio_config": lambda value: isinstance(value, dict),
+    "data_root": lambda value: isinstance(value, str),
+    "template_row": lambda value: type(value) is int and value >= 0,
+}
+"""Options that such a file may hold, and whether a value fits; others are left to the checkpoint."""
+
+MODEL_HPARAMS = ("do_normalize", "epsilon", "num_heads", "chunks", "finish", "long_windows", "normalize_windows")
+"""Options of models and audio encoders that such a file may hold."""
 
 
 @dataclass(frozen=True)
@@ -16,23 +33,31 @@ class ImportOptions:
     """What no checkpoint of a published method holds.
 
     Attributes:
-        dataset: what it was trained on, where the number of vertices does not say it
+        dataset: what it was trained on, where the number of vertices does not say it; of UniTalker the data set whose
+            faces are animated, D3 (ARKit's weights) by default
         identities: training identities in the order of the training command; by default the data set's usual ones
         templates: neutral faces by speaker (templates.pkl); in Python also arrays (V, 3) or (3V,) by name
         regions: folder with lve.txt and fdd.txt, the vertices of lips and upper face
         mesh: the data set's mesh, for triangles, so that faces can be drawn
         audio_config: config.json of an audio encoder of unusual size; in Python also its content
+        data_root: folder of UniTalker's data release, with principal components and neutral faces
+        template_row: neutral face of that release, by default the published demo's
+        hparams: JSON file with what the checkpoint does not say: any of these options by name, audio_config (or
+            encoder_config) as an object, options of the model; in Python also its content
         option: an option of the model or its audio encoder that no file holds, such as num_heads=4; may be repeated;
             ignore=PREFIX leaves out the tensors whose names begin so
         model_options: the same options by name, in Python
     """
 
-    dataset: Literal["vocaset", "biwi", "multiface"] | None = None
+    dataset: Literal["vocaset", "biwi", "multiface", "D0", "D1", "D2", "D3", "D4", "D5", "D6", "D7"] | None = None
     identities: Annotated[Sequence[str] | None, Option(metavar="A,B,…")] = None
     templates: Annotated[Path | Mapping[str, Any] | None, Option(metavar="FILE", reads=True)] = None
     regions: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None
     mesh: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None
     audio_config: Annotated[Path | Mapping[str, Any] | None, Option(metavar="FILE", reads=True)] = None
+    data_root: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None
+    template_row: Annotated[int | None, Option(metavar="N"), Range(0, 100_000)] = None
+    hparams: Annotated[Path | Mapping[str, Any] | None, Option(metavar="FILE", reads=True)] = None
     option: Annotated[list[str] | None, Option(metavar="NAME=VALUE")] = None
     model_options: Annotated[Mapping[str, Any], Option(hidden=True)] = field(default_factory=dict)
 
@@ -42,6 +67,31 @@ class ImportOptions:
         own = {name for name in cls.__dataclass_fields__ if name not in ("option", "model_options")}
         chosen = {name: value for name, value in options.items() if name in own}
         return cls(**chosen, model_options={name: value for name, value in options.items() if name not in own})
+
+    def with_hparams(self) -> tuple[ImportOptions, list[str]]:
+        """These options, with those of the file where they are not given, and the names that are no option here.
+
+        Raises:
+            FaceDiffError: if the file cannot be read, or holds no options by name.
+        """
+        if self.hparams is None:
+            return self, []
+        content: Any = self.hparams
+        if not isinstance(content, Mapping):
+            path, remedy = Path(content), "expected a JSON object of options by name"
+            content = load_json(path, name=f"--hparams {path}", remedy=remedy)
+            if not isinstance(content, dict):
+                raise OptionError.naming(f"{{hparams}} {path}: holds no options by name; {remedy}")
+            if isinstance(content.get("data_root"), str):
+                content["data_root"] = str(path.parent / content["data_root"])
+        own = {ALIASES.get(name, name): value for name, value in content.items()}
+        chosen: dict[str, Any] = {}
+        for name, check in HPARAMS.items():
+            if name in own and getattr(self, name) is None and check(own[name]):
+                chosen[name] = Path(own[name]) if name == "data_root" else own[name]
+        flags = {name: own[name] for name in MODEL_HPARAMS if name in own}
+        left = sorted(own.keys() - HPARAMS.keys() - set(MODEL_HPARAMS))
+        return replace(self, **chosen, model_options={**flags, **self.model_options}), left
 
     def all_model_options(self) -> dict[str, Any]:
         """Options of the model and its audio encoder by name; ``ignore`` is a list where it is repeated.

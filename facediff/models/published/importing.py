@@ -34,6 +34,7 @@ from facediff.models.published.recognition import (
     AuthorsWeights,
     CheckpointFacts,
     DatasetFacts,
+    FaceFacts,
     Recogniser,
     dataset_facts,
 )
@@ -93,7 +94,10 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     weights = read_weights([path for path in files if path.suffix != GRAPH])
     method = recognise(weights)
-    facts = facts_of(weights, method, options, [path for path in files if path.suffix == GRAPH])
+    options, unused = options.with_hparams()
+    own = None if method.faces is None else method.faces(weights, options)
+    graphs = [path for path in files if path.suffix == GRAPH]
+    facts = facts_of(weights, method, options, graphs) if own is None else own_facts(own, method, options)
     converted = method.convert(weights, facts)
     ignore = options.all_model_options().get("ignore", ())
     for prefix in [ignore] if isinstance(ignore, str) else ignore:
@@ -103,10 +107,12 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
             f"{weights.source}: holds tensors that {method.method} has no use for ({listed(left)}); is it a variant "
             f"of the method? If they may be left out, give {{option}} ignore={left[0]}"
         )
-    assets, notes = read_assets(facts, options)
+    assets, notes = read_assets(facts, options) if own is None else own_assets(own, options)
+    if unused:
+        notes.append(f"hparams: not needed, or read from the tensors: {', '.join(unused)}")
     model = build(weights, method, facts, with_options(method.method, converted, facts.model_options))
     model.adopt(assets)
-    label(model, method, facts.dataset)
+    label(model, method, facts.dataset, () if own is None else own.licences)
     return Imported(model.eval(), facts.dataset, len(weights.renamed), weights.ignored, [*weights.notes, *notes])
 
 
@@ -283,6 +289,61 @@ def check_names(identities: Sequence[str]) -> None:
         )
 
 
+def own_facts(faces: FaceFacts, method: Recogniser, options: ImportOptions) -> CheckpointFacts:
+    """What is known of the checkpoint of a method with faces of its own."""
+    asked = options.all_model_options()
+    return CheckpointFacts(
+        dataset=faces.corpus,
+        frame_rate=faces.frame_rate,
+        identities=faces.identities,
+        n_vertices=faces.n_points,
+        audio_config=read_config(options.audio_config),
+        model_options={key: value for key, value in asked.items() if key != "ignore"},
+        space=faces.space,
+        details=faces.details,
+    )
+
+
+def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[str]]:
+    """Assets of such a method, and notes on them.
+
+    Raises:
+        FaceDiffError: if a mesh does not fit its vertices.
+    """
+    everything = torch.arange(faces.n_points)
+    named = {name: torch.tensor(faces.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
+    regions = {name: indices if len(indices) else everything for name, indices in named.items()}
+    assets = Assets(
+        corpus=faces.corpus,
+        synthetic=False,
+        unit=faces.unit,
+        frame_rate=faces.frame_rate,
+        identities=faces.identities,
+        templates=faces.templates,
+        faces=read_triangles(options.mesh, faces.n_points) if faces.space.is_vertices else None,
+        colours=None,
+        regions=regions,
+        space=faces.space,
+    )
+    return assets, list(faces.notes)
+
+
+def read_triangles(mesh: Path | None, count: int) -> Tensor | None:
+    """The triangles of a mesh, if there is one.
+
+    Raises:
+        FaceDiffError: if it has another number of vertices.
+    """
+    from facediff.mesh import read_mesh
+
+    if mesh is None:
+        return None
+    drawn = read_mesh(Path(mesh))
+    if len(drawn.vertices) != count:
+        raise OptionError.naming(f"{{mesh}} {mesh}: has {len(drawn.vertices)} vertices, the checkpoint {count}")
+    return torch.as_tensor(drawn.faces).long()
+
+
 def rate_of(dataset: DatasetFacts, method: Recogniser, option: object) -> float:
     """Frames a second: those of the data set or of the method, or as the user says where the method lets choose.
 
@@ -380,7 +441,6 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
         FaceDiffError: if there are no templates, or anything does not fit the number of vertices.
     """
     from facediff.data.corpus import as_template
-    from facediff.mesh import read_mesh
 
     if not facts.space.is_vertices:
         return parametric_assets(facts), []
@@ -410,14 +470,9 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     else:
         for name, file in (("lips", "lve.txt"), ("upper_face", "fdd.txt")):
             indices[name] = read_region(Path(regions) / file, count)
-    triangles = colours = None
-    if mesh is None:
+    triangles = read_triangles(mesh, count)
+    if triangles is None:
         notes.append("no --mesh: its faces have no triangles, so they can be written but not drawn")
-    else:
-        drawn = read_mesh(Path(mesh))
-        if len(drawn.vertices) != count:
-            raise OptionError.naming(f"{{mesh}} {mesh}: has {len(drawn.vertices)} vertices, the checkpoint {count}")
-        triangles = torch.as_tensor(drawn.faces).long()
     unit = dataset_facts()[facts.dataset].unit
     if count != dataset_facts()[facts.dataset].n_vertices:
         unit = "m"
@@ -429,7 +484,7 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
         identities=facts.identities,
         templates=faces,
         faces=triangles,
-        colours=colours,
+        colours=None,
         regions=indices,
     )
     return assets, notes
@@ -509,7 +564,7 @@ def build(
     return model
 
 
-def label(model: AnimationModel, method: Recogniser, dataset: str) -> None:
+def label(model: AnimationModel, method: Recogniser, dataset: str, data_licences: tuple[Licence, ...] = ()) -> None:
     """Keep the data set's class with the model, and the licences of weights, data set and pretrained network.
 
     By the class, ``facediff test`` knows what to read; where its folder is, no checkpoint knows.
@@ -521,7 +576,7 @@ def label(model: AnimationModel, method: Recogniser, dataset: str) -> None:
         model.data_source = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}"}
     weights = Licence(f"weights of {method.method}", method.licence, method.commercial, method.licence_source)
     model.provenance = {IMPORTED: method.method}
-    model.licences = merged([weights], [data], network_licences(dict(model.hparams)))
+    model.licences = merged([weights], data_licences or [data], network_licences(dict(model.hparams)))
 
 
 def listed(names: Sequence[str]) -> str:

@@ -15,9 +15,10 @@ from typing import Any, Literal
 from torch import Tensor
 
 from facediff.errors import FaceDiffError, OptionError
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import VERTICES, Space
-from facediff.utils.licences import Commercial
+from facediff.utils.licences import Commercial, Licence
 from facediff.utils.limits import quoted
 
 
@@ -48,6 +49,35 @@ def dataset_facts() -> dict[str, DatasetFacts]:
         "biwi": DatasetFacts(23370, 25.0, tuple(Biwi.identities), Biwi.unit),
         "multiface": DatasetFacts(6172, 30.0, ("2", "3", "6", "7", "9", "10", "11", "12", "13"), "0.122"),
     }
+
+
+@dataclass(frozen=True)
+class FaceFacts:
+    """What a method with faces of its own knows of them: whose data set they are, and the space of their motion.
+
+    Attributes:
+        corpus: what it was trained on.
+        space: of its motion.
+        frame_rate: frames a second that it animates.
+        identities: training identities in the order of its table.
+        n_points: vertices or channels.
+        templates: neutral faces (points, dims) by name.
+        unit: unit of length of vertices.
+        licences: of what it was trained on.
+        notes: what the user should know.
+        details: what its recogniser needs to convert the tensors.
+    """
+
+    corpus: str
+    space: Space
+    frame_rate: float
+    identities: list[str]
+    n_points: int
+    templates: dict[str, Tensor]
+    unit: str = "m"
+    licences: tuple[Licence, ...] = ()
+    notes: list[str] = field(default_factory=list)
+    details: dict[str, Any] = field(default_factory=dict)
 
 
 class AuthorsWeights:
@@ -164,12 +194,12 @@ class AuthorsWeights:
         self,
         prefix: str,
         *,
-        kind: Literal["wav2vec2", "hubert"],
+        kind: Literal["wav2vec2", "hubert", "wavlm"],
         facts: CheckpointFacts,
         into: str = "audio_encoder",
         **settings: Any,  # noqa: ANN401
     ) -> Callable[..., Any]:
-        """Use a complete wav2vec 2.0 or HuBERT under ``audio_encoder``, and give the encoder that it belongs to.
+        """Use a complete wav2vec 2.0, HuBERT or WavLM under ``audio_encoder``, and give the encoder that it belongs to.
 
         Args:
             prefix: how its names begin, with the dot.
@@ -179,6 +209,7 @@ class AuthorsWeights:
             settings: options of the encoder, such as ``epsilon``.
         """
         config = backbone_config(self, prefix, kind, facts.audio_config)
+        self.ignore(f"{prefix}lm_head.", "letters of a speech recogniser")
         old = ("weight_g", "parametrizations.weight.original0"), ("weight_v", "parametrizations.weight.original1")
         self.move_all(prefix, f"{into}.network.", old)
         # Without the vector that SpecAugment puts on masked frames, the network is made without masking.
@@ -269,6 +300,8 @@ class CheckpointFacts:
         audio_config: configuration of the audio encoder, where the user gives it.
         model_options: options of the model or its audio encoder that the user gives.
         graph: file of the frozen graph that the method needs as well.
+        space: of the motion.
+        details: what the method's own faces need, see :class:`FaceFacts`.
     """
 
     dataset: str
@@ -279,6 +312,8 @@ class CheckpointFacts:
     audio_config: Mapping[str, Any] | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     graph: Path | None = None
+    space: Space = VERTICES
+    details: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -296,6 +331,7 @@ class Recogniser:
         frame_rate: frames a second that its checkpoints animate, where they are not those of the data set; the option
             ``frame_rate`` then says otherwise.
         graph: the option that names the frozen graph that the method needs as well; empty if it needs none.
+        faces: the faces of a method whose space and data sets are its own; None for vertices of the known data sets.
         licence: of the authors' weights.
         commercial: whether that licence allows commercial use.
         licence_source: where it stands.
@@ -310,6 +346,7 @@ class Recogniser:
     layout: str = ""
     frame_rate: float | None = None
     graph: str = ""
+    faces: Callable[[AuthorsWeights, ImportOptions], FaceFacts] | None = None
     licence: str = "unknown"
     commercial: Commercial = "unknown"
     licence_source: str = ""

@@ -57,6 +57,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "TalkingStyle": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 1},
     "DiffSpeaker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "sampling_steps": 8, "smooth": True},
     "Voca": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "components": 8, "channels": (8, 8)},
+    "LamAudio2Expression": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "identity_dim": 4},
+    "UniTalker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "style_dim": 4, "components": 0},
 }
 """Options by which each published method is small."""
 

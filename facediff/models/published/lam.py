@@ -1,0 +1,323 @@
+"""LAM-Audio2Expression (aigc3d, 2025): speech to the 52 weights of ARKit's face shapes, 30 frames a second.
+
+wav2vec 2.0, whose convolutions' output is resampled to the frames, then convolutions over frames that know the speaker,
+six Transformer layers in the larger variant, and a sigmoid. From top to bottom: the model, its network, the authors'
+checkpoint. docs/methods.md says what of the published code is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.errors import ArgumentError
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.graphs import Spoken
+from facediff.models.inference import BatchMotion, Progress, with_speech
+from facediff.models.layers import Heads, Share, Width, exporting, frame_mask
+from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
+from facediff.models.published.convolutions import AUTHORS_NAMES, ConvolutionStack
+from facediff.models.published.lam_finishing import CONTEXT_FRAMES, Finish, Finishing
+from facediff.models.published.recognition import (
+    AuthorsWeights,
+    CheckpointFacts,
+    Recogniser,
+    register,
+)
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.spaces import Space
+from facediff.speech.frame_clock import FrameClock
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+
+Chunks = Literal["none", "context", "silence"]
+"""How speech is cut: not at all, as of a file; or into chunks as of the published stream, each after the ``context`` of
+the speech before it as its authors meant, or after ``silence`` as the published code does."""
+
+
+@registry.model.register("LamAudio2Expression")
+class LamAudio2Expression(DirectModel):
+    """LAM-Audio2Expression: convolutions over the frames of wav2vec 2.0, for weights of face shapes.
+
+    Channels of a valid range pass through a sigmoid, as published; rotations and vertices do not.
+
+    Args:
+        dim: channels of the decoder.
+        identity_dim: channels of the speaker's row.
+        transformer_layers: layers of the Transformer between the convolutions: 6 in the larger published variant, 0 in
+            the one for streams.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
+        dropout: on the features of speech and in the Transformer.
+        chunks: how speech is cut into the published stream's chunks.
+        chunk_seconds: length of a chunk.
+        finish: what is done with the weights afterwards, as names joined by ``+``: ``mouth`` (damped in silence),
+            ``smooth``, ``symmetric`` as published or ``halves`` as meant, and ``blinks``; see
+            :mod:`facediff.models.published.lam_finishing`.
+        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+    """
+
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder,
+        source="facebook/wav2vec2-base-960h",
+        edges=False,
+        do_normalize=False,  # the network takes the waveform as it is
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width = 512,
+        identity_dim: Width = 64,
+        transformer_layers: Annotated[int, Range(0, 256)] = 0,
+        num_heads: Heads = 8,
+        feed_forward_dim: Width | None = None,
+        dropout: Share = 0.1,
+        chunks: Chunks = "none",
+        chunk_seconds: Annotated[float, Range(0.05, 2.1)] = 1.0,
+        finish: str = "",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(**options)
+        if transformer_layers and dim % num_heads:
+            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of num_heads")
+        self.chunks, self.chunk = chunks, round(chunk_seconds * SAMPLE_RATE)
+        self.finishing = Finishing.of(finish, self.space, self.frame_rate)
+        self.network = LamNetwork(
+            audio_width=self.audio_width,
+            space=self.space,
+            coordinates=self.dims * self.n_vertices,
+            n_identities=len(self.identities),
+            dim=dim,
+            identity_dim=identity_dim,
+            layers=transformer_layers,
+            num_heads=num_heads,
+            hidden_dim=feed_forward_dim or 2 * dim,
+            dropout=dropout,
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The table of speakers."""
+        return [self.network.style]
+
+    @property
+    def clock(self) -> FrameClock:
+        """A frame for every part of one that speech lasts."""
+        return FrameClock(self.frame_rate, "up")
+
+    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
+        """All of the motion."""
+        return batch.frame_lengths
+
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Hidden states of the speech network, whose convolutions' output is resampled to the frames."""
+        cached = heard.cached_features or ()
+        return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "features", *cached)
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The mean absolute error."""
+        frames = self.trained_frames(batch)
+        predicted = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
+        truth = (batch.motion * self.scale).flatten(2)[:, : predicted.shape[1]]
+        error = masked_mean((predicted - truth).abs(), frames)
+        return {"reconstruction": error, "loss": error}
+
+    def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
+        """Every frame sees its neighbours, and of the larger variant all others."""
+        mask = None if frames is None or exporting() else frame_mask(frames, features.shape[1])
+        values: Tensor = self.network(features, weights, mask)
+        return values * self.scale
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """All frames in one pass or chunk by chunk, then what was chosen to finish them."""
+        if self.chunks == "none" and not self.finishing.steps:
+            return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
+        motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
+        for row, (count, seed) in enumerate(zip(frames.tolist(), seeds, strict=True)):
+            clip = batch.select([row])
+            speech = clip.audio[0, : int(clip.audio_lengths[0])]
+            finish = self.finishing.start(seed)
+            if self.chunks == "none":
+                own = super().generate_frames(clip, frames[row : row + 1], seeds=[seed])[0]
+                finished = finish.whole(own[..., 0].float().cpu().numpy(), speech.float().cpu().numpy())
+            else:
+                parts = self.stream_chunks(clip, self.chunk, context=self.chunks == "context", finish=finish)
+                finished = np.concatenate(list(parts))[:count]
+            motion[row, : len(finished)] = torch.from_numpy(finished).to(motion).view(-1, *motion.shape[2:])
+        return motion
+
+    def stream_chunks(
+        self, clip: Batch, samples: int, *, context: bool, finish: Finish | None = None
+    ) -> Iterator[np.ndarray]:
+        """What the published stream gives of each chunk of one clip's speech, (frames, coordinates).
+
+        Args:
+            clip: a batch of one clip.
+            samples: of a chunk.
+            context: compute each chunk after the speech before it; else after silence. The published code never notes
+                that the first chunk is over, so that each has silence before it.
+            finish: what is done with the weights of each chunk.
+        """
+        speech = clip.audio[0, : int(clip.audio_lengths[0])]
+        window = SAMPLE_RATE * CONTEXT_FRAMES // 30
+        for start in range(0, len(speech), samples):
+            chunk = speech[start : start + samples]
+            before = speech.new_zeros(window - len(chunk))
+            past = speech[max(0, start - len(before)) : start] if context else speech[:0]
+            before[len(before) - len(past) :] = past
+            heard = torch.cat([before, chunk])
+            count = self.frames_of(len(heard))
+            first = int(CONTEXT_FRAMES - len(chunk) / SAMPLE_RATE * 30)
+            window_clip = with_speech(clip, heard, count)
+            motion = super().generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
+            values = motion.flatten(1)[first:].detach().float().cpu().numpy()
+            yield values if finish is None else finish.chunk(values, chunk.float().cpu().numpy())
+
+
+class LamNetwork(nn.Module):
+    """Features of speech and a speaker to values of channels.
+
+    Args:
+        audio_width: channels of the features.
+        space: of the motion; says which channels are bounded.
+        coordinates: numbers of a frame.
+        n_identities: rows of the table of speakers.
+        dim: channels.
+        identity_dim: channels of a speaker's row.
+        layers: of the Transformer.
+        num_heads: its attention heads.
+        hidden_dim: channels of its feed-forward layers.
+        dropout: on the features, and in the Transformer.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        space: Space,
+        coordinates: int,
+        n_identities: int,
+        dim: int,
+        identity_dim: int,
+        layers: int,
+        num_heads: int,
+        hidden_dim: int,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.style = SpeakerTable(n_identities, identity_dim)
+        self.style_bias = nn.Parameter(torch.empty(identity_dim).uniform_(-1, 1) / math.sqrt(n_identities))
+        self.dropout = nn.Dropout(dropout)
+        self.encoder = ConvolutionStack(dim + identity_dim, dim)
+        self.transformer = nn.ModuleList(
+            nn.TransformerEncoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True) for _ in range(layers)
+        )
+        self.decoder = ConvolutionStack(dim, dim, residual=False)
+        self.motion_out = nn.Linear(dim, coordinates)
+        low, high = space.valid_range or (0.0, 1.0)
+        bounded = torch.zeros(coordinates, dtype=torch.bool)
+        if space.valid_range is not None:
+            bounded[list(space.face)] = True
+        self.low, self.high = low, high
+        self.register_buffer("bounded", bounded, persistent=False)
+
+    bounded: Bool[Tensor, " coordinates"]
+
+    def encode(
+        self,
+        features: Float[Tensor, "batch frames width"],
+        weights: Float[Tensor, "batch identities"],
+        mask: Bool[Tensor, "batch frames"] | None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """Speech that knows its speaker."""
+        style = (self.style(weights) + self.style_bias)[:, None].expand(-1, features.shape[1], -1)
+        x = self.encoder(torch.cat([self.dropout(self.audio_map(features)), style.to(features)], -1), mask)
+        for layer in self.transformer:
+            x = layer(x, src_key_padding_mask=None if mask is None else ~mask)
+        return x
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames width"],
+        weights: Float[Tensor, "batch identities"],
+        mask: Bool[Tensor, "batch frames"] | None = None,
+    ) -> Float[Tensor, "batch frames coordinates"]:
+        """Values of the channels; frames outside the mask have no meaning."""
+        values = self.motion_out(self.decoder(self.encode(features, weights, mask), mask))
+        bounded = self.low + (self.high - self.low) * torch.sigmoid(values)
+        return torch.where(self.bounded, bounded, values)
+
+
+# The authors' checkpoints.
+
+PREFIXES = ("module.backbone.", "backbone.", "module.", "")
+"""How the names of the tensors may begin, by how they were trained and saved."""
+
+
+USUAL = 153
+"""The speaker of the published demo of the larger variant; that of the one for streams takes the first."""
+
+
+def count_channels(weights: AuthorsWeights, *, prefix: str) -> int:
+    """Weights of a frame."""
+    return weights.shape(f"{prefix}output_proj.weight")[0]
+
+
+def count_speakers(weights: AuthorsWeights, *, prefix: str) -> int:
+    """Columns of the speakers' map."""
+    return weights.shape(f"{prefix}identity_encoder.id_mlp.weight", 3)[1]
+
+
+def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, prefix: str) -> dict[str, Any]:
+    """The tensors under the names of this file, and the model's options."""
+    encoder = weights.backbone(
+        f"{prefix}audio_encoder.", kind="wav2vec2", facts=facts, **LamAudio2Expression.encoder_settings()
+    )
+    identity = f"{prefix}identity_encoder."
+    weights.ignore(f"{identity}grus.", "a recurrent layer that the published code makes and never uses")
+    weights.move_all(f"{prefix}feature_projection.", "network.audio_map.")
+    rows = weights.get(f"{identity}id_mlp.weight")
+    weights.renamed["network.style.weight"] = rows[..., 0].T.contiguous()
+    weights.move(f"{identity}id_mlp.bias", "network.style_bias")
+    weights.move_all(f"{identity}first_net.conv_layers.", "network.encoder.layers.", AUTHORS_NAMES)
+    weights.move_all(f"{identity}transformer_encoder.layers.", "network.transformer.")
+    weights.move_all(f"{prefix}decoder.0.", "network.decoder.layers.", AUTHORS_NAMES)
+    weights.move_all(f"{prefix}output_proj.", "network.motion_out.")
+    if len(facts.identities) > USUAL:
+        weights.notes.append(f"the published demo of this variant animates identity {facts.identities[USUAL]}")
+    layers = {name.split(".")[2] for name in weights.renamed if name.startswith("network.transformer.")}
+    dim, _ = weights.shape(f"{prefix}feature_projection.weight")
+    sizes: dict[str, Any] = {"dim": dim, "identity_dim": rows.shape[0], "transformer_layers": len(layers)}
+    if layers:
+        sizes["feed_forward_dim"] = weights.shape(f"{identity}transformer_encoder.layers.0.linear1.weight")[0]
+    return {"audio_encoder": encoder, **sizes}
+
+
+for start in PREFIXES:
+    register(
+        Recogniser(
+            method="LamAudio2Expression",
+            marks=tuple(f"{start}{name}" for name in ("identity_encoder.id_mlp.weight", "output_proj.weight")),
+            unless=(),
+            convert=partial(convert, prefix=start),
+            vertices=partial(count_channels, prefix=start),
+            count=partial(count_speakers, prefix=start),
+            layout="arkit",
+            frame_rate=30.0,
+            licence="Apache-2.0",
+            commercial="allowed",
+            licence_source="github.com/aigc3d/LAM_Audio2Expression",
+        )
+    )

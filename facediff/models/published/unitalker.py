@@ -1,0 +1,347 @@
+"""UniTalker (Fan, Li, Lin, Xiao, Yang: "UniTalker: Scaling up Audio-Driven 3D Facial Animation", 2024).
+
+One network with a head for each kind of face that its eight data sets have: vertices as principal components, weights
+of ARKit's shapes, coefficients of FLAME. Here a model has one head, that of its corpus. From top to bottom: the model
+and its networks; the authors' checkpoint is read in ``unitalker_checkpoints.py``. docs/methods.md says what of the
+published code is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch, SpeechMotionDataModule
+from facediff.errors import ArgumentError
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.evaluation import IdentityPolicy
+from facediff.models.graphs import Spoken
+from facediff.models.inference import BatchMotion, Progress, Style, with_speech
+from facediff.models.layers import Heads, Share, Weight, Width, exporting, frame_mask
+from facediff.models.published.autoregressive import PeriodicDecoder
+from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
+from facediff.models.published.convolutions import ConvolutionStack
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.speech.frame_clock import FrameClock
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+
+COMMON = "common"
+"""The style of the last row of the table: of nobody, which training also shows to clips of the training speakers."""
+
+DecoderKind = Literal["conv", "transformer"]
+
+Published = Literal["published", "whole"]
+"""How speech beyond 25 s is animated: in the ``published`` windows of 25 s, which overlap by 5 s, or as a ``whole``."""
+
+WINDOW, OVERLAP = 25, 5
+"""Seconds of a published window, and of its overlap with the next."""
+
+
+@registry.model.register("UniTalker")
+class UniTalker(DirectModel):
+    """UniTalker: convolutions or one Transformer layer over the frames of a speech network, and a head.
+
+    Its table of speakers has one row more than there are training identities, ``common``, for unknown speakers.
+
+    Args:
+        dim: channels of the decoder.
+        style_dim: channels of a speaker's row, of ``conv``; those of a Transformer are ``dim``.
+        decoder_type: ``conv``, as the released models, or ``transformer``.
+        num_heads: attention heads of the Transformer.
+        period: frames after which its positions and its attention's bias repeat.
+        dropout: on the features of speech, and in the Transformer.
+        components: principal components of the training motion that the head of a corpus of vertices predicts; 0 for
+            the vertices themselves, as of weights.
+        component_weight: of the squared error of these components.
+        value_weight: of the squared error of the values of a parametric space, next to that of what they move.
+        common_share: share of the clips that are shown as of nobody in training.
+        frozen_epochs: epochs in the beginning in which the speech network is not trained.
+        long_windows: how speech beyond 25 s is animated.
+        normalize_windows: standardise each published window once more, after the standardisation of all speech, as the
+            published code does where its speech network asks for it.
+        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+    """
+
+    # WavLM base plus asks for no standardisation of its speech: the published B model hears the waveform as it is.
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder, source="microsoft/wavlm-base-plus", spec_augment=True, edges=False, do_normalize=False
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width = 256,
+        style_dim: Width = 64,
+        decoder_type: DecoderKind = "conv",
+        num_heads: Heads = 4,
+        period: Annotated[int, Range(1, 100_000)] = 30,
+        dropout: Share = 0.1,
+        components: Annotated[int, Range(0, 16_384)] | None = None,
+        component_weight: Weight = 0.01,
+        value_weight: Weight = 1e-4,
+        common_share: Share = 0.1,
+        frozen_epochs: Annotated[int, Range(0, 10**6)] = 1,
+        long_windows: Published = "published",
+        normalize_windows: bool = True,
+        unseen_identity: IdentityPolicy = "style_only",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(unseen_identity=unseen_identity, **options)
+        if decoder_type == "transformer" and (dim % num_heads or dim % 2):
+            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
+        self.component_weight, self.value_weight = component_weight, value_weight
+        self.common_share, self.frozen_epochs = common_share, frozen_epochs
+        self.long_windows, self.normalize_windows = long_windows, normalize_windows
+        if long_windows == "published":
+            self.windows = type(self.windows)(above=math.inf)
+        if components is None:
+            components = 512 if self.space.is_vertices else 0
+        self.network = UniTalkerNetwork(
+            audio_width=self.audio_width,
+            coordinates=self.dims * self.n_vertices,
+            rows=len(self.identities) + 1,
+            dim=dim,
+            style_dim=dim if decoder_type == "transformer" else style_dim,
+            decoder_type=decoder_type,
+            num_heads=num_heads,
+            period=period,
+            dropout=dropout,
+            components=components,
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The table of speakers."""
+        return [self.network.style]
+
+    def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
+        """The head's principal components are those of the training motion."""
+        count = self.network.components
+        principal = super().measure(data, max(at_least, count))
+        if count:
+            mean, shapes = data.principal_motion(count)
+            self.network.attach(mean * self.scale, shapes * self.scale)
+        return principal
+
+    # Speakers: one row more than identities.
+
+    def weights_of(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch rows"]:
+        """One-hot rows of identities; of an unknown speaker (−1) the common one."""
+        count = len(self.identities)
+        return F.one_hot(torch.where(identity >= 0, identity, count), count + 1).float()
+
+    def identity_weights(self, batch: Batch) -> Float[Tensor, "batch rows"]:
+        """One-hot rows of the clips' identities, or the weights of their styles."""
+        if batch.style is not None and batch.style.shape[1] == len(self.identities) + 1:
+            return batch.style.to(batch.template)
+        return self.weights_of(batch.identity).to(batch.template)
+
+    def own_styles(self) -> dict[str, Style]:
+        """Each training identity, and the common style."""
+        names = [*self.identities, COMMON]
+        return {name: Style(name, row) for name, row in zip(names, torch.eye(len(names)), strict=True)}
+
+    # Frames.
+
+    @property
+    def clock(self) -> FrameClock:
+        """As many frames as speech lasts, rounded to even."""
+        return FrameClock(self.frame_rate, "rows")
+
+    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
+        """All of the motion."""
+        return batch.frame_lengths
+
+    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+        """Hidden states of the speech network, resampled to the frames."""
+        cached = heard.cached_features or ()
+        return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden", *cached)
+
+    def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
+        """Offsets from the template."""
+        mask = None if frames is None or exporting() else frame_mask(frames, features.shape[1])
+        motion: Tensor = self.network.motion(self.network.head(self.network(features, weights, mask)))
+        return motion
+
+    # Training and inference.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Squared errors: of vertices and their components; of weights what they move, and a little of themselves."""
+        frames = self.trained_frames(batch)
+        features = self.hear(batch, frames)
+        if self._trainer is not None and self.training and self.trainer.current_epoch < self.frozen_epochs:
+            # Gradients of zero, and not none: every process must give every weight one.
+            features = features.detach() + 0.0 * (features - features.detach())
+        weights = self.identity_weights(batch)
+        if self.training and self.common_share:
+            drawn = torch.rand(len(weights), generator=generator, device=weights.device) < self.common_share
+            weights = torch.where(drawn[:, None], self.weights_of(torch.full_like(batch.identity, -1)), weights)
+        mask = frame_mask(frames, features.shape[1])
+        coded = self.network.head(self.network(features, weights, mask))
+        shape = (*features.shape[:2], self.n_vertices, self.dims)
+        truth = (batch.motion * self.scale)[:, : shape[1]]
+        difference = self.network.motion(coded).view(shape) - truth
+        reconstruction = masked_mean(self.weighed(difference).square(), frames)
+        losses = {"reconstruction": reconstruction}
+        loss = reconstruction
+        if not self.space.is_vertices:
+            losses["values"] = masked_mean(difference.square(), frames)
+            loss = loss + self.value_weight * losses["values"]
+        if self.network.components:
+            own = self.network.coefficients(truth.flatten(2))
+            losses["components"] = masked_mean((coded - own).square(), frames)
+            loss = loss + self.component_weight * losses["components"]
+        return {**losses, "loss": loss}
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """In one pass, or of long speech in the published windows."""
+        batch, whole = self.standardised(batch), self.long_windows == "whole" or exporting()
+        if whole or int(batch.audio_lengths.max()) <= WINDOW * SAMPLE_RATE:
+            return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
+        motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
+        for row, count in enumerate(frames.tolist()):
+            own = self.in_windows(batch.select([row]))[:count]
+            motion[row, : len(own)] = own
+        return motion
+
+    def standardised(self, batch: Batch) -> Batch:
+        """Speech as the published code hands it on: standardised here, and again by the speech network.
+
+        The second time changes little of a short clip, but a window of long speech then has a level of its own.
+        """
+        encoder = self.audio_encoder
+        own_level = (
+            not getattr(encoder, "do_normalize", False) or encoder.has_level or batch.cached_features is not None
+        )
+        if own_level or not self.normalize_windows:
+            return batch
+        audio = encoder.standardise(batch.audio, batch.audio_lengths, encoder.epsilon)  # type: ignore[arg-type]
+        return replace(batch, audio=audio)
+
+    def in_windows(self, clip: Batch) -> Float[Tensor, "frames points dims"]:
+        """Motion of one clip: windows of 25 s, over whose 5 s of overlap one goes over into the next linearly."""
+        speech = clip.audio[0, : int(clip.audio_lengths[0])]
+        window, step = WINDOW * SAMPLE_RATE, (WINDOW - OVERLAP) * SAMPLE_RATE
+        count = max(0, math.ceil((len(speech) / SAMPLE_RATE - WINDOW) / (WINDOW - OVERLAP))) + 1
+        shared = round(OVERLAP * self.frame_rate)
+        # Both ends of the overlap are of one window alone, as published.
+        share = torch.linspace(0, 1, shared, dtype=torch.float64, device=speech.device).view(-1, 1, 1)
+        motion = clip.template.new_zeros(0, *clip.template.shape[1:])
+        for number in range(count):
+            samples = speech[number * step : number * step + window]
+            piece = with_speech(clip, samples, max(1, self.frames_of(len(samples))))
+            with self.level_of(speech):
+                now = super().generate_frames(piece, piece.frame_lengths, seeds=[0])[0]
+            if number:
+                mixed = (1 - share) * motion[-shared:] + share * now[:shared]
+                now = torch.cat([mixed.to(now), now[shared:]])
+            motion = torch.cat([motion[:-shared] if number else motion, now])
+        return motion
+
+    def level_of(self, speech: Float[Tensor, " samples"]) -> AbstractContextManager[None]:
+        """Within it, windows are standardised by the level of all speech, unless each has its own."""
+        encoder = self.audio_encoder
+        if self.normalize_windows or encoder.has_level:
+            return nullcontext()
+        return encoder.at_level(float(speech.mean()), float((speech.var(correction=0) + 1e-7).sqrt()))
+
+
+class UniTalkerNetwork(nn.Module):
+    """Features of speech and a speaker to the coefficients of a head, and these to motion.
+
+    Args:
+        audio_width: channels of the features.
+        coordinates: numbers of a frame of motion.
+        rows: of the table of speakers.
+        dim: channels.
+        style_dim: channels of a speaker's row.
+        decoder_type: what stands between speech and head.
+        num_heads: attention heads of a Transformer.
+        period: of its positions and its attention's bias.
+        dropout: on the features, or in the Transformer.
+        components: linear shapes that the head predicts the coefficients of; 0 for motion itself.
+    """
+
+    def __init__(
+        self,
+        *,
+        audio_width: int,
+        coordinates: int,
+        rows: int,
+        dim: int,
+        style_dim: int,
+        decoder_type: DecoderKind,
+        num_heads: int,
+        period: int,
+        dropout: float,
+        components: int,
+    ) -> None:
+        super().__init__()
+        self.style = SpeakerTable(rows, style_dim, like="embedding")
+        self.audio_map = nn.Linear(audio_width, dim)
+        self.dropout = nn.Dropout(dropout)
+        self.convolutions = ConvolutionStack(dim + style_dim, dim) if decoder_type == "conv" else None
+        self.transformer = None
+        if decoder_type == "transformer":
+            self.transformer = PeriodicDecoder(
+                dim=dim, num_layers=1, num_heads=num_heads, hidden_dim=2 * dim, dropout=dropout, period=period, steps=1
+            )
+        self.components = components
+        self.head = nn.Linear(dim, components or coordinates)
+        nn.init.zeros_(self.head.weight)  # training starts from the face that does not move
+        nn.init.zeros_(self.head.bias)
+        self.register_buffer("mean", torch.zeros(coordinates) if components else None)
+        self.register_buffer("basis", torch.zeros(components, coordinates) if components else None)
+
+    mean: Tensor | None
+    basis: Tensor | None
+
+    def attach(self, mean: Float[Tensor, " all"], basis: Float[Tensor, "components all"]) -> None:
+        """Take over linear shapes; those that training motion has too little of stay zero."""
+        assert self.mean is not None  # noqa: S101 - of a head with components
+        assert self.basis is not None  # noqa: S101
+        count = min(len(basis), len(self.basis))
+        self.mean.copy_(mean)
+        self.basis[:count].copy_(basis[:count])
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames width"],
+        weights: Float[Tensor, "batch rows"],
+        mask: Bool[Tensor, "batch frames"] | None = None,
+    ) -> Float[Tensor, "batch frames dim"]:
+        """What the heads take; frames outside the mask have no meaning."""
+        style, memory = self.style(weights), self.audio_map(features)
+        if self.transformer is not None:
+            # Its queries are the speaker and the frame's position alone; a frame hears its own moment of the speech.
+            tokens = style[:, None].expand(-1, memory.shape[1], -1)
+            decoded: Tensor = self.transformer(tokens, memory)
+            return decoded
+        assert self.convolutions is not None  # noqa: S101
+        spread = style[:, None].expand(-1, memory.shape[1], -1).to(memory)
+        convolved: Tensor = self.convolutions(torch.cat([self.dropout(memory), spread], -1), mask)
+        return convolved
+
+    def motion(self, coded: Float[Tensor, "batch frames codes"]) -> Float[Tensor, "batch frames coordinates"]:
+        """Offsets of the head's coefficients."""
+        return coded if self.basis is None or self.mean is None else coded @ self.basis + self.mean
+
+    def coefficients(
+        self, motion: Float[Tensor, "batch frames coordinates"]
+    ) -> Float[Tensor, "batch frames components"]:
+        """Coefficients of offsets, for shapes that are orthogonal to each other."""
+        assert self.mean is not None  # noqa: S101
+        assert self.basis is not None  # noqa: S101
+        return (motion - self.mean) @ (self.basis / self.basis.square().sum(1, keepdim=True).clamp_min(1e-12)).T
