@@ -33,6 +33,15 @@ def keys_of(path: Path | str) -> set[str]:
     return {str(key.value) for key, _ in root.value} if isinstance(root, yaml.MappingNode) else set()
 
 
+def loggers_of(path: Path | str) -> list[str]:
+    """Class names of the loggers that a config, which :func:`check_config` has let through, states itself."""
+    content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only
+    trainer = content.get("trainer")
+    loggers = trainer.get("logger") if isinstance(trainer, dict) else None
+    entries = loggers if isinstance(loggers, list) else [loggers]
+    return [str(entry["class_path"]).rpartition(".")[2] for entry in entries if "class_path" in (entry or {})]
+
+
 PARTS = ("model", "data", "trainer")
 """Folders of the bundled configs that hold one part of an experiment, and the options that take such a part."""
 

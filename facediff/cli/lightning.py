@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.configs import as_parts, bundled_config, check_config, keys_of
+from facediff.cli.configs import as_parts, bundled_config, check_config, keys_of, loggers_of
 from facediff.cli.process import StoppedBySignal, tell
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, printable
 from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
 from facediff.utils.hub import check_model_source, check_training_source, model_path
@@ -58,6 +58,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     """Run one of Lightning's subcommands; the object that holds what it made: trainer, model, data module."""
     check_options(name, arguments)
     options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+    tell_replaced_loggers(options)
     checkpoint = value_of(options, "--ckpt_path")
     if checkpoint is not None and checkpoint != "last":  # that depends on the config
         check_model_source(checkpoint, "--ckpt_path")
@@ -264,6 +265,25 @@ def find_config(flag: str, value: str) -> str:
     near = difflib.get_close_matches(value, names, n=1)
     hint = f'did you mean "{near[0]}"?' if near else "the bundled ones are configs/experiment/puppet.yaml and others"
     raise FaceDiffError(f"--config {value}: no such file; {hint}")
+
+
+def tell_replaced_loggers(arguments: Sequence[str]) -> None:
+    """Say which loggers of a config a later config replaces: a list in a config is never added to another one's."""
+    earlier: dict[str, str] = {}  # loggers and their files
+
+    def look(flag: str, value: str) -> str:
+        loggers = loggers_of(value) if flag in ("-c", "--config") and os.path.isfile(value) else []  # noqa: PTH113
+        replaced = [logger for logger in earlier if logger not in loggers] if loggers else []
+        if replaced:
+            names = f"{' and '.join(replaced)} of {earlier[replaced[0]]}"
+            note = f"{value}: its loggers replace {names}; list all of them in one config if all are to log"
+            print(printable(note), file=sys.stderr, flush=True)
+        if loggers:
+            earlier.clear()
+            earlier.update(dict.fromkeys(loggers, value))
+        return value
+
+    change_values(arguments, look)
 
 
 def experiment_name(arguments: Sequence[str]) -> str | None:

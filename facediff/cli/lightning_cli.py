@@ -29,6 +29,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from facediff import registry
 from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
@@ -117,6 +118,12 @@ def parsing(arguments: Sequence[str], experiment: Callable[..., str]) -> Iterato
     argv, sys.argv = sys.argv, [sys.argv[0], *arguments]
     try:
         yield
+    except OmegaConfBaseException as error:  # a key, a variable or a grammar that is not there
+        option, reason = str(error.full_key or "").partition(".")[2], str(error).partition("\n")[0]
+        raise FaceDiffError(
+            f"--config: ${{…}} of {option or 'an option'} cannot be resolved ({reason}); expected ${{KEY}} with a key "
+            f"of the config, or ${{oc.env:NAME}}"
+        ) from error
     finally:
         sys.argv = argv
 

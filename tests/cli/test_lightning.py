@@ -20,6 +20,7 @@ import torch
 import yaml
 
 from facediff.cli.app import main
+from facediff.cli.lightning import tell_replaced_loggers
 from facediff.models import load_model
 from tests.cli.conftest import SMALL
 from tests.fakes import processes
@@ -464,3 +465,25 @@ def test_freed_memory_is_kept_for_the_next_step() -> None:
     before, told, _, after = done.stdout.split()
     if told == "True":  # another C library has nothing to be told
         assert int(after) < 0.01 * int(before)
+
+
+@pytest.mark.parametrize("value", ["${nope.x}", "${", "${oc.env:FACEDIFF_NOT_SET}", "${nope:1}"])
+def test_an_interpolation_that_cannot_be_resolved_names_its_option(
+    value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.yaml").write_text(f"model: {{class_path: DualPathDiffusion, init_args: {{dim: '{value}'}}}}\n")
+    assert main(["fit", "--config", str(tmp_path / "mine.yaml"), "--data=Puppet"]) == 2
+    error = capsys.readouterr().err
+    assert "--config" in error and "model.init_args.dim" in error
+
+
+def test_loggers_that_another_config_replaces_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, loggers in {"one": ("Wandb", "CSV"), "two": ("CSV",), "three": ("TensorBoard", "CSV")}.items():
+        entries = ", ".join(f"{{class_path: lightning.pytorch.loggers.{logger}Logger}}" for logger in loggers)
+        (tmp_path / f"{name}.yaml").write_text(f"trainer: {{logger: [{entries}]}}\n")
+    one, two, three = ([f"--config={tmp_path / name}.yaml"] for name in ("one", "two", "three"))
+    tell_replaced_loggers(two + three)  # adds one, replaces none
+    assert not capsys.readouterr().err
+    tell_replaced_loggers(one + two)
+    note = capsys.readouterr().err
+    assert "WandbLogger of" in note and "one.yaml" in note and "two.yaml" in note and "CSVLogger" not in note

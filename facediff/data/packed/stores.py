@@ -176,7 +176,7 @@ class RemoteStore:
                 raise MissingExtraError("fsspec", "packed", "reading a corpus from an address") from error
             try:
                 self._system, self._base = fsspec.core.url_to_fs(self.source, skip_instance_cache=True)
-            except (ImportError, ValueError) as error:
+            except Exception as error:  # every file system asks for options of its own
                 raise FaceDiffError(
                     f"{self.source}: cannot be opened ({brief(error)}); install what fsspec names, or correct the "
                     f"address"
