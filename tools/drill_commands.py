@@ -129,7 +129,7 @@ DRILLS = [
     ),
     Drill("export-model", "model.ckpt -o face-onnx", once=True),
     Drill("serve", "face -o site", also=WEB_RUNTIME, once=True),
-    Drill("publish", "model.ckpt face --license mit", also="test_scores.csv", once=True),
+    Drill("publish", "model.ckpt published --license mit", also="test_scores.csv", once=True),
     Drill(
         "style extract",
         "A_e01.npy --checkpoint model.ckpt -o style.npy",

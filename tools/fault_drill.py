@@ -272,6 +272,7 @@ def run_forked(
             onnxruntime_web.web_runtime = lambda *_, **__: files
         if Path("demo.yaml").exists():
             demo.CONFIG = "demo.yaml"
+            demo.compare_with_bundled = lambda *_: []  # that model does not know the speakers of this corpus
         sys.argv = ["facediff", *words]
         sys.path[:] = [each for each in sys.path if each != ""]
         os.write(writer, b"begun ")
@@ -403,6 +404,8 @@ def plain(value: Any) -> Any:  # noqa: ANN401
         array = value.detach().contiguous()
         return [str(array.dtype), list(array.shape), hashlib.sha256(array.numpy().tobytes()).hexdigest()]
     if isinstance(value, dict):
+        if value.get("metric") == "real_time_factor":
+            return None
         return {str(k): plain(v) for k, v in value.items() if not of_a_clock(k)}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]

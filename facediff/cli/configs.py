@@ -39,7 +39,7 @@ def loggers_of(path: Path | str) -> list[str]:
     trainer = content.get("trainer")
     loggers = trainer.get("logger") if isinstance(trainer, dict) else None
     entries = loggers if isinstance(loggers, list) else [loggers]
-    return [str(entry["class_path"]).rpartition(".")[2] for entry in entries if "class_path" in (entry or {})]
+    return [str(entry["class_path"]).rpartition(".")[2] for entry in entries if entry and "class_path" in entry]
 
 
 PARTS = ("model", "data", "trainer")

@@ -17,6 +17,7 @@ from facediff.editing.eyes import GIVE, Array, Eyes, smooth_step
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
+from facediff.utils.files import reserve_room
 
 PROCEDURAL = "procedural"  # Metadata key: what was added by rules
 EDITED = "edited"  # Metadata key: how the animation's own motion was changed
@@ -365,13 +366,23 @@ def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     name = f".facediff-{secrets.token_hex(8)}.partial"
     try:
         path = folder / name
-        room = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+        room = _mapped(path, vertices.shape)
     except OSError:
         path = temporary / name
-        room = np.memmap(path, np.float32, "w+", shape=vertices.shape)
+        room = _mapped(path, vertices.shape)
     with suppress(OSError):  # Windows keeps a file that is in use
         path.unlink()
     return room
+
+
+def _mapped(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    array = np.memmap(path, np.float32, "w+", shape=shape)
+    try:
+        reserve_room(path)
+    except OSError:
+        path.unlink()
+        raise
+    return array
 
 
 def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

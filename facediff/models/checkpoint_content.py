@@ -27,6 +27,9 @@ from facediff.utils.plain_options import is_name, is_plain_text
 PROVENANCE_KEY = "facediff_provenance"
 """Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
 
+COUNTED = {"epochs": "epoch", "steps": "global_step"}
+"""Of the provenance, what a checkpoint of training counts itself, and where."""
+
 IMPORTED = "imported"
 """In the provenance: the method whose authors' checkpoint the weights were imported from."""
 
@@ -157,8 +160,12 @@ class CheckpointContent(LightningModule, Inference):
         checkpoint[ASSETS_KEY] = self.assets.state()
         checkpoint[DATA_SOURCE_KEY] = self.data_source
         checkpoint[LICENCES_KEY] = [licence.state() for licence in self.licences]
-        if self.provenance:
-            checkpoint[PROVENANCE_KEY] = dict(self.provenance)
+        if self._trainer is not None:  # a run that goes on from a checkpoint counts its own
+            provenance = {name: text for name, text in self.provenance.items() if name not in COUNTED}
+        else:
+            provenance = dict(self.provenance)
+        if provenance:
+            checkpoint[PROVENANCE_KEY] = provenance
         if self.style_source == "person":
             # By the weights that are saved: weight averaging has replaced the present ones in the checkpoint by now.
             if self._trainer is not None and isinstance(self.trainer.datamodule, SpeechMotionDataModule):  # type: ignore[attr-defined]
@@ -199,7 +206,7 @@ def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
         isinstance(text, str) and is_plain_text(text) for pair in texts.items() for text in pair
     ):
         raise FaceDiffError(f"its provenance is {quoted(texts)}; expected texts by name. The file is damaged")
-    counted = {"epochs": checkpoint.get("epoch"), "steps": checkpoint.get("global_step")}
+    counted = {name: checkpoint.get(key) for name, key in COUNTED.items()}
     return {**texts, **{name: str(count) for name, count in counted.items() if isinstance(count, int)}}
 
 

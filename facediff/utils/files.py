@@ -400,6 +400,19 @@ def _is_running(process: int) -> bool:
     return True
 
 
+def reserve_room(path: Path) -> None:
+    """Take the room of a file that is to be written through a memory map.
+
+    Without it, a disk that fills up ends the process (SIGBUS) in the middle of an assignment.
+
+    Raises:
+        OSError: if the disk has no room.
+    """
+    with path.open("r+b") as stream:
+        if hasattr(os, "posix_fallocate") and (size := path.stat().st_size):
+            os.posix_fallocate(stream.fileno(), 0, size)
+
+
 def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) -> None:
     """Remove what killed processes have left of files named ``stem``; no other process may be writing there."""
     pattern = f".{stem if stem == '*' else glob.escape(short_name(stem, LONGEST))}.partial-*"

@@ -474,7 +474,8 @@ def test_an_interpolation_that_cannot_be_resolved_names_its_option(
     (tmp_path / "mine.yaml").write_text(f"model: {{class_path: DualPathDiffusion, init_args: {{dim: '{value}'}}}}\n")
     assert main(["fit", "--config", str(tmp_path / "mine.yaml"), "--data=Puppet"]) == 2
     error = capsys.readouterr().err
-    assert "--config" in error and "model.init_args.dim" in error
+    assert "--config" in error
+    assert "model.init_args.dim" in error
 
 
 def test_loggers_that_another_config_replaces_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -486,4 +487,5 @@ def test_loggers_that_another_config_replaces_are_named(tmp_path: Path, capsys: 
     assert not capsys.readouterr().err
     tell_replaced_loggers(one + two)
     note = capsys.readouterr().err
-    assert "WandbLogger of" in note and "one.yaml" in note and "two.yaml" in note and "CSVLogger" not in note
+    assert all(word in note for word in ("WandbLogger of", "one.yaml", "two.yaml"))
+    assert "CSVLogger" not in note

@@ -14,6 +14,7 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.flame import Flame
 from facediff.utils.arrays import open_array, vertices_of
+from facediff.utils.files import reserve_room
 from facediff.utils.progress import track
 
 Array = npt.NDArray[np.float64]
@@ -216,6 +217,7 @@ def differing_faces(one: Faces, other: Faces) -> int:
 def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
     """A new memory-mapped float32 array."""
     array: npt.NDArray[np.float32] = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    reserve_room(path)
     return array
 
 
