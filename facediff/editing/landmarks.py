@@ -302,6 +302,23 @@ class Landmarks:
                     f"landmarks: name {name} vertex {int(places.corners.max())} of {count}; count vertices from 0"
                 )
 
+    def refuse_contradictions(self, where: object) -> None:
+        """Refuse pairs of one place with several places of the other mesh; the same pair may be repeated.
+
+        Args:
+            where: what messages call the pairs.
+        """
+        places = [list(map(str, np.hstack([side.corners, side.weights]).tolist())) for side in self._sides]
+        for name, one, other in (("source", *places), ("target", *reversed(places))):
+            partners: dict[str, int] = {}
+            for number, (place, partner) in enumerate(zip(one, other, strict=True)):
+                first = partners.setdefault(place, number)
+                if other[first] != partner:
+                    raise FaceDiffError(
+                        f"{where}: pairs {first + 1} and {number + 1} give one place of the {name} mesh two places of "
+                        f"the other mesh; keep one of them"
+                    )
+
 
 def common_landmarks(source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]) -> Landmarks | None:
     """The named pairs of two meshes (V, 3) of known topologies; None if one of them is another one."""
@@ -342,7 +359,7 @@ def read_landmarks(
     for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
         cells = [cell.strip() for cell in line if cell.strip()]
         named = any(cell in NAMES for cell in cells)
-        if not cells or (number == 1 and not named and not any(cell.isdecimal() for cell in cells)):
+        if not cells or (number == 1 and not named and not any(map(is_number, cells))):
             continue
         if len(cells) == 1 and named:
             cells = cells * 2
@@ -358,7 +375,18 @@ def read_landmarks(
         names.append(next((cell for cell in cells if cell in NAMES), ""))
     if not pairs:
         raise FaceDiffError(f"{path}: holds no pairs; expected lines {EXAMPLE}")
-    return Landmarks.of_vertices(np.array(pairs, np.int64), names)
+    landmarks = Landmarks.of_vertices(np.array(pairs, np.int64), names)
+    landmarks.refuse_contradictions(path)
+    return landmarks
+
+
+def is_number(word: str) -> bool:
+    """Whether a cell is a number of any kind, so that its line is no header; also ``nan``, which is no vertex."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _whole(word: str) -> bool:
@@ -423,6 +451,7 @@ def parse_landmarks(
             )
         if places_of.corners.min() < 0 or (expected is not None and places_of.corners.max() >= expected):
             raise FaceDiffError(f"{where}: names {key} vertices that do not exist; pick the landmarks again")
+    landmarks.refuse_contradictions(where)
     return landmarks
 
 

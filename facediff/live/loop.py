@@ -75,11 +75,20 @@ class LiveSummary:
     def sentences(self) -> list[str]:
         """The report at the end."""
         lines = [
-            f"{self.frames} frames of {self.speech:.1f} s; lag {self.lag}; {self.dropped} frames dropped"
-            + (f", {self.lost:.1f} s of speech" if self.lost else ""),
+            f"{self.frames} frames of {self.speech:.1f} s; lag {self.lag}; {dropped_text(self.dropped, self.lost)}",
             f"computing {self.computing} a window (real-time factor {self.factor:.2f}); sending {self.sending} a frame",
         ]
         return lines + [f"{name}: {status}" for name, status in self.receivers.items() if status]
+
+
+def dropped_text(frames: int, speech: float) -> str:
+    """What was dropped, said alike while a performance runs and at its end.
+
+    Args:
+        frames: that came too late to be sent.
+        speech: seconds that were never animated.
+    """
+    return f"{frames} frames dropped" + (f", {speech:.1f} s of speech" if speech else "")
 
 
 class Backlog:
@@ -301,7 +310,9 @@ class Loop:
         enough = max(RECENT, 2 * hop)
         while heard - recent[0][1] > enough:
             heard -= recent.popleft()[1]
-        factor = sum(seconds for seconds, _ in recent) / max(heard, 1e-9)
+        # A process that was stopped for a while has one long window: it counts as the next longest.
+        longest = sorted((seconds for seconds, _ in recent), reverse=True)
+        factor = (sum(longest) - longest[0] + longest[min(1, len(longest) - 1)]) / max(heard, 1e-9)
         slow = heard > 0.9 * enough and factor > 1
         self._backlog.limit = hop + (HURRIED if slow else self._patience)
         if slow and not self._slow_reported:
@@ -414,7 +425,7 @@ class Loop:
     def _tell(self) -> None:
         """Report on the last seconds."""
         parts = [f"{self.summary.speech:.0f} s: lag {self._interval}"]
-        parts.append(f"{self.summary.dropped + self._backlog.dropped} frames dropped")
+        parts.append(dropped_text(self.summary.dropped, self._backlog.dropped / self.model.frame_rate))
         parts += [f"{receiver.name}: {status}" for receiver in self.receivers if (status := receiver.status())]
         self._interval = Lags()
         self._report("; ".join(parts))

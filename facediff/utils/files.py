@@ -437,7 +437,8 @@ def _new_folders(folder: Path) -> Iterator[None]:
     """Make a folder and its parents; those that are still empty at the end are removed."""
     missing = [place for place in (folder, *folder.parents) if not os.path.lexists(place)]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for place in [*reversed(missing), folder]:  # one by one: pathlib calls itself for each of a thousand parents
+            place.mkdir(exist_ok=True)
         yield
     finally:
         for place in missing:

@@ -8,9 +8,11 @@ mean to ``huggingface_hub``, through which everything goes.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import re
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +33,11 @@ EXPECTED = (
     "expected a .ckpt file that `facediff fit` has written, a folder of `facediff publish`, or user/name[@revision] of "
     "the Hugging Face hub"
 )
+
+PATIENCE = 30.0
+"""Seconds that the hub has for what it tells about a model; it is asked twice, since the cache may know more."""
+MOST_TOLD = 16 << 20
+"""Bytes of that; a model's own files are not meant, whose sizes are compared with the budget."""
 
 _ID = re.compile(r"(?P<name>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:@(?P<revision>[\w.-][\w./-]{0,199}))?")
 
@@ -164,7 +171,7 @@ def fetch(name: str, revision: str | None = None) -> Path:
     except ImportError as error:
         raise MissingExtraError("huggingface_hub", "hub", f"fetching the model {name}") from error
     shown = name if revision is None else f"{name}@{revision}"
-    with _hub_errors(shown, "fetched"), _progress():
+    with _hub_errors(shown, "fetched"), _bounded_answers(), _progress():
         options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
         try:
             planned = snapshot_download(name, dry_run=True, **options)
@@ -192,13 +199,68 @@ def push(folder: Path, name: str, *, private: bool = False) -> str:
         from huggingface_hub import HfApi
     except ImportError as error:
         raise MissingExtraError("huggingface_hub", "hub", "sending a model to the hub") from error
-    with _hub_errors(name, "sent"), _progress():
+    with _hub_errors(name, "sent"), _bounded_answers(), _progress():
         api = HfApi(library_name="facediff")
         address = api.create_repo(name, private=private, exist_ok=True)
         api.upload_folder(
             repo_id=name, folder_path=folder, commit_message="Publish with facediff", allow_patterns=list(FILES)
         )
     return str(address)
+
+
+@contextmanager
+def _bounded_answers() -> Iterator[None]:
+    """Let the hub's library wait for no answer for ever, and read no more than :data:`MOST_TOLD` of one into memory."""
+    from huggingface_hub import set_client_factory
+    from huggingface_hub.utils import _http
+
+    def client() -> Any:  # noqa: ANN401 - of the HTTP library that the hub's library has chosen
+        session = _http.default_client_factory()
+        library = importlib.import_module(type(session).__module__.partition(".")[0])
+
+        class Bounded(library.SyncByteStream):  # type: ignore[misc, name-defined]
+            def __init__(self, stream: Any, ends: float) -> None:  # noqa: ANN401
+                self.stream, self.ends = stream, ends
+
+            def __iter__(self) -> Iterator[bytes]:
+                size = 0
+                for part in self.stream:
+                    size += len(part)
+                    if size > MOST_TOLD or time.monotonic() > self.ends:
+                        raise FaceDiffError(
+                            f"the hub's answer is longer than {MOST_TOLD >> 20} MiB or takes longer than {PATIENCE:g} "
+                            f"s; check HF_ENDPOINT, or give a folder in its place"
+                        )
+                    yield part
+
+            def close(self) -> None:
+                self.stream.close()
+
+        def ask(request: Any) -> None:  # noqa: ANN401
+            timeouts = request.extensions.get("timeout") or dict.fromkeys(("connect", "read", "write", "pool"))
+            request.extensions["timeout"] = {kind: seconds or PATIENCE for kind, seconds in timeouts.items()}
+            # What a redirect leads to has the same extensions; only files of a model are read piece by piece.
+            if not request.extensions.setdefault("facediff_file", "/resolve/" in request.url.path):
+                request.headers["Accept-Encoding"] = "identity"  # what expands is bounded as well
+
+        def answer(response: Any) -> None:  # noqa: ANN401
+            if not response.request.extensions["facediff_file"]:
+                if response.headers.get("Content-Encoding", "identity") != "identity":
+                    raise FaceDiffError("the hub's answer is compressed though none was asked for; check HF_ENDPOINT")
+                response.stream = Bounded(response.stream, time.monotonic() + PATIENCE)
+
+        hooks = session.event_hooks
+        session.event_hooks = {
+            "request": [*hooks["request"], ask],
+            "response": [*hooks["response"], answer],
+        }
+        return session
+
+    set_client_factory(client)
+    try:
+        yield
+    finally:
+        set_client_factory(_http.default_client_factory)
 
 
 @contextmanager

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import socket
 import struct
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 
@@ -219,3 +222,29 @@ def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: py
         wait_for(served, "1 pages")
         with pytest.raises(InvalidStatus), visit(served):
             pass
+
+
+def test_only_reading_is_answered(served: Browser) -> None:
+    for method in ("GET", "HEAD", "PUT", "DELETE", "PATCH", "TRACE", "POST"):
+        connection = http.client.HTTPConnection(served.host, served.port, timeout=5)
+        with closing(connection):
+            connection.request(method, "/")
+            response = connection.getresponse()
+            content = response.read()
+        assert response.status == (200 if method in ("GET", "HEAD") else 405)
+        assert (b"<html" in content) == (method == "GET")
+        assert method != "HEAD" or int(response.headers["Content-Length"]) > 10_000
+
+
+def test_two_hundred_visitors_at_the_same_moment_get_the_page(served: Browser) -> None:
+    together = threading.Barrier(200)
+
+    def read() -> int:
+        together.wait(30)
+        with urllib.request.urlopen(served.url, timeout=30) as response:  # noqa: S310 - our own server
+            return len(response.read())
+
+    with ThreadPoolExecutor(200) as pool:
+        lengths = [future.result() for future in [pool.submit(read) for _ in range(200)]]
+    assert len(set(lengths)) == 1
+    assert lengths[0] > 10_000

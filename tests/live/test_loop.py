@@ -65,6 +65,24 @@ def test_slow_model_drops_speech_says_so_once_and_keeps_its_lag(monkeypatch: pyt
     assert summary.lag.worst < 2.0
 
 
+def test_one_long_window_is_not_blamed_on_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when the process is stopped for a while: what is dropped then is counted alike in both reports."""
+
+    class Stopped(FakeStream):
+        def feed(self, samples: np.ndarray) -> np.ndarray:
+            if self.heard < 8_000 <= self.heard + len(samples):
+                time.sleep(1.2)
+            return super().feed(samples)
+
+    monkeypatch.setattr("facediff.live.loop.RECENT", 0.5)
+    reports = list[str]()
+    loop = Loop(fake_model(Stopped), Spoken(2.4), [Kept()], report=reports.append, every=0.2)
+    summary = loop.run()
+    assert not [sentence for sentence in reports if "--steps" in sentence]
+    assert summary.lost > 0.2
+    assert f"{summary.dropped} frames dropped, {summary.lost:.1f} s of speech" in reports[-1]
+
+
 def test_click_is_in_the_frame_in_which_it_was_spoken() -> None:
     """Of a face that follows the level of the sound: the time at which its frame leaves is that of the click, late by
     what a frame lasts, and the margin.

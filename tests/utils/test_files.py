@@ -19,7 +19,16 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
 from facediff.speech.audio import read_speech
 from facediff.utils.checksums import describe_files, same_sizes, sha256
-from facediff.utils.files import atomic, atomic_folder, check_writable, discard, locked, put_in_place, scratch_folder
+from facediff.utils.files import (
+    atomic,
+    atomic_folder,
+    check_writable,
+    discard,
+    locked,
+    put_in_place,
+    reserve_room,
+    scratch_folder,
+)
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_json, write_json, write_rows
 from facediff.utils.tables import format_table
@@ -408,3 +417,20 @@ def test_what_is_given_up_is_removed_though_a_signal_comes_meanwhile(
     with pytest.raises(KeyboardInterrupt):
         discard(path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_room_is_taken_before_a_map_is_written(tmp_path: Path) -> None:
+    with (tmp_path / "hole").open("wb") as stream:
+        stream.truncate(1 << 20)
+    reserve_room(tmp_path / "hole")
+    assert (tmp_path / "hole").stat().st_blocks * 512 >= 1 << 20
+
+
+@pytest.mark.slow
+def test_a_file_a_thousand_folders_deep_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with atomic(Path("a/" * 1200) / "x.txt") as temporary:
+        temporary.write_text("x")
+    assert (Path("a/" * 1200) / "x.txt").read_text() == "x"
+    (Path("a/" * 1200) / "x.txt").unlink()
+    os.removedirs("a/" * 1200)  # pytest's tidying up would call itself for each

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -26,10 +30,11 @@ from facediff.utils.hub import (
 from tests.fakes.hub import FakeHub, Repository, fake_hub
 
 TRY = """
-import json, sys
+import json, os, sys
 from pathlib import Path
 from facediff.errors import FaceDiffError
 from facediff.utils import hub
+hub.PATIENCE = float(os.environ.get("PATIENCE", hub.PATIENCE))
 for function, *words in json.loads(sys.argv[1]):
     try:
         found = hub.push(Path(words[0]), words[1]) if function == "push" else hub.fetch(*words)
@@ -37,6 +42,7 @@ for function, *words in json.loads(sys.argv[1]):
     except FaceDiffError as error:
         print(json.dumps(["error", str(error)]))
 """
+ENDLESS = b'HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n\r\n{"a": "'
 CARD_TEXT = b"---\nlicense: mit\n---\n# A face\n"
 
 
@@ -191,3 +197,34 @@ def test_a_models_hash_is_of_what_it_makes_and_not_of_its_card(tmp_path: Path) -
         assert model_hash(folder) != first
         (folder / name).write_bytes(name.encode())
     assert model_hash(folder) == first
+
+
+@pytest.mark.parametrize(
+    ("begin", "part", "pause"),
+    [
+        pytest.param(b"", b"", 60.0, id="silent"),
+        pytest.param(ENDLESS, b"x" * 2**20, 0.0, id="endless"),
+        pytest.param(ENDLESS, b"x", 0.1, id="slow"),
+    ],
+)
+def test_a_hub_that_never_comes_to_an_end_is_given_up(begin: bytes, part: bytes, pause: float, tmp_path: Path) -> None:
+    over = threading.Event()
+
+    def serve(listening: socket.socket) -> None:
+        while not over.is_set():
+            with suppress(OSError), listening.accept()[0] as connection:
+                connection.recv(2**16)
+                connection.sendall(begin)
+                while not over.wait(pause):
+                    connection.sendall(part)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        servers = [threading.Thread(target=serve, args=(listening,), daemon=True) for _ in range(4)]
+        for server in servers:
+            server.start()
+        address = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        began = time.monotonic()
+        (answer,) = attempts(address, tmp_path / "home", ["fetch", "ada/face"], PATIENCE="1")
+        over.set()
+    assert answer[0] == "error"
+    assert time.monotonic() - began < 30

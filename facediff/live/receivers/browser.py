@@ -152,9 +152,13 @@ class Browser(Receiver):
         if len(hosts) != 1 or not is_own_page(hosts[0], ",".join(origins) if origins else None, self._hosts):
             self._refuse("a page from elsewhere asked for frames")
             return _response(http.HTTPStatus.FORBIDDEN, b"only the page that this server shows may ask it\n")
-        path = request.path.partition("?")[0]
+        path, method = request.path.partition("?")[0], getattr(request, "method", "GET")  # websockets 15 reads GET only
+        if method not in ("GET", "HEAD"):
+            return _response(http.HTTPStatus.METHOD_NOT_ALLOWED, b"the page is read with GET\n", Allow="GET, HEAD")
         if path == "/":
-            return _response(http.HTTPStatus.OK, self._page, "text/html; charset=utf-8")
+            shown = _response(http.HTTPStatus.OK, self._page, "text/html; charset=utf-8")
+            shown.body = b"" if method == "HEAD" else shown.body
+            return shown
         if path != "/live":
             return _response(http.HTTPStatus.NOT_FOUND, b"there is one page, at /\n")
         if len(self._viewers) >= MOST_VIEWERS:
@@ -307,13 +311,14 @@ class _Viewer:
             outbox.close(0.2)
 
 
-def _response(status: http.HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> Response:
+def _response(status: http.HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8", **more: str) -> Response:
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
     headers = Headers([*HEADERS.items(), ("Content-Type", kind), ("Content-Length", str(len(body)))])
     headers["Cache-Control"] = "no-store"
     headers["Connection"] = "close"
+    headers.update(more)
     return Response(status.value, status.phrase, headers, body)
 
 

@@ -23,6 +23,9 @@ Item = TypeVar("Item")
 log = logging.getLogger("facediff.live")
 """Failures that do not end a performance; without a handler, Python writes them to standard error."""
 
+VISITORS = 512
+"""Connections that may wait to be accepted; the system turns away what comes beyond them at the same moment."""
+
 THIS_MACHINE = "127.0.0.1"
 
 
@@ -183,7 +186,7 @@ def listen(address: Address, host: str, port: int) -> socket.socket:
         listening = socket.socket(place[0], place[1], place[2])
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(place[4])
-        listening.listen(16)
+        listening.listen(VISITORS)
     except (OSError, UnicodeError) as error:
         if listening is not None:
             listening.close()

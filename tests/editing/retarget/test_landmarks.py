@@ -286,3 +286,25 @@ def test_the_manual_lists_the_names_with_their_vertices() -> None:
     page = (Path(__file__).parents[3] / "docs" / "own_mesh.md").read_text(encoding="utf-8")
     for name, words in NAMES.items():
         assert f"| `{name}` | {words} | {puppet_landmarks()[name]} | {FLAME[name]} |" in page
+
+
+@pytest.mark.parametrize("first", ["nan,nan", "inf,inf", "1.5,2.5", "-1,-1", "1e3,1e3"])
+def test_a_first_line_of_numbers_is_no_header(first: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"{first}\n1,2\n3,4\n")
+    with pytest.raises(FaceDiffError, match="line 1"):
+        read_landmarks(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("pairs", [[(1, 1), (2, 2), (1, 3)], [(1, 1), (2, 1)]])
+def test_pairs_that_contradict_each_other_are_refused(pairs: list[tuple[int, int]], tmp_path: Path) -> None:
+    rows = [{"name": "", "source": source, "target": target} for source, target in pairs]
+    (tmp_path / "a.json").write_text(json.dumps({"format": "facediff landmarks 1", "landmarks": rows}))
+    (tmp_path / "a.csv").write_text("source,target\n" + "".join(f"{one},{other}\n" for one, other in pairs))
+    for name in ("a.json", "a.csv"):
+        with pytest.raises(FaceDiffError, match=f"pairs 1 and {len(pairs)}"):
+            read_landmarks(tmp_path / name)
+
+
+def test_a_pair_that_is_repeated_is_no_contradiction(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,2\n3,4\n1,2\n")
+    assert len(read_landmarks(tmp_path / "a.csv")) == 3
