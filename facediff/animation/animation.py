@@ -21,6 +21,7 @@ from facediff.animation.options import (
 )
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh.flame import rotations
+from facediff.spaces import VERTICES, Space
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import in_range
 from facediff.utils.lazy import late
@@ -32,6 +33,22 @@ OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
 
 
 MOTION = "facediff.pipelines.motion"  # What shows, changes and writes animations
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Channels of a parametric space that an animation's vertices were made of.
+
+    Attributes:
+        space: what they mean.
+        values: (T, C) float32, finite.
+        vertices: the animation's array of vertices. Whatever changes the vertices makes another array, with which the
+            channels have nothing to do any more.
+    """
+
+    space: Space
+    values: npt.NDArray[np.float32]
+    vertices: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -55,6 +72,7 @@ class Animation:
         inner_lip_pairs: (P, 2) upper and lower vertices of the inner lips, for the mouth's opening; None if unknown.
         head: (T, 6) how the head moves as a whole, if it does: a rotation about the origin, axis-angle in radians, and
             then a shift; the vertices have been moved by it, see :meth:`still`.
+        channels: what the vertices were made of, where that is channels of a parametric space; see :attr:`values`.
         metadata: text about how it was made: identity, style, what in it is procedural …
 
     Raises:
@@ -79,6 +97,7 @@ class Animation:
     regions: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
     inner_lip_pairs: npt.NDArray[np.int64] | None = None
     head: npt.NDArray[np.float64] | None = None
+    channels: Channels | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -107,6 +126,12 @@ class Animation:
                 f"{self.name}: has {shape[0]} frames and the motion of its head the shape {self.head.shape}; expected "
                 f"finite numbers (frames, 6)"
             )
+        if self.values is not None and self.channels is not None:
+            expected = (shape[0], len(self.channels.space.channels))
+            if self.values.shape != expected or not in_range(self.values):
+                raise FaceDiffError(
+                    f"{self.name}: its values have the shape {self.values.shape}; expected finite numbers {expected}"
+                )
         if not in_range(self.template):
             raise FaceDiffError(f"{self.name}: its template holds {OUT_OF_RANGE}; give another one")
         if self.speech is not None and not np.isfinite(self.speech).all():
@@ -114,6 +139,21 @@ class Animation:
         check_number(self.name, "frame rate", self.frame_rate, *FRAME_RATES)
         check_number(self.name, "sample rate", self.sample_rate, *SAMPLE_RATES, whole=True)
         metres_per_unit(self.unit)
+
+    @property
+    def values(self) -> npt.NDArray[np.float32] | None:
+        """The channels (T, C) that the vertices were made of; None if there are none, or the vertices were changed."""
+        known = self.channels is not None and self.channels.vertices is self.vertices
+        return self.channels.values if known and self.channels is not None else None
+
+    @property
+    def space(self) -> Space:
+        """What :attr:`values` mean; that of vertices where there are none."""
+        return VERTICES if self.values is None or self.channels is None else self.channels.space
+
+    def made_of(self, space: Space, values: npt.NDArray[np.float32]) -> Self:
+        """The same with the channels that its vertices were made of."""
+        return replace(self, channels=Channels(space, values, self.vertices))
 
     @property
     def seconds(self) -> float:
@@ -136,7 +176,8 @@ class Animation:
 
     def part(self, frames: slice | list[int]) -> Self:
         """The same with some of the frames only."""
-        return replace(self, vertices=self.vertices[frames], head=None if self.head is None else self.head[frames])
+        part = replace(self, vertices=self.vertices[frames], head=None if self.head is None else self.head[frames])
+        return part if self.values is None else part.made_of(self.space, self.values[frames])
 
     def still(self) -> Self:
         """The same with a head that does not move as a whole; itself if it does not.
@@ -154,7 +195,8 @@ class Animation:
         for index, frame in enumerate(self.vertices):
             moving = self.head[index].any()
             vertices[index] = (frame - self.head[index, 3:]) @ matrices[index] if moving else frame
-        return replace(self, vertices=vertices, head=None)
+        still = replace(self, vertices=vertices, head=None)
+        return still if self.values is None else still.made_of(self.space, self.values)
 
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
         """Frame after frame (V, 3); the pages of a memory map that have been read are released."""

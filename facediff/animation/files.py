@@ -11,8 +11,9 @@ from typing import Any, TypedDict, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation.animation import OUT_OF_RANGE, Animation
+from facediff.animation.animation import OUT_OF_RANGE, Animation, Channels
 from facediff.errors import FaceDiffError, OptionError
+from facediff.spaces import Space
 from facediff.utils.arrays import in_range, open_vertices, read_arrays
 from facediff.utils.files import atomic
 from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, quoted
@@ -30,6 +31,7 @@ ARRAYS: dict[str, tuple[str, str, tuple[int | None, ...], type[np.generic]]] = {
     "speech": ("f", "floating point (samples,)", (None,), np.float32),
     "colours": ("u", "bytes (vertices, 3)", (None, 3), np.uint8),
     "head": ("f", "floating point (frames, 6)", (None, 6), np.float64),
+    "values": ("f", "floating point (frames, channels)", (None, None), np.float32),
     "inner_lip_pairs": ("iu", "whole numbers (pairs, 2)", (None, 2), np.int64),
 }
 """An archive's arrays: kinds of number, in words, lengths of the axes, and the type that :class:`Animation` has."""
@@ -129,6 +131,7 @@ def write_archive(path: Path, animation: Animation) -> None:
     """
     animation.refuse_not_finite()
     arrays: dict[str, Any] = {name: getattr(animation, name) for name in ARRAYS if getattr(animation, name) is not None}
+    space = {} if animation.values is None else {"space": animation.space.state()}
     arrays |= {f"region_{name}": indices for name, indices in animation.regions.items()}
     about = {
         "format": FORMAT,
@@ -137,6 +140,7 @@ def write_archive(path: Path, animation: Animation) -> None:
         "unit": animation.unit,
         "sample_rate": animation.sample_rate,
         "metadata": dict(animation.metadata),
+        **space,
     }
     arrays["about"] = np.array(json_text(path, about, indent=None))
     with atomic(path) as temporary, temporary.open("wb") as stream:
@@ -160,6 +164,9 @@ def read_archive(path: Path) -> Animation:
     LIMITS.check("seconds", len(checked["vertices"]) / facts["frame_rate"], path)
     regions = {name.removeprefix("region_"): array for name, array in checked.items() if name.startswith("region_")}
     parts: dict[str, Any] = {name: checked[name] for name in ARRAYS if name in checked and checked[name].size}
+    values, space = parts.pop("values", None), facts.pop("space")
+    if values is not None:
+        parts["channels"] = Channels(_named(path, lambda: Space.from_state(space)), values, parts["vertices"])
     animation = _named(path, lambda: Animation(**parts, regions=regions, **facts))
     _named(path, animation.refuse_not_finite)
     return animation
@@ -193,7 +200,7 @@ def _about(array: npt.NDArray[Any], source: str) -> dict[str, Any]:
             check_number(source, "sample_rate", about.get("sample_rate"), *SAMPLE_RATES, whole=True, remedy=remedy)
         ),
     }
-    return {"name": about["name"], "unit": about["unit"], "metadata": metadata, **numbers}
+    return {"name": about["name"], "unit": about["unit"], "metadata": metadata, "space": about.get("space"), **numbers}
 
 
 def _checked(path: Path, name: str, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:

@@ -197,7 +197,8 @@ def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, 
         batch = collate([sample]).to(model.device)
         with trainer.precision_plugin.forward_context():
             motion = model.generate(batch, seed=0)
-        errors = (motion[0].float() - batch.motion[0]).norm(dim=-1).mean(dim=0)
+        off = model.assets.to_scored(motion[0].float() - batch.motion[0], sample.identity_name)
+        errors = off.norm(dim=-1).mean(dim=0)
         measured.append(
             ClipErrors(row["split"], sample.name, sample.identity_name, sample.audio.numpy(), errors.cpu().numpy())
         )
@@ -211,7 +212,7 @@ def draw_errors(model: AnimationModel, clips: list[ClipErrors]) -> list[npt.NDAr
         pictures (height, width, 3), sRGB; None in place of those that cannot be drawn, with a warning that gives the
         reason: the corpus has no faces, the packages for drawing are missing, or an error is not finite.
     """
-    assets = model.assets
+    assets = model.assets.scored
     if assets.faces is None:
         rank_zero_warn(f"test/sequences has no error pictures: the corpus {assets.corpus} has no mesh file")
         return [None] * len(clips)

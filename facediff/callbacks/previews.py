@@ -149,7 +149,7 @@ class SamplingPreview(Callback):
             return
         # DeepSpeed's strategy is a DDPStrategy, but spreads the weights over processes like FSDP.
         sharded = isinstance(trainer.strategy, DeepSpeedStrategy) or not isinstance(trainer.strategy, DDPStrategy)
-        if pl_module.assets.faces is None:
+        if pl_module.assets.scored.faces is None:
             if trainer.is_global_zero:  # no fault: the bundled configs ask for previews, whatever the corpus has
                 files = " or ".join(data.mesh_files)
                 print(f"no previews in this run: {data.root} holds no mesh to draw ({files})", flush=True)
@@ -334,24 +334,25 @@ def draw_clip(
     The motion is offsets from the template, and the files get the clip's name; ``error_scale`` (in the corpus's unit),
     ``size`` and ``view`` are those of :class:`SamplingPreview`.
     """
-    assets = model.assets
+    assets, name = model.assets.scored, sample.identity_name
     if assets.faces is None:
         raise FaceDiffError(f"{assets.corpus} has no mesh to draw")
     clip_scores = scores(model, sample, motion)
     corpus = f"{assets.corpus}, synthetic corpus" if assets.synthetic else assets.corpus
-    template, width = sample.template.numpy(), round(ASPECT * size)
+    template, width = assets.template(name).numpy(), round(ASPECT * size)
+    truth, motion = (model.assets.to_scored(offsets, name) for offsets in (sample.motion, motion))
     framed = portrait(template, {name: indices.numpy() for name, indices in assets.regions.items()})
     renderer = Renderer(
         assets.faces.numpy(),
         template=template,
         size=(size, width),
         camera=Camera.framing(framed, view=view, aspect=width / size),
-        colours=None if (colours := assets.colours_of(sample.identity_name)) is None else colours.numpy(),
+        colours=None if (colours := assets.colours_of(name)) is None else colours.numpy(),
     )
     frames = comparison(
         renderer,
-        (sample.motion + sample.template).numpy(),
-        (motion + sample.template).numpy(),
+        truth.numpy() + template,
+        motion.numpy() + template,
         highest=error_scale,
         scale_label=length(error_scale, assets.unit),
         labels=("truth", "facediff", "error"),
@@ -379,10 +380,11 @@ def draw_clip(
 
 def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, float]:
     """The protocol's metrics of one clip; in this process alone, unlike those of a whole split."""
-    regions = regions_of(model.assets)
+    regions = regions_of(model.assets.scored)
+    truth, motion = (model.assets.to_scored(offsets, sample.identity_name) for offsets in (sample.motion, motion))
     built = model.evaluation.protocol.build(regions["lips"], regions["upper_face"])
     metrics = cast(Iterable[tuple[str, SequenceMetric]], built.items(copy_state=False))
-    (clip,) = align(motion[None], sample.motion[None], clip_names=[sample.name]).clips
+    (clip,) = align(motion[None], truth[None], clip_names=[sample.name]).clips
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
 
 

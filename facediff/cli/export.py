@@ -52,7 +52,7 @@ def export(
         footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
     check_output(files, output.suffix)
     options = replace(files, footer=footer, quiet=quiet)
-    check_export(output, options, len(animations))
+    check_export(output, options, len(animations), weights=True)
     check_controls(controls)
     read = SourceReader(source).read
     finished: list[Animation] = [read(path) for path in animations]

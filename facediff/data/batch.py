@@ -262,7 +262,7 @@ class Rig:
         """
         deltas = self.deltas.get(identity, self.mean).to(motion)
         weights = motion[..., list(space.face), 0]
-        return (weights @ deltas.flatten(1)).view(*weights.shape[:-1], -1, 3)
+        return (weights @ deltas.flatten(1)).view(*weights.shape[:-1], *deltas.shape[1:])
 
     def gram(self, weights: Float[Tensor, "vertices 3"]) -> Float[Tensor, "face face"]:
         """Products D Dᵀ of the weighted deltas D, the mean over speakers, over the number of coordinates.
@@ -331,6 +331,17 @@ class Assets:
                 f"vertices; write the channels themselves, to .csv or .npz"
             )
         return self.rig.mesh
+
+    @property
+    def scored(self) -> Assets:
+        """What is drawn and scored: vertices, also those that a rig makes of channels; without a rig the channels."""
+        return self if self.rig is None else self.rig.mesh
+
+    def to_scored(
+        self, motion: Float[Tensor, "*frames points dims"], identity: str
+    ) -> Float[Tensor, "*frames scored_points scored_dims"]:
+        """Offsets from the template as those of :attr:`scored`."""
+        return motion if self.rig is None else self.rig.decode(motion, self.space, identity)
 
     def to_vertices(
         self, motion: Float[Tensor, "*frames points dims"], identity: str

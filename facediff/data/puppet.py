@@ -125,7 +125,8 @@ TURNS = ("Head", "LeftEye", "RightEye")
 def channel_space() -> Space:
     """The space of the second edition's channels: ARKit's shapes and two of the tongue, head and gaze in radians.
 
-    Yaw is to the face's left, pitch down, roll towards its left shoulder.
+    Yaw is to the face's left, pitch down, roll towards its right shoulder: turns about y, x and z, as facediff.spaces
+    takes Euler angles.
     """
     named = tuple(f"{turn}{angle}" for turn in TURNS for angle in ("Yaw", "Pitch", "Roll"))
     identity = f"{puppet_corpus.CORPUS} {second_edition.GENERATOR} {' '.join(SHAPES)}"
@@ -167,7 +168,7 @@ class PuppetChannels(ChannelFolder):
         pitch, yaw, roll = np.deg2rad(np.asarray(head, np.float64)).T
         left, up = np.deg2rad(np.asarray(gaze, np.float64)).T
         eye = (left, -up, np.zeros(frames))
-        turns = np.stack([yaw, pitch, roll, *eye, *eye], axis=1)
+        turns = np.stack([yaw, pitch, -roll, *eye, *eye], axis=1)
         return np.concatenate([weights, turns], axis=1).astype(np.float32)
 
 

@@ -65,7 +65,7 @@ def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str], asset
         usable = [clip for clip in candidates.get(speaker, []) if data.find_split(clip) in ("train", None)]
         for clip in spread(usable):
             mean = data.corpus.read_motion(clip).mean(0)
-            means.append(mean if assets.rig is None else assets.to_vertices(mean, speaker))
+            means.append(assets.to_scored(mean, speaker))
             numbers.append(number)
     if len({*numbers}) < 2:
         raise FaceDiffError(

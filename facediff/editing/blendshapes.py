@@ -179,6 +179,28 @@ class Weights:
         )
 
 
+def own_weights(animation: Animation) -> Weights:
+    """The weights that an animation was made of, as they are; nothing is solved for.
+
+    Raises:
+        FaceDiffError: if it has none.
+    """
+    values, space = animation.values, animation.space
+    if values is None:
+        raise FaceDiffError(f"{animation.name}: has no weights of its own; give shapes to solve for them")
+    face, frames = list(space.face), len(values)
+    return Weights(
+        names=tuple(space.channels[channel] for channel in face),
+        values=np.asarray(values[:, face], np.float64),
+        residual_rms_mm=np.zeros(frames),
+        residual_max_mm=np.zeros(frames),
+        amplitude_mm=0.0,
+        frame_rate=animation.frame_rate,
+        metadata={**animation.metadata, "weights": "those of the model; nothing was solved for"},
+        head=None if animation.head is None else animation.head[:, :3],
+    )
+
+
 def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None = None) -> Weights:
     """Weights w_t that bring the shapes nearest to an animation.
 

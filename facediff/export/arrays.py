@@ -61,7 +61,7 @@ class Archive(Format):
 
 @export_format.register("csv")
 class BlendshapeWeights(Format):
-    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes."""
+    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for motion in such weights."""
 
     next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
     speech = "next to it"
@@ -73,11 +73,13 @@ class BlendshapeWeights(Format):
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Solve for the weights and write them, with a .json file that says how well they fit."""
-        from facediff.editing.blendshapes import SolveOptions, solve
+        from facediff.editing.blendshapes import SolveOptions, own_weights, solve
         from facediff.editing.shapes import read_shapes
 
         (animation,) = animations
-        assert options.shapes is not None  # noqa: S101 - checked by check_export
+        if options.shapes is None:  # checked by check_export
+            own_weights(animation).save(path, key_tolerance=options.key_tolerance)
+            return
         shapes = read_shapes(Path(options.shapes), animation.template, animation.unit)
         solve(animation, shapes, SolveOptions()).save(path, key_tolerance=options.key_tolerance)
 

@@ -61,7 +61,7 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
         [PosixPath('hello.usdc'), PosixPath('hello.wav')]
     """
     options = options or ExportOptions()
-    check_export(path, options, len(animations))
+    check_export(path, options, len(animations), weights=have_weights(animations))
     form = FORMATS[path.suffix]
     for animation in animations:
         check_animation(animation, needs_mesh=form.needs_mesh)
@@ -93,13 +93,14 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
     return [path.with_name(name) for name in [*first, *(file.name for file in written if file.name not in first)]]
 
 
-def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> None:
+def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, weights: bool = False) -> None:
     """Refuse what can be refused before any work is done.
 
     Args:
         path: the file to write; its suffix chooses the format.
         options: what the user chose.
         n_animations: how many animations will be written.
+        weights: whether the animations have, or may have, weights of ARKit's shapes by themselves.
 
     Raises:
         FaceDiffError: if the suffix is unknown, the format does not support an option, the blendshapes are missing, or
@@ -125,7 +126,7 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
     if options.up is not None and options.up not in form.up_axes:
         reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
         raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
-    if form.needs_shapes and options.shapes is None:
+    if form.needs_shapes and options.shapes is None and not weights:
         raise OptionError(
             "",
             f"{path}: {suffix} needs blendshapes; give {{shapes}}: a folder of meshes, a .glb with targets, or puppet",
@@ -140,6 +141,11 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1) -> N
         check_writable(target)
         if form.is_folder:
             check_free(folder_of(target))
+
+
+def have_weights(animations: Sequence[Animation]) -> bool:
+    """Whether animations have weights of ARKit's shapes by themselves, which need not be solved for."""
+    return all(animation.space.kind == "arkit" for animation in animations)
 
 
 def check_used(suffix: str, option_names: Collection[str]) -> None:

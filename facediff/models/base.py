@@ -378,12 +378,16 @@ class AnimationModel(PersonStyles, ABC):
             self.log_dict(self.evaluation.scalars(split), sync_dist=True)
 
     def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
-        """Absolute vertices of every clip of the batch."""
+        """Absolute vertices of every clip of the batch, also of channels with a rig; without one the channels."""
         batch = self.with_person_styles(batch)
-        vertices = self.generate(batch, seed=0) + batch.template[:, None]
+        motion, assets = self.generate(batch, seed=0), self.assets
+        vertices = [
+            assets.to_scored(own, name) + assets.scored.template(name).to(own) if assets.rig else own + template
+            for own, name, template in zip(motion, batch.identity_names, batch.template, strict=True)
+        ]
         names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
         return [
-            Prediction(name, names[i], batch.reference_names[i], vertices[i, : int(batch.frame_lengths[i])].cpu())
+            Prediction(name, names[i], batch.reference_names[i], vertices[i][: int(batch.frame_lengths[i])].cpu())
             for i, name in enumerate(batch.names)
         ]
 

@@ -203,7 +203,7 @@ class Evaluation:
         assets = model.assets
         self._assets = assets
         # Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
-        regions = regions_of(self._scored)
+        regions = regions_of(assets.scored)
         self.splits = list(splits)
         self._sequences = []
         self._data = data
@@ -233,26 +233,19 @@ class Evaluation:
             for split in self.splits
         }
 
-    @property
-    def _scored(self) -> Assets:
-        """The assets of what is scored: vertices, or channels without a rig."""
-        assets = self._assets
-        assert assets is not None  # noqa: S101 - for the type checker
-        return assets if assets.rig is None else assets.mesh
-
     def decoded(self, motion: Tensor, batch: Batch) -> Tensor:
         """Offsets of a batch's clips, (batch, …, points, dims), as those of what is scored."""
         assets = self._assets
         if assets is None or assets.rig is None:
             return motion
         names = batch.identity_names
-        return torch.stack([assets.to_vertices(own, name) for own, name in zip(motion, names, strict=True)])
+        return torch.stack([assets.to_scored(own, name) for own, name in zip(motion, names, strict=True)])
 
     def _templates(self, batch: Batch) -> Tensor:
         """Neutral faces of a batch's clips."""
         if self._assets is None or self._assets.rig is None:
             return batch.template
-        faces = [self._assets.mesh.template(name) for name in batch.identity_names]
+        faces = [self._assets.scored.template(name) for name in batch.identity_names]
         return torch.stack(faces).to(batch.template)
 
     def _of_channels(self, device: torch.device) -> dict[str, Metric]:
@@ -320,7 +313,7 @@ class Evaluation:
             "identities": {"n_identities": len(assets.templates)},
             "time": {"hardware": device_name(device)},
         }
-        if (pairs := self._scored.inner_lip_pairs) is not None:
+        if (pairs := assets.scored.inner_lip_pairs) is not None:
             has["lip_pairs"] = {"pairs": LipPairs.from_pairs(f"{assets.corpus}/inner lips", pairs)}
         if "lid_pairs" in self.needs and (lids := eyelid_pairs_of(data)) is not None:
             has["lid_pairs"] = {"pairs": lids, "frames_per_second": assets.frame_rate}

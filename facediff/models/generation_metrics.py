@@ -139,6 +139,11 @@ class EvaluationCorpus:
     def __init__(self, data: SpeechMotionDataModule) -> None:
         self.data = data
         self.assets = data.assets()
+        if not self.assets.space.is_vertices:
+            raise FaceDiffError(
+                f"{data.corpus_name}: generation metrics are of vertices, and this corpus has channels; score such a "
+                f"model with `facediff test`, which decodes them"
+            )
         self.regions = regions_of(self.assets)
         compared = data.compared_speakers
         self.speakers = sorted(name for name in self.assets.templates if compared is None or name in compared)

@@ -64,7 +64,7 @@ class Prediction:
         name: the clip.
         identity: the training identity that conditioned it, or ``unknown``.
         reference_name: the clip that gave the style.
-        vertices: absolute vertices.
+        vertices: absolute points: vertices, or the channels of the model's space.
     """
 
     name: str

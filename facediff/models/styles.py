@@ -229,6 +229,7 @@ def style_of(
     assets, path, scale = model.assets, opened.path, 1.0
     if opened.array.ndim == 1:
         return Style(path.stem, read_vector(opened, model))
+    refuse_vertices(path, model)
     if opened.template is None:
         face, whose, rate = face_of_array(opened, identity, model, template)
     else:
@@ -242,12 +243,22 @@ def style_of(
     return Reference(path.stem, offsets)
 
 
+def refuse_vertices(source: object, model: AnimationModel) -> None:
+    """Refuse motion of vertices as the style of a model that takes channels."""
+    if not model.assets.space.is_vertices:
+        raise OptionError.naming(
+            f"{{style}} {source}: motion files hold vertices, and this model takes channels; name a speaker of the "
+            f"checkpoint, or a style vector of this model"
+        )
+
+
 def corpus_clip(name: str, model: AnimationModel) -> StyleFile:
     """The motion of a clip of the training corpus, if the corpus is on this machine."""
     import numpy as np
 
     from facediff.data.storage import MOTION_FOLDERS, motion_path, open_motion
 
+    refuse_vertices(name, model)
     root = model.data_source.get("root")
     path = motion_path(Path(root), name) if root else None
     if path is None or not path.is_file():

@@ -86,7 +86,8 @@ class AnimationPipeline(ABC):
         model: name of the model, for errors.
         samples: whether the model's motion depends on a seed.
         usual_gate: the model's voice gate, where the options choose none.
-        rest_weights: how far each vertex (V,) goes to rest in pauses.
+        rest_weights: how far each point (V,) goes to rest in pauses.
+        resting: the points (V, dims) of the model's motion at rest; those of the neutral face if None.
 
     Attributes:
         seed: of the first sample.
@@ -112,6 +113,7 @@ class AnimationPipeline(ABC):
         samples: bool,
         usual_gate: str,
         rest_weights: Callable[[], Array],
+        resting: Array | None = None,
     ) -> None:
         from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, MouthAtRest, read_gate
 
@@ -127,11 +129,12 @@ class AnimationPipeline(ABC):
         self.seed = options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or drawn else 0
         self.progress: Progress | None = None
         self.rest: MouthAtRest | None = None
+        self.resting: Array = face["template"] if resting is None else resting
         self.gate = options.voice_gate or usual_gate
         if options.low_latency and self.gate == USUAL_GATE:
             self.gate = QUICK_GATE  # The usual gate looks further ahead than windows of low latency do.
         if (gate := read_gate(self.gate)) is not None:
-            self.rest = MouthAtRest(gate, face["template"], rest_weights(), self.frame_rate)
+            self.rest = MouthAtRest(gate, self.resting, rest_weights(), self.frame_rate)
         self.acting: Acting | None = None
         if options.acting is not None:
             from facediff.editing.acting import read_acting
@@ -144,7 +147,7 @@ class AnimationPipeline(ABC):
 
     @abstractmethod
     def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
-        """Absolute vertices of some speech (S,), part by part: those of each sample, (T, V, 3)."""
+        """Absolute points of some speech (S,), part by part: those of each sample, (T, V, dims)."""
 
     @abstractmethod
     def generator(self) -> VertexGenerator:
@@ -157,6 +160,25 @@ class AnimationPipeline(ABC):
     @abstractmethod
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
+
+    has_weights = False
+    """Whether animations have weights of ARKit's shapes by themselves."""
+
+    def made_of(self, animation: Animation, points: Array) -> Animation:  # noqa: ARG002
+        """An animation of the face alone with what it was decoded from; of vertices nothing."""
+        return animation
+
+    def posed(self, animation: Animation, points: Array) -> Animation:  # noqa: ARG002
+        """A finished animation with what its points say besides the face: how the head turns; of vertices nothing."""
+        return animation
+
+    def shown(self, points: Array) -> Array:
+        """Absolute vertices (T, V, 3) of points as the model generates them."""
+        return points
+
+    def rest_of_stream(self) -> MouthAtRest | None:
+        """What brings the mouth of a stream's vertices to rest."""
+        return self.rest
 
     @property
     @abstractmethod
@@ -230,9 +252,10 @@ class AnimationPipeline(ABC):
         )
         with spool as folder:
             finished = []
-            for i, vertices in enumerate(self._motions(speech, seeds, folder)):
+            for i, points in enumerate(self._motions(speech, seeds, folder)):
                 title = name if len(seeds) == 1 else f"{name}, sample {i + 1}"
-                finished.append(self._finished(self._animation(vertices, speech, title, seeds[i]), seeds[i]))
+                animation = self.made_of(self._animation(self.shown(points), speech, title, seeds[i]), points)
+                finished.append(self._finished(animation, seeds[i], points))
             yield finished
 
     def stream(self, rate: int = SAMPLE_RATE) -> AnimationStream:
@@ -253,7 +276,7 @@ class AnimationPipeline(ABC):
 
         return AnimationStream(
             self.generator(),
-            rest=self.rest,
+            rest=self.rest_of_stream(),
             performer=None
             if self.acting is None
             else self.acting.performer(self.frame_rate, self._acting_seed(self.seed)),
@@ -288,7 +311,7 @@ class AnimationPipeline(ABC):
             report(done, max(done, total))
 
     def _motions(self, speech: Array, seeds: Sequence[int], folder: Path | None) -> Sequence[Array]:
-        """Vertices (T, V, 3) of the samples, with the mouth at rest in pauses; memory maps if there is a folder."""
+        """Points (T, V, dims) of the samples, with the mouth at rest in pauses; memory maps if there is a folder."""
         import numpy as np
 
         model_speech = speech
@@ -302,7 +325,7 @@ class AnimationPipeline(ABC):
         if folder is not None:
             from facediff.animation.files import MotionWriter
 
-            shape = tuple(self.facts["template"].shape)
+            shape = tuple(self.resting.shape)
             writers = [MotionWriter(folder / f"{seed}.npy", shape) for seed in seeds]
         parts: list[list[Array]] = [[] for _ in seeds]
         done = 0
@@ -345,7 +368,7 @@ class AnimationPipeline(ABC):
                 metadata[option] = scales_text(scales)
         return Animation(name=name, vertices=vertices, speech=speech, metadata=metadata, **self.facts)
 
-    def _finished(self, animation: Animation, seed: int) -> Animation:
+    def _finished(self, animation: Animation, seed: int, points: Array) -> Animation:
         """A sample after everything that the options ask for after inference."""
         animation = self._closed(animation)
         if self.face is not None:
@@ -355,6 +378,7 @@ class AnimationPipeline(ABC):
 
                 acted = act(self.acting, animation, self._acting_seed(seed))
             animation = self.face.apply(animation, seed=seed, acted=acted)
+        animation = self.posed(animation, points)
         if self.options.target_mesh is None:
             return animation
         from facediff.editing.fit_check import FitReport, refuse_poor

@@ -85,6 +85,11 @@ def export_model(
         MissingExtraError: if the packages for ONNX are not installed.
     """
     require_onnx()
+    if not model.assets.space.is_vertices:
+        raise FaceDiffError(
+            f"{folder}: exported folders hold models of vertices, and this one's motion is channels "
+            f"({model.assets.space.kind}); animate with the checkpoint itself"
+        )
     graphs = model.graphs()
     known = list(model.assets.templates)
     for name in identities or ():

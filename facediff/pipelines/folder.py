@@ -77,7 +77,7 @@ def animate_folder(
             "output", f"several recordings go into a folder; give its name, and {{suffix}} {output.suffix}", output
         )
     check_options(options)
-    check_export(output / f"recording{suffix}", export, options.samples)
+    check_export(output / f"recording{suffix}", export, options.samples, weights=not is_exported(options.checkpoint))
     if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
         fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
         raise OptionError("suffix", f"a batch writes one file for each recording; choose {fit}", suffix)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from facediff.animation.options import AnimationOptions
 from facediff.editing.direction import Direction
@@ -17,10 +19,13 @@ from facediff.utils.hub import model_name
 from facediff.utils.licences import licence_metadata
 
 if TYPE_CHECKING:
+    from facediff.animation import Animation
     from facediff.data import Assets, Reference
     from facediff.models import AnimationModel, Style
     from facediff.pipelines.animate import Array
     from facediff.pipelines.directing import DirectedStream
+    from facediff.spaces import Space
+    from facediff.speech.voice_activity import MouthAtRest
 
 
 class TrainedPipeline(AnimationPipeline):
@@ -51,7 +56,9 @@ class TrainedPipeline(AnimationPipeline):
         model.windows = model.windows.chosen(options.window, options.overlap)
         self.identity = options.identity or model.identities[0]
         model.check_condition(options.condition)
-        face = facts_of(model.assets, self.identity)
+        face = facts_of(model.assets.mesh, self.identity)
+        assets = self.model.assets
+        self.has_weights = assets.space.kind == "arkit"
         self.options, self.facts = options, face
         if options.expressivity is not None:
             self._choose_expressivity()
@@ -64,6 +71,8 @@ class TrainedPipeline(AnimationPipeline):
         def rest_weights() -> Array:
             from facediff.editing.expressiveness import rest_weights
 
+            if not assets.space.is_vertices:
+                return channel_rest(assets.space)
             return rest_weights(face["template"], face["regions"])
 
         super().__init__(
@@ -74,6 +83,7 @@ class TrainedPipeline(AnimationPipeline):
             samples=model.samples,
             usual_gate=model.usual_gate,
             rest_weights=rest_weights,
+            resting=assets.template(self.identity).numpy(),
         )
         steps = getattr(getattr(model, "sampler", None), "steps", 1)
         self.step_seconds *= steps * len(self.runs)
@@ -130,7 +140,48 @@ class TrainedPipeline(AnimationPipeline):
 
     def generator(self) -> FirstSample:
         """What generates vertices while speech arrives."""
-        return FirstSample(self._directed([self.seed]))
+        return FirstSample(self._directed([self.seed]), self.shown)
+
+    def shown(self, points: Array) -> Array:
+        """Vertices as they are, and channels decoded by the corpus's rig."""
+        import torch
+
+        assets = self.model.assets
+        if assets.space.is_vertices:
+            return points
+        offsets = assets.to_vertices(torch.from_numpy(points - self.resting), self.identity).numpy()
+        offsets += self.facts["template"]
+        return offsets
+
+    def made_of(self, animation: Animation, points: Array) -> Animation:
+        """With the channels that its vertices were decoded from."""
+        space = self.model.assets.space
+        return animation if space.is_vertices else animation.made_of(space, np.ascontiguousarray(points[..., 0]))
+
+    def posed(self, animation: Animation, points: Array) -> Animation:
+        """With the turns of the head that the channels say, unless something else moves it."""
+        from facediff.editing.procedural import move_head, moves_head
+        from facediff.spaces.rotations import convert
+
+        turn = next((turn for turn in self.model.assets.space.rotations if turn.joint == "head"), None)
+        if turn is None or moves_head(animation):
+            return animation
+        values = animation.values
+        turns = convert(points[:, turn.start : turn.channels.stop, 0], turn.form, "axis_angle")
+        turned = move_head(animation, turns, np.zeros_like(turns))
+        return turned if values is None else turned.made_of(animation.space, values)
+
+    def rest_of_stream(self) -> MouthAtRest | None:
+        """Of a stream vertices are brought to rest, since they are decoded as they come."""
+        from facediff.editing.expressiveness import rest_weights
+        from facediff.speech.voice_activity import MouthAtRest
+
+        if self.rest is None or self.model.assets.space.is_vertices:
+            return self.rest
+        face = self.facts
+        return MouthAtRest(
+            self.rest.gate, face["template"], rest_weights(face["template"], face["regions"]), self.frame_rate
+        )
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
@@ -178,6 +229,12 @@ class TrainedPipeline(AnimationPipeline):
         if {*factors} == {ALL}:
             self.model.choose_expressivity(factors[ALL])
             return
+        if not self.model.assets.space.is_vertices:
+            raise OptionError(
+                "expressivity",
+                "regions are of vertices, and this model's motion is channels; give one number for all of it",
+                self.options.expressivity,
+            )
         import torch
 
         # A region's number fades into the rest as those of expressiveness do, so that no edge is visible.
@@ -188,8 +245,8 @@ class TrainedPipeline(AnimationPipeline):
 class FirstSample:
     """The only sample of a stream with one seed."""
 
-    def __init__(self, stream: DirectedStream) -> None:
-        self._stream = stream
+    def __init__(self, stream: DirectedStream, shown: Callable[[Array], Array]) -> None:
+        self._stream, self._shown = stream, shown
 
     @property
     def frames(self) -> int:
@@ -198,11 +255,19 @@ class FirstSample:
 
     def feed(self, samples: Array) -> Array:
         """The frames (m, V, 3) that more speech (n,) at 16 kHz makes certain."""
-        return self._stream.feed(samples)[0]
+        return self._shown(self._stream.feed(samples)[0])
 
     def finish(self) -> Array:
         """The frames (m, V, 3) that are left."""
-        return self._stream.finish()[0]
+        return self._shown(self._stream.finish()[0])
+
+
+def channel_rest(space: Space) -> Array:
+    """How far each channel (C,) goes to rest in pauses: those of the lower face do; brows, eyes and head move on."""
+    upper = {*space.region("upper_face"), *space.region("eyes")}
+    weights = np.zeros(len(space.channels), np.float32)
+    weights[[channel for channel in space.face if channel not in upper]] = 1.0
+    return weights
 
 
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
@@ -210,7 +275,6 @@ def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
 
     The neutral face and its colours are those of ``identity``, the first one trained on if None.
     """
-    import numpy as np
 
     def array(value: object, kind: type) -> object:
         return None if value is None else np.asarray(value, kind)

@@ -51,7 +51,7 @@ def test_channels_are_the_truth_of_the_vertices(tmp_path: Path) -> None:
     )
     # Pitch, yaw and roll in degrees on disk; where the eyes look, to the left and up.
     head, gaze = (np.load(tmp_path / "second" / f"{name}_npy" / "F1_t03.npy") for name in ("head", "gaze"))
-    np.testing.assert_allclose(motion[:, 54:57, 0], np.deg2rad(head[:, [1, 0, 2]]), atol=1e-6)
+    np.testing.assert_allclose(motion[:, 54:57, 0], np.deg2rad(head[:, [1, 0, 2]] * [1, 1, -1]), atol=1e-6)
     np.testing.assert_allclose(motion[:, 57:59, 0], np.deg2rad(gaze * [1, -1]), atol=1e-6)
     assert torch.equal(motion[:, 57:60], motion[:, 60:63])
 

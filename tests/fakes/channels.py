@@ -15,7 +15,7 @@ from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny, write_tiny
 
 CHANNELS = Space(
     "arkit",
-    ("mouthDown", "browForward", "jawStill", "HeadYaw", "HeadPitch", "HeadRoll"),
+    ("jawOpen", "browInnerUp", "mouthLeft", "HeadYaw", "HeadPitch", "HeadRoll"),
     rig="tiny",
     rig_hash="0",
     rotations=(Rotation("head", 3, "euler"),),

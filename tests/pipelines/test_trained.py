@@ -1,0 +1,92 @@
+"""A model of channels as a pipeline: decoded vertices, weights as they are, and how the head turns."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Trainer
+
+from facediff.animation import Animation
+from facediff.animation.files import read_animation
+from facediff.animation.options import AnimationOptions, ExportOptions
+from facediff.errors import FaceDiffError
+from facediff.export import check_export
+from facediff.models import DualPathDiffusion, load_model
+from facediff.pipelines.trained import TrainedPipeline, channel_rest
+from facediff.spaces.rotations import convert
+from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
+
+SPEECH = np.sin(np.arange(16_000) / 9).astype(np.float32)
+
+
+@pytest.fixture
+def checkpoint(
+    make_model: Callable[..., DualPathDiffusion], make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> Path:
+    data = TinyChannels(root=str(write_channels(tmp_path / "channels")), batch_size=4)
+    trainer = make_trainer(max_steps=1, limit_val_batches=0)
+    trainer.fit(make_model(n_vertices=6, space=CHANNELS), data)
+    trainer.save_checkpoint(tmp_path / "channels.ckpt")
+    return tmp_path / "channels.ckpt"
+
+
+def animate(checkpoint: Path, **options: object) -> Animation:
+    pipeline = TrainedPipeline(AnimationOptions(checkpoint=str(checkpoint), seed=3, quiet=True, **options))  # type: ignore[arg-type]
+    with pipeline.animations(SPEECH, "speech") as (animation,):
+        return animation
+
+
+def test_the_animation_is_what_the_rig_makes_of_its_channels(checkpoint: Path) -> None:
+    animation, assets = animate(checkpoint), load_model(checkpoint).assets
+    assert animation.values is not None
+    assert animation.values.shape == (25, 6)
+    decoded = (
+        assets.to_vertices(torch.from_numpy(animation.values)[..., None], "A").numpy()
+        + assets.mesh.template("A").numpy()
+    )
+    np.testing.assert_allclose(animation.still().vertices, decoded, atol=1e-6)
+    assert animation.head is not None
+    np.testing.assert_allclose(
+        animation.head[:, :3], convert(animation.values[:, 3:], "euler", "axis_angle"), atol=1e-6
+    )
+
+
+def test_weights_are_written_as_they_are(checkpoint: Path, tmp_path: Path) -> None:
+    animation = animate(checkpoint)
+    assert animation.values is not None
+    animation.save(tmp_path / "speech.csv")
+    with (tmp_path / "speech.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    written = np.array([[float(row[name]) for name in ("JawOpen", "BrowInnerUp", "MouthLeft")] for row in rows])
+    np.testing.assert_allclose(written[: len(animation.values)], animation.values[:, :3], atol=1e-7)
+    animation.save(tmp_path / "speech.npz")
+    again = read_animation(tmp_path / "speech.npz")
+    np.testing.assert_array_equal(again.values, animation.values)
+    assert again.space == CHANNELS
+    assert again.part([3, 4]).values is not None
+
+
+def test_changed_vertices_have_no_channels_any_more(checkpoint: Path, tmp_path: Path) -> None:
+    animation = animate(checkpoint, expressiveness="2")
+    assert animation.values is None
+    assert animation.space.is_vertices
+    with pytest.raises(FaceDiffError, match="blendshapes"):
+        check_export(tmp_path / "a.csv", ExportOptions())
+    with pytest.raises(FaceDiffError, match="blendshapes"):
+        animation.save(tmp_path / "a.csv")
+
+
+def test_a_stream_gives_vertices(checkpoint: Path) -> None:
+    pipeline = TrainedPipeline(AnimationOptions(checkpoint=str(checkpoint), seed=3, quiet=True))
+    stream = pipeline.stream()
+    frames = np.concatenate([stream.feed(SPEECH), stream.finish()])
+    assert frames.shape == (25, 24, 3)
+
+
+def test_pauses_rest_the_lower_face() -> None:
+    assert channel_rest(CHANNELS).tolist() == [1, 0, 1, 0, 0, 0]
