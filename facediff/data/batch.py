@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -20,6 +21,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from facediff.errors import FaceDiffError
 from facediff.spaces import VERTICES, Space
+from facediff.spaces.rigs import LinearRig
 from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
 from facediff.utils.plain_options import is_name
 
@@ -247,6 +249,43 @@ class Rig:
 
     mesh: Assets
     deltas: dict[str, Float[Tensor, "face vertices 3"]]
+
+    @classmethod
+    def of(cls, linear: LinearRig, assets: Assets) -> Rig:
+        """A linear rig as that of all speakers of a corpus; channels that it has no displacements for move nothing.
+
+        Its lips and upper face are the vertices that the channels of these regions move at least half as far as any.
+
+        Raises:
+            FaceDiffError: if it has none of the channels.
+        """
+        rows = {name.casefold(): row for row, name in enumerate(linear.names)}
+        names = [assets.space.channels[channel].casefold() for channel in assets.space.face]
+        if not rows.keys() & set(names):
+            raise FaceDiffError(
+                f"{linear.title or 'rig'}: has none of the channels of {assets.corpus} ({', '.join(names[:3])} …); give a "
+                f"rig with shapes of these names"
+            )
+        nothing = np.zeros(linear.neutral.shape)
+        deltas = torch.from_numpy(
+            np.stack([linear.deltas[rows[name]] if name in rows else nothing for name in names]).astype(np.float32)
+        )
+        moved = {
+            region: deltas[[assets.space.face.index(c) for c in channels.tolist() if c in assets.space.face]]
+            for region, channels in assets.regions.items()
+        }
+        sizes = {region: own.norm(dim=-1).amax(0) for region, own in moved.items()}
+        mesh = replace(
+            assets,
+            unit=linear.unit or "m",
+            templates=dict.fromkeys(assets.templates, torch.from_numpy(linear.neutral.astype(np.float32))),
+            faces=None if linear.faces is None else torch.from_numpy(np.asarray(linear.faces, np.int64)),
+            regions={region: (size >= size.max() / 2).nonzero()[:, 0] for region, size in sizes.items()},
+            references={},
+            space=VERTICES,
+            rig=None,
+        )
+        return cls(mesh, dict.fromkeys(assets.templates, deltas))
 
     @cached_property
     def mean(self) -> Float[Tensor, "face vertices 3"]:

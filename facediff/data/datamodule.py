@@ -345,6 +345,17 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """Where the channels of a parametric space lie."""
         return ChannelFolder(self.root, self.space)
 
+    def rig(self, assets: Assets) -> Rig | None:
+        """What turns channels into vertices, given the assets without it; None where that is not known.
+
+        One rig for all speakers is :meth:`facediff.data.batch.Rig.of` a linear rig.
+        """
+        mesh = self.mesh_corpus
+        if mesh is None:
+            return None
+        bare = replace(assets, templates=dict(mesh.templates), references={}, space=VERTICES)
+        return Rig(self._with_mesh(bare, mesh), self.deltas())
+
     @property
     def mesh_corpus(self) -> Corpus | None:
         """The corpus as vertices: itself, or of channels what their rig makes of them; None where that is not known."""
@@ -460,7 +471,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def assets(self) -> Assets:
         """The part of a checkpoint that describes this corpus, still without :meth:`motion_scale`."""
         if self._assets is None:
-            corpus, mesh = self.corpus, self.mesh_corpus
+            corpus = self.corpus
             references = {}
             for identity, clips in sorted(self.reference_policy().candidates.items()):
                 if identity in corpus.templates and self.stores_reference(identity):
@@ -481,12 +492,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 references=references,
                 space=self.space,
             )
-            if mesh is corpus:
-                assets = self._with_mesh(assets, corpus)
-            elif mesh is not None:
-                bare = replace(assets, templates=dict(mesh.templates), references={}, space=VERTICES)
-                assets = replace(assets, rig=Rig(self._with_mesh(bare, mesh), self.deltas()))
-            self._assets = assets
+            vertices = self.space.is_vertices
+            self._assets = self._with_mesh(assets, corpus) if vertices else replace(assets, rig=self.rig(assets))
         return self._assets
 
     def _with_mesh(self, assets: Assets, corpus: Corpus) -> Assets:
