@@ -263,8 +263,8 @@ class Rig:
         names = [assets.space.channels[channel].casefold() for channel in assets.space.face]
         if not rows.keys() & set(names):
             raise FaceDiffError(
-                f"{linear.title or 'rig'}: has none of the channels of {assets.corpus} ({', '.join(names[:3])} …); give a "
-                f"rig with shapes of these names"
+                f"{linear.title or 'rig'}: has none of the channels of {assets.corpus} ({', '.join(names[:3])} …); "
+                f"give a rig with shapes of these names"
             )
         nothing = np.zeros(linear.neutral.shape)
         deltas = torch.from_numpy(

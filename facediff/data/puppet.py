@@ -29,6 +29,7 @@ from facediff.synthetic.cast import MOST_DRAWN, SEEN, UNSEEN, drawn_names
 from facediff.synthetic.face import build_face
 from facediff.synthetic.further_speech import further_speech
 from facediff.synthetic.head.rig import SHAPES
+from facediff.synthetic.known_faces import built_in_rig as built_in_rig
 from facediff.synthetic.recordings import ALIGNED, speakers_of
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN as FIRST_MOST_DRAWN

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,8 +57,8 @@ class TrainedPipeline(AnimationPipeline):
         model.windows = model.windows.chosen(options.window, options.overlap)
         self.identity = options.identity or model.identities[0]
         model.check_condition(options.condition)
-        face = facts_of(model.assets.mesh, self.identity)
-        assets = self.model.assets
+        assets = self.assets = with_rig(model.assets)
+        face = facts_of(assets.mesh, self.identity)
         self.has_weights = assets.space.kind == "arkit"
         self.options, self.facts = options, face
         if options.expressivity is not None:
@@ -146,7 +147,7 @@ class TrainedPipeline(AnimationPipeline):
         """Vertices as they are, and channels decoded by the corpus's rig."""
         import torch
 
-        assets = self.model.assets
+        assets = self.assets
         if assets.space.is_vertices:
             return points
         offsets = assets.to_vertices(torch.from_numpy(points - self.resting), self.identity).numpy()
@@ -260,6 +261,16 @@ class FirstSample:
     def finish(self) -> Array:
         """The frames (m, V, 3) that are left."""
         return self._shown(self._stream.finish()[0])
+
+
+def with_rig(assets: Assets) -> Assets:
+    """Assets whose channels are ARKit's with the shapes of the built-in face, where they have no rig of their own."""
+    if assets.space.kind != "arkit" or assets.rig is not None:
+        return assets
+    from facediff.data.batch import Rig
+    from facediff.data.puppet import built_in_rig
+
+    return replace(assets, rig=Rig.of(built_in_rig(), assets))
 
 
 def channel_rest(space: Space) -> Array:

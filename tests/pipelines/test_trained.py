@@ -19,6 +19,7 @@ from facediff.export import check_export
 from facediff.models import DualPathDiffusion, load_model
 from facediff.pipelines.trained import TrainedPipeline, channel_rest
 from facediff.spaces.rotations import convert
+from facediff.synthetic.known_faces import built_in_rig
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 
 SPEECH = np.sin(np.arange(16_000) / 9).astype(np.float32)
@@ -90,3 +91,19 @@ def test_a_stream_gives_vertices(checkpoint: Path) -> None:
 
 def test_pauses_rest_the_lower_face() -> None:
     assert channel_rest(CHANNELS).tolist() == [1, 0, 1, 0, 0, 0]
+
+
+def test_arkit_channels_without_a_rig_move_the_built_in_face(
+    make_model: Callable[..., DualPathDiffusion], make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    data = TinyChannels(root=str(write_channels(tmp_path / "channels")), batch_size=4)
+    data.mesh_corpus = None  # type: ignore[assignment]
+    trainer = make_trainer(max_steps=1, limit_val_batches=0)
+    trainer.fit(make_model(n_vertices=6, space=CHANNELS), data)
+    trainer.save_checkpoint(tmp_path / "bare.ckpt")
+    animation = animate(tmp_path / "bare.ckpt")
+    rig = built_in_rig()
+    assert animation.values is not None
+    decoded = rig.only(CHANNELS.channels[:3]).decode(animation.values[:, :3])
+    np.testing.assert_allclose(animation.still().vertices, decoded, atol=1e-5)
+    assert {"lips", "upper_face"} <= animation.regions.keys()
