@@ -58,7 +58,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 PROGRAM = """
 import contextlib, io, json, sys
 from facediff.cli.app import main
+from tests.fakes.parsing import parse_imports_once
 
+parse_imports_once()
 outputs = {}
 for name, words in json.load(sys.stdin).items():
     with contextlib.redirect_stdout(io.StringIO()) as printed:

@@ -1,0 +1,183 @@
+"""The fixtures of all tests. Importing it takes as long as PyTorch and Lightning do: see tests/conftest.py."""
+
+from __future__ import annotations
+
+import gc
+
+gc.disable()  # what is imported and collected stays; it comes back below
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from facediff import registry
+from facediff.models import DualPathDiffusion
+from facediff.runtime.onnxruntime_web import VERSION
+from tests.fakes.parsing import parse_imports_once
+from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
+from tools.browser.chromium import Chromium, find_chromium
+
+# Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
+torch.set_num_threads(1)
+parse_imports_once()
+
+
+def pytest_collection_finish() -> None:
+    """Thousands of tests and all modules stay until the end: the garbage collector need not look at them each time."""
+    gc.freeze()
+    gc.enable()
+
+
+@pytest.fixture(autouse=True)
+def seed_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seed that one test sets, which Lightning keeps in the environment, is not that of the next one."""
+    for name in ("PL_GLOBAL_SEED", "PL_SEED_WORKERS"):
+        monkeypatch.setenv(name, "0")  # so that it is put back, whatever a test makes of it
+        monkeypatch.delenv(name)
+
+
+@pytest.fixture(scope="session")
+def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("corpus") / "tiny")
+
+
+@pytest.fixture
+def tiny(tiny_root: Path) -> Tiny:
+    return Tiny(root=str(tiny_root))
+
+
+@pytest.fixture
+def make_model() -> Callable[..., DualPathDiffusion]:
+    """A model small enough to train in a test; keyword arguments override."""
+
+    def make(**options: object) -> DualPathDiffusion:
+        from functools import partial
+
+        torch.manual_seed(0)
+        defaults: dict[str, object] = {
+            "n_vertices": VERTICES,
+            "identities": SEEN,
+            "frame_rate": 25.0,
+            "dim": 16,
+            "diffusion_steps": 40,
+            "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
+            "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
+            "decoder": partial(registry.decoder.style_transformer, num_layers=1),
+            "sampler": partial(registry.sampler.ddim, steps=3),
+        }
+        return DualPathDiffusion(**{**defaults, **options})
+
+    return make
+
+
+@pytest.fixture
+def make_trainer(tmp_path: Path) -> Callable[..., pl.Trainer]:
+    def make(**options: object) -> pl.Trainer:
+        defaults: dict[str, object] = {
+            "accelerator": "cpu",
+            "devices": 1,
+            "max_epochs": 1,
+            "logger": False,
+            "enable_progress_bar": False,
+            "enable_model_summary": False,
+            "enable_checkpointing": False,
+            "num_sanity_val_steps": 0,
+            "default_root_dir": tmp_path,
+            "log_every_n_steps": 1,
+        }
+        return pl.Trainer(**{**defaults, **options})
+
+    return make
+
+
+def saved(network: Any, config: Any, folder: Path) -> Path:  # noqa: ANN401 - of transformers
+    """The folder, with a network of random weights in it, as transformers saves one."""
+    from transformers.utils import logging
+
+    torch.manual_seed(0)
+    logging.disable_progress_bar()
+    network(config).save_pretrained(folder)
+    logging.enable_progress_bar()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A HuBERT of the published shape (seven convolutions, stride 320) in miniature, with random weights."""
+    from transformers import HubertConfig, HubertModel
+
+    config = HubertConfig(
+        hidden_size=32,
+        num_hidden_layers=3,
+        num_attention_heads=4,
+        intermediate_size=48,
+        conv_dim=(16,) * 7,
+        num_conv_pos_embeddings=8,
+        num_conv_pos_embedding_groups=4,
+    )
+    return saved(HubertModel, config, tmp_path_factory.mktemp("hubert"))
+
+
+@pytest.fixture(scope="session")
+def deepspeech_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """DeepSpeech's frozen graph in miniature, with random weights."""
+    from tests.fakes.tensorflow import write_graph
+    from tests.fakes.voca import deepspeech_state
+
+    return write_graph(tmp_path_factory.mktemp("deepspeech") / "output_graph.pb", deepspeech_state())
+
+
+@pytest.fixture(scope="session")
+def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wav2vec 2.0 with a CTC head over 29 letters in miniature, of the published shape, with random weights."""
+    from transformers import Wav2Vec2Config, Wav2Vec2ForCTC
+
+    config = Wav2Vec2Config(
+        vocab_size=29,
+        hidden_size=16,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        intermediate_size=24,
+        conv_dim=(8,) * 7,
+        num_conv_pos_embeddings=8,
+        num_conv_pos_embedding_groups=4,
+    )
+    return saved(Wav2Vec2ForCTC, config, tmp_path_factory.mktemp("ctc"))
+
+
+@pytest.fixture(scope="session")
+def program() -> Path:
+    """A Chromium; without one the test is skipped, or fails where FACEDIFF_REQUIRE_BROWSER is set."""
+    found = find_chromium()
+    if found is None:
+        words = (
+            "no Chromium found: put one on the PATH, or run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
+        )
+        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
+            pytest.fail(words)
+        pytest.skip(words)
+    return found
+
+
+@pytest.fixture(scope="session")
+def browser(program: Path) -> Iterator[Chromium]:
+    with Chromium(program) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def web_runtime_package(program: Path) -> Path:
+    """ONNX Runtime for browsers, which the browser's installation brings along; skipped or failed as the browser."""
+    name = f"onnxruntime-web-{VERSION}.tgz"
+    found = next((path for path in (program.parent / name, program.parent.parent / name) if path.is_file()), None)
+    if found is None:
+        words = f"no {name} next to the browser: run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
+        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
+            pytest.fail(words)
+        pytest.skip(words)
+    return found
