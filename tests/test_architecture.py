@@ -87,7 +87,10 @@ def imports_in(text: str) -> tuple[list[ast.Import | ast.ImportFrom], set[int]]:
     """The statements that import, at the top of a file or inside functions, and the lines for type checkers only."""
     statements: list[ast.Import | ast.ImportFrom] = []
     typed: set[int] = set()
-    for node in ast.walk(ast.parse(text)):
+    nodes: list[ast.AST] = [ast.parse(text)]
+    for node in nodes:  # which grows by statements only: expressions are most of a tree, and import nothing
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+            nodes += getattr(node, block, [])
         if isinstance(node, ast.Import | ast.ImportFrom):
             statements.append(node)
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):

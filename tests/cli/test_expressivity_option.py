@@ -39,7 +39,7 @@ def made(speech: Path, checkpoint: Path, *words: object) -> np.ndarray:
     return np.asarray(np.load(path), np.float64)
 
 
-@pytest.mark.parametrize("seconds", [1.0, 10.6])
+@pytest.mark.parametrize("seconds", [pytest.param(1.0, marks=pytest.mark.slow), 10.6])
 def test_expressivity_goes_from_the_mean_to_the_sample(checkpoint: Path, tmp_path: Path, seconds: float) -> None:
     """In one pass and by windows."""
     speech = say(tmp_path / "speech.wav", seconds)

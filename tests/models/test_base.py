@@ -289,7 +289,13 @@ def test_hyper_parameters_are_kept_without_a_word_of_the_model() -> None:
 
 @pytest.mark.parametrize(
     "named",
-    ["os.system", "subprocess.Popen", "facediff.registry.decoder.nothing", "facediff.registry.fusion.add", "this"],
+    [
+        "os.system",
+        pytest.param("subprocess.Popen", marks=pytest.mark.slow),
+        pytest.param("facediff.registry.decoder.nothing", marks=pytest.mark.slow),
+        "facediff.registry.fusion.add",
+        "this",
+    ],
 )
 def test_a_checkpoint_that_names_a_program_does_not_run_it(tmp_path: Path, trained: Path, named: str) -> None:
     checkpoint = torch.load(trained, weights_only=True)

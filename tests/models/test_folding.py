@@ -170,7 +170,9 @@ def choose(model: DualPathDiffusion, batch: Batch) -> ConditionalDenoiser:
 
 
 @pytest.mark.parametrize(("name", "options"), SAMPLERS)
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(torch.float64, 1e-10), pytest.param(torch.float32, 1e-4, marks=pytest.mark.slow)]
+)
 def test_folded_sampling_gives_the_same_motion_for_the_same_noise(
     ready: Make, batch: Batch, name: str, options: dict[str, Any], dtype: torch.dtype, tolerance: float
 ) -> None:

@@ -52,7 +52,15 @@ def imported(files: list[Path], dataset: str, **options: Any) -> CodeTalker:  # 
 
 
 @pytest.mark.parametrize("loop", ["cached", "literal"])
-@pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 40), ("vocaset", 41), ("biwi", 41), ("biwi", 58)])
+@pytest.mark.parametrize(
+    ("dataset", "steps"),
+    [
+        ("vocaset", 41),
+        ("biwi", 41),
+        pytest.param("vocaset", 40, marks=pytest.mark.slow),
+        pytest.param("biwi", 58, marks=pytest.mark.slow),
+    ],
+)
 def test_it_animates_as_published(dataset: str, steps: int, loop: str, tmp_path: Path) -> None:
     one, two = codetalker.stage_one(dataset), codetalker.stage_two(dataset)
     model = imported(write(tmp_path, one=one, two=two), dataset, loop=loop)

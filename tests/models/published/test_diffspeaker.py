@@ -38,12 +38,12 @@ def noise_of(frames: int, seed: int) -> Tensor:
 @pytest.mark.parametrize(
     ("dataset", "steps", "frames"),
     [
-        ("vocaset", 40, 24),
+        pytest.param("vocaset", 40, 24, marks=pytest.mark.slow),
         ("vocaset", 41, 24),
         ("vocaset", 205, 122),
-        ("biwi", 40, 20),
+        pytest.param("biwi", 40, 20, marks=pytest.mark.slow),
         ("biwi", 41, 20),
-        ("biwi", 58, 28),
+        pytest.param("biwi", 58, 28, marks=pytest.mark.slow),
     ],
 )
 def test_parity(dataset: str, steps: int, frames: int, tmp_path: Path) -> None:
