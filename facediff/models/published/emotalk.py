@@ -257,7 +257,7 @@ class EmoTalkNetwork(nn.Module):
         level: int,
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Values of the channels, which nothing bounds."""
-        content, emotion = torch.split(features, self.widths, -1)
+        content, emotion = torch.split(features, list(self.widths), -1)
         frames = features.shape[1]
         memory = self.memory_map(emotion)
         chosen = self.level.weight[level].expand(*features.shape[:2], -1)
