@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast, overload
 
@@ -25,7 +26,7 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.hub import EXPECTED, check_model_source, is_exported, model_or_bundled
+from facediff.utils.hub import EXPECTED, check_model_source, is_audio2face, is_exported, model_or_bundled
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import SAMPLE_RATES, check_number
 
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
     from facediff.animation.options import StyleLike
     from facediff.models import AnimationModel
     from facediff.pipelines.animate import Progress
+    from facediff.pipelines.audio2face import Audio2FaceWeights, Part
     from facediff.runtime import RuntimeModel
+    from facediff.runtime.audio2face import Audio2Face
     from facediff.speech.inputs import Speech, Waveform
 
     DType = str | torch.dtype
@@ -48,13 +51,13 @@ PRECISIONS: dict[str, Literal["32", "bf16"]] = {"float32": "32", "bfloat16": "bf
 
 def load(
     source: str | Path | None = None, device: str = "auto", commercial_only: bool = False, dtype: DType = "float32"
-) -> Animator | ExportedAnimator:
+) -> Animator | ExportedAnimator | Audio2FaceAnimator:
     """A model, ready to animate.
 
     Args:
         source: a checkpoint (.ckpt), a model folder that ``facediff publish`` has written, ``user/name[@revision]`` of
-            the Hugging Face hub, or a folder of ``facediff export-model``, which needs no PyTorch; the model that comes
-            with facediff if None.
+            the Hugging Face hub, or a folder of ``facediff export-model`` or of Audio2Face-3D, which need no PyTorch;
+            the model that comes with facediff if None.
         device: where it computes: cpu, cuda …; ``auto`` for a CUDA device where there is one.
         commercial_only: refuse a model whose licence labels do not allow commercial use.
         dtype: in which it multiplies, float32 or bfloat16.
@@ -75,6 +78,8 @@ def load(
         options = AnimationOptions(
             checkpoint=source, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
         )
+        if is_audio2face(source):
+            return Audio2FaceAnimator.load(options)
         return ExportedAnimator.load(options)
     check_model_source(source)  # before torch is imported
     from facediff.models import load_model
@@ -487,6 +492,78 @@ class ExportedAnimator(SpeechAnimator):
         return (
             f"ExportedAnimator({str(self.source)!r}: {about.model}, identities {', '.join(self.identities)}, "
             f"{self.frame_rate:g} frames a second, in {about.unit}; {about.licences.get('licence', '')})"
+        )
+
+
+class Audio2FaceAnimator(SpeechAnimator):
+    """A folder of Audio2Face-3D, without PyTorch; ``style="joy:0.7,pain:0.2"`` says how strong each emotion is.
+
+    Args:
+        model: the open folder.
+        source: where it lies.
+
+    Attributes:
+        frame_rate: frames a second of its animations; may be changed.
+        weights: how weights of its blendshapes are solved for; may be changed.
+    """
+
+    def __init__(self, model: Audio2Face, source: str | Path) -> None:
+        from facediff.pipelines.audio2face import FRAME_RATE, Audio2FaceWeights
+
+        self.model, self.source = model, source
+        self.frame_rate = FRAME_RATE
+        self.weights: Audio2FaceWeights = Audio2FaceWeights()
+
+    @classmethod
+    def load(cls, options: AnimationOptions) -> Self:
+        """Open the folder that options name; a device or a precision that it does not have is refused."""
+        from facediff.pipelines.audio2face import Audio2FacePipeline
+
+        return cls(Audio2FacePipeline(options).model, options.checkpoint)
+
+    @property
+    def identities(self) -> list[str]:
+        """The actor."""
+        return [self.model.folder.facts.actor or "actor"]
+
+    @property
+    def emotions(self) -> tuple[str, ...]:
+        """The emotions that have a strength."""
+        return self.model.folder.facts.emotions
+
+    @property
+    def device(self) -> str:
+        """Where it computes."""
+        return "cpu"
+
+    @contextmanager
+    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
+        """The model with its choices made."""
+        from facediff.pipelines.audio2face import Audio2FacePipeline
+
+        yield Audio2FacePipeline(options, model=self.model, frame_rate=self.frame_rate, weights=self.weights)
+
+    def solve(
+        self, part: Part, vertices: npt.NDArray[np.float32], temporal: float | None = None
+    ) -> npt.NDArray[np.float32]:
+        """Weights (T, K) of the folder's blendshapes for vertices.
+
+        Args:
+            part: whose shapes: ``skin`` or ``tongue``.
+            vertices: absolute positions (T, V, 3) of all of its vertices.
+            temporal: strength of the temporal term; that of :attr:`weights` if None.
+
+        Raises:
+            FaceDiffError: if the folder has no such shapes, or the vertices are others.
+        """
+        weights = self.weights if temporal is None else replace(self.weights, temporal=temporal)
+        return weights.solve(self.model, part, vertices)
+
+    def __repr__(self) -> str:
+        facts = self.model.folder.facts
+        return (
+            f"Audio2FaceAnimator({str(self.source)!r}: {facts.actor}, {facts.skin_vertices} vertices, "
+            f"{self.frame_rate:g} frames a second, emotions {', '.join(facts.emotions)})"
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationOptions
-from facediff.utils.hub import is_exported
+from facediff.utils.hub import is_audio2face, is_exported
 
 if TYPE_CHECKING:
     from facediff.pipelines.animate import AnimationPipeline
@@ -19,6 +19,10 @@ def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
         pipeline = open_pipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))
         pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), ExportOptions())
     """
+    if is_audio2face(options.checkpoint):
+        from facediff.pipelines.audio2face import Audio2FacePipeline
+
+        return Audio2FacePipeline(options)
     if is_exported(options.checkpoint):
         from facediff.pipelines.exported import ExportedPipeline
 

@@ -92,6 +92,11 @@ class Audio2Face:
         """Frames whose moments lie in so many samples: frame k is at k/frame_rate seconds."""
         return math.ceil(samples / step(frame_rate))
 
+    @staticmethod
+    def moment(frame: int, frame_rate: float) -> int:
+        """The sample that a frame's window is about, rounded down; exact, so that no frame rate drifts."""
+        return math.floor(frame * step(frame_rate))
+
     def emotion(self, strengths: Mapping[str, float] | None = None) -> Array:
         """The network's emotion (I + E,): the implicit one of the settings, then the explicit one.
 
@@ -117,6 +122,7 @@ class Audio2Face:
         *,
         start: int = 0,
         frames: int | None = None,
+        origin: int = 0,
     ) -> Array:
         """What the network gives for each frame.
 
@@ -126,11 +132,12 @@ class Audio2Face:
             emotion: strengths by name, or the explicit emotion of every frame (T, E).
             start: the first frame.
             frames: how many; all whose moments lie in the speech if None.
+            origin: the sample of the recording that ``audio`` begins with, where it is the rest of a longer one.
 
         Returns:
             (T, n): coefficients of skin and tongue, offsets of the jaw's points, angles of the eyes.
         """
-        facts, rate = self.folder.facts, step(frame_rate)
+        facts = self.folder.facts
         count = self.frames(len(audio), frame_rate) - start if frames is None else frames
         if isinstance(emotion, np.ndarray):
             implicit = np.broadcast_to(self.folder.implicit, (len(emotion), facts.implicit))
@@ -140,12 +147,10 @@ class Audio2Face:
         if emotions.shape != (count, facts.implicit + len(facts.emotions)):
             given = (len(emotions), emotions.shape[1] - facts.implicit)
             raise FaceDiffError(f"emotion: has the shape {given}; expected ({count}, {len(facts.emotions)})")
-        # The moments are whole samples, rounded down, in exact arithmetic: 29.97 frames a second must not drift.
-        moments = [math.floor((start + frame) * rate) for frame in range(count)]
-        padded = np.pad(audio.astype(np.float32), (facts.before, facts.buffer)) * np.float32(
-            self.folder.settings.input_strength
-        )
-        padded = np.pad(padded, (0, max(0, max(moments, default=0) + facts.buffer - len(padded))))
+        moments = [self.moment(start + frame, frame_rate) - origin for frame in range(count)]
+        after = max(0, max(moments, default=0) + facts.buffer - facts.before - len(audio))
+        padded = np.pad(audio.astype(np.float32), (facts.before, after))
+        padded *= np.float32(self.folder.settings.input_strength)
         results = np.empty((count, facts.size), np.float32)
         for first in range(0, count, self._batch):
             rows = slice(first, min(first + self._batch, count))
@@ -183,6 +188,9 @@ class FaceAnimator:
         folder: content of the model's folder.
         frame_rate: frames a second.
         blink: how far the lids are closed besides.
+
+    Attributes:
+        lower: (V, 1) how far each vertex belongs to the lower face.
     """
 
     def __init__(self, folder: Audio2FaceFolder, frame_rate: float, *, blink: float = 0.0) -> None:
@@ -192,10 +200,10 @@ class FaceAnimator:
         share = (height - height.min()) / np.ptp(height)
         distance = (settings.face_mask_level - share) / settings.face_mask_softness
         with np.errstate(over="ignore"):  # far below the border, exp overflows to infinity, which gives the right 0
-            lower = (1 / (1 + np.exp(-distance)))[:, None]
+            self.lower = (1 / (1 + np.exp(-distance)))[:, None]
         self._parts = (
-            (lower * settings.lower_face_strength, self._share(settings.lower_face_smoothing)),
-            ((1 - lower) * settings.upper_face_strength, self._share(settings.upper_face_smoothing)),
+            (self.lower * settings.lower_face_strength, self._share(settings.lower_face_smoothing)),
+            ((1 - self.lower) * settings.upper_face_strength, self._share(settings.upper_face_smoothing)),
         )
         closing = -settings.eyelid_open_offset + blink * settings.blink_strength
         self._offset = arrays["eye_close"] * closing + arrays["lip_open"] * np.float64(settings.lip_open_offset)

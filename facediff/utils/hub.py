@@ -79,8 +79,13 @@ def check_model_source(source: str | os.PathLike[str], option: str = "") -> None
 
 
 def is_exported(source: str | os.PathLike[str]) -> bool:
-    """Whether a model is a folder of ``facediff export-model``, which animates without PyTorch."""
+    """Whether a model is a folder of graphs, of ``facediff export-model`` or others, which needs no PyTorch."""
     return (Path(source) / "model.json").is_file()
+
+
+def is_audio2face(source: str | os.PathLike[str]) -> bool:
+    """Whether a model is a folder of Audio2Face-3D, as NVIDIA distributes it."""
+    return is_exported(source) and (Path(source) / "network_info.json").is_file()
 
 
 def check_animating_source(source: str | os.PathLike[str]) -> None:

@@ -1,0 +1,328 @@
+"""A folder of Audio2Face-3D as a pipeline: vertices, weights of face and tongue, and how jaw and eyes turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from facediff.animation.options import AnimationOptions
+from facediff.editing.regularised_weights import Regularisation, RegularisedSolver, TemporalTerm, pairs_of
+from facediff.errors import FaceDiffError, OptionError
+from facediff.pipelines.animate import AnimationPipeline
+from facediff.pipelines.exported import FIXED, style_text
+from facediff.runtime.audio2face import LICENCE, Array, Audio2Face, FaceAnimator
+from facediff.runtime.audio2face_folder import Poses
+from facediff.spaces import Rotation, Space
+from facediff.spaces.arkit import ARKIT
+from facediff.spaces.rotations import convert
+from facediff.speech.voice_activity import OFF
+from facediff.speech.windows import WindowPlan
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.licences import Licence, licence_metadata, require_cleared
+
+if TYPE_CHECKING:
+    from facediff.animation import Animation
+    from facediff.editing.direction import Direction
+
+FRAME_RATE = 30.0
+"""Frames a second where nobody chooses; any rate will do."""
+
+UNIT = "cm"
+
+Part = Literal["skin", "tongue"]
+
+Solver = Literal["nvidia", "facediff"]
+"""Whose solver makes weights of vertices: NVIDIA's regularised system, or facediff's bounded least squares."""
+
+
+@dataclass(frozen=True)
+class Audio2FaceWeights:
+    """How weights of a folder's blendshapes are solved for.
+
+    Attributes:
+        solver: whose solver makes weights: ``nvidia`` or ``facediff``.
+        temporal_term: of NVIDIA's solver: ``published`` shrinks motion where its strength is not 0, ``corrected`` does
+            what it is for.
+        temporal: strength of that term; that of the folder if None.
+    """
+
+    solver: Solver = "nvidia"
+    temporal_term: TemporalTerm = "published"
+    temporal: float | None = None
+
+    def solve(self, model: Audio2Face, part: Part, vertices: Array) -> Array:
+        """Weights (T, K) of the folder's blendshapes, in the order of ``model.folder.poses[part].names``.
+
+        Args:
+            model: the model.
+            part: whose shapes.
+            vertices: absolute positions (T, V, 3) of all of its vertices.
+
+        Raises:
+            FaceDiffError: if the folder has no such shapes, or the vertices are others.
+        """
+        poses = model.folder.poses.get(part)
+        if poses is None:
+            folder = model.folder.network.parent
+            raise FaceDiffError(f"{folder}: has no blendshapes of the {part}; get the whole folder")
+        if self.solver == "facediff":
+            return nearest(poses, vertices)
+        settings = poses.settings
+        regularisation = Regularisation(
+            l1=settings.l1,
+            l2=settings.l2,
+            temporal=settings.temporal if self.temporal is None else self.temporal,
+            symmetry=settings.symmetry,
+            template_size=settings.template_size,
+            temporal_term=self.temporal_term,
+        )
+        solver = RegularisedSolver(
+            poses.neutral,
+            poses.deltas,
+            mask=poses.mask,
+            regularisation=regularisation,
+            active=settings.active,
+            symmetric=pairs_of(settings.symmetric),
+            cancel=pairs_of(settings.cancel),
+            multipliers=settings.multipliers,
+            offsets=settings.offsets,
+        )
+        return solver.solve(np.asarray(vertices).reshape(len(vertices), -1, 3)).astype(np.float32)
+
+
+def nearest(poses: Poses, vertices: Array) -> Array:
+    """The weights (T, K) by which the shapes come nearest to the vertices, each frame by itself."""
+    from facediff.animation import Animation
+    from facediff.editing.blendshapes import SolveOptions, solve
+    from facediff.editing.shapes import ShapeSet
+
+    shapes = ShapeSet(poses.names, poses.neutral.astype(np.float64), poses.deltas.astype(np.float64))
+    regions = {"mask": poses.mask} if len(poses.mask) else {}
+    animation = Animation("poses", np.asarray(vertices), poses.neutral, FRAME_RATE, unit=UNIT, regions=regions)
+    options = SolveOptions(
+        smoothness=0, sparsity=0, area_weighted=False, residual_limit=1.0, region="mask" if regions else None
+    )
+    solved = solve(animation, shapes, options)
+    weights = np.zeros((len(vertices), len(poses.names)), np.float32)
+    for column, name in enumerate(solved.names):
+        weights[:, poses.names.index(name)] = solved.values[:, column]
+    return weights
+
+
+class Audio2FacePipeline(AnimationPipeline):
+    """Animates recordings with a folder of Audio2Face-3D.
+
+    Args:
+        options: the choices; ``style`` says how strong each emotion is.
+        model: a model that is open already. None to open the folder.
+        frame_rate: frames a second.
+        weights: how weights are solved for.
+
+    Raises:
+        FaceDiffError: if an option decides nothing in such a model.
+    """
+
+    def __init__(
+        self,
+        options: AnimationOptions,
+        *,
+        model: Audio2Face | None = None,
+        frame_rate: float = FRAME_RATE,
+        weights: Audio2FaceWeights | None = None,
+    ) -> None:
+        refuse_fixed(options)
+        self.model = Audio2Face.open(options.checkpoint, threads=options.threads) if model is None else model
+        self.weights = weights or Audio2FaceWeights()
+        folder = self.model.folder
+        self.actor = folder.facts.actor or "actor"
+        if options.commercial_only:
+            require_cleared(options.checkpoint, licences_of(self.model))
+        for name in ("identity", "condition"):
+            if getattr(options, name) not in (None, self.actor):
+                raise OptionError(name, f"the folder has one face, {self.actor}; omit it", getattr(options, name))
+        text = style_text(options)
+        self.emotion = {} if text is None else emotions_of(text)
+        self.model.emotion(self.emotion)  # refuses what the model does not know
+        self._animated: list[dict[str, Array]] = []
+        template = folder.arrays["skin"]
+        self.has_weights = "skin" in folder.poses and {*folder.poses["skin"].names} <= {*ARKIT}
+        super().__init__(
+            options,
+            face={
+                "template": template,
+                "faces": None,
+                "frame_rate": float(frame_rate),
+                "unit": UNIT,
+                "regions": {"mask": folder.poses["skin"].mask} if "skin" in folder.poses else {},
+            },
+            windows=WindowPlan(),
+            model="Audio2Face-3D",
+            samples=False,
+            usual_gate=OFF,
+            rest_weights=lambda: FaceAnimator(folder, frame_rate).lower[:, 0].astype(np.float32),
+        )
+
+    @property
+    def corpus(self) -> str:
+        """What errors call the model's face."""
+        return f"Audio2Face-3D's {self.actor}"
+
+    @property
+    def look_ahead(self) -> float:
+        """What a window has after its frame's moment, if nothing else looks further."""
+        facts = self.model.folder.facts
+        own = (facts.buffer - facts.before) / SAMPLE_RATE
+        return max(own, 0.0 if self.rest is None else self.rest.openness().look_ahead)
+
+    def frames_of(self, samples: int) -> int:
+        """How many frames there are for so many samples of speech."""
+        return self.model.frames(samples, self.frame_rate)
+
+    def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
+        """Absolute vertices of the skin, a second after the other."""
+        animator, total = FaceAnimator(self.model.folder, self.frame_rate), self.frames_of(len(speech))
+        if not total:
+            raise FaceDiffError("the speech holds no samples; give more of it")
+        self._animated, part = [], max(1, round(self.frame_rate))
+        for start in self.track(range(0, total, part), "seconds"):
+            count = min(part, total - start)
+            result = self.model.infer(speech, self.frame_rate, self.emotion, start=start, frames=count)
+            animated = animator.animate(result)
+            yield [animated.pop("skin_vertices")]
+            self._animated.append(animated)
+
+    def generator(self) -> Audio2FaceStream:
+        """What generates vertices while speech arrives."""
+        return Audio2FaceStream(self.model, self.frame_rate, self.emotion)
+
+    def made_of(self, animation: Animation, points: Array) -> Animation:
+        """With the weights of the face and the tongue, and how jaw and eyes turn."""
+        if not self.has_weights:
+            return animation
+        animated = {name: np.concatenate([part[name] for part in self._animated]) for name in self._animated[0]}
+        poses = self.model.folder.poses
+        columns = {"skin": self.weights.solve(self.model, "skin", points)}
+        if "tongue" in poses:
+            columns["tongue"] = self.weights.solve(self.model, "tongue", animated["tongue_vertices"])
+        turned = convert(animated["jaw_transform"][:, :3, :2].swapaxes(1, 2).reshape(-1, 6), "six_d", "axis_angle")
+        eyes = np.deg2rad(animated["eyes_rotation"])
+        still = np.zeros((len(eyes), 1))
+        moved = [turned, animated["jaw_transform"][:, :3, 3], eyes[:, [1, 0]], still, eyes[:, [3, 2]], still]
+        values = np.concatenate([*columns.values(), *moved], axis=1)
+        return animation.made_of(self.space(), np.ascontiguousarray(values, np.float32))
+
+    def space(self) -> Space:
+        """The channels: the folder's shapes, then the jaw's turn and shift and the eyes' turns, in radians and cm.
+
+        Its ``mouthClose`` is that of a closed mouth with an open jaw, and not Apple's, which is added to ``jawOpen``.
+        """
+        poses = self.model.folder.poses
+        skin = poses["skin"].names
+        tongue = (
+            [f"tongue_{name}" if name in skin else name for name in poses["tongue"].names] if "tongue" in poses else []
+        )
+        jaw = [f"jaw_{axis}" for axis in "xyz"] + [f"jaw_shift_{axis}" for axis in "xyz"]
+        eyes = [f"{side}_eye_{angle}" for side in ("right", "left") for angle in ("yaw", "pitch", "roll")]
+        first = len(skin) + len(tongue)
+        return Space(
+            "arkit",
+            (*skin, *tongue, *jaw, *eyes),
+            version="audio2face",
+            rig=f"Audio2Face-3D {self.actor}",
+            rotations=(
+                Rotation("jaw", first, "axis_angle"),
+                Rotation("right_eye", first + 6, "euler"),
+                Rotation("left_eye", first + 9, "euler"),
+            ),
+        )
+
+    def direct(self, direction: Direction | None) -> None:
+        """Follow other keys over time from now on; those that a model itself follows are for trained ones."""
+        if direction is not None:
+            direction.refuse_model_channels()
+        super().direct(direction)
+
+    def metadata(self, seed: int) -> dict[str, str]:
+        """What an animation says of the model and its choices."""
+        facts = self.model.folder.facts
+        chosen = ",".join(f"{name}:{strength:g}" for name, strength in self.emotion.items())
+        return {
+            "model": f"Audio2Face-3D v2.3, {facts.actor}",
+            **licence_metadata(licences_of(self.model)),
+            "identity": self.actor,
+            "style": chosen or "the usual emotion",
+        }
+
+
+class Audio2FaceStream:
+    """Animates speech that arrives in pieces: a frame is certain once its window has been heard.
+
+    Args:
+        model: the model.
+        frame_rate: frames a second.
+        emotion: strengths of explicit emotions.
+    """
+
+    def __init__(self, model: Audio2Face, frame_rate: float, emotion: dict[str, float]) -> None:
+        self.model, self.frame_rate, self.emotion = model, frame_rate, emotion
+        self.frames = 0
+        self._animator = FaceAnimator(model.folder, frame_rate)
+        self._speech = np.zeros(0, np.float32)
+        self._dropped = 0  # samples before these, which no window will hear again
+
+    def feed(self, samples: Array) -> Array:
+        """The frames (m, V, 3) that more speech (n,) at 16 kHz makes certain."""
+        self._speech = np.concatenate([self._speech, np.asarray(samples, np.float32)])
+        facts = self.model.folder.facts
+        heard = self._dropped + len(self._speech)
+        return self._next(self.model.frames(max(0, heard - (facts.buffer - facts.before) + 1), self.frame_rate))
+
+    def finish(self) -> Array:
+        """The frames (m, V, 3) that are left."""
+        return self._next(self.model.frames(self._dropped + len(self._speech), self.frame_rate))
+
+    def _next(self, total: int) -> Array:
+        """Frames up to this one; then what no later window hears is forgotten."""
+        count, facts = max(0, total - self.frames), self.model.folder.facts
+        if not count:
+            return np.zeros((0, facts.skin_vertices, 3), np.float32)
+        result = self.model.infer(
+            self._speech, self.frame_rate, self.emotion, start=self.frames, frames=count, origin=self._dropped
+        )
+        self.frames += count
+        drop = max(0, self.model.moment(self.frames, self.frame_rate) - facts.before - self._dropped)
+        self._speech, self._dropped = self._speech[drop:], self._dropped + min(drop, len(self._speech))
+        return self._animator.animate(result)["skin_vertices"]
+
+
+def refuse_fixed(options: AnimationOptions) -> None:
+    """Refuse options that such a model does not have."""
+    changed = options.changed()
+    for name in (*FIXED, "expressivity", "window", "overlap", "low_latency"):
+        if name in changed and (name, changed[name]) not in (("device", "auto"), ("low_latency", False)):
+            raise OptionError(name, "has no meaning for Audio2Face-3D, whose frames have a window each; omit it")
+
+
+def licences_of(model: Audio2Face) -> tuple[Licence, ...]:
+    """The licence of the weights, for the actor of the folder."""
+    return (replace(LICENCE, of=f"weights of Audio2Face-3D {model.folder.facts.actor}".strip()),)
+
+
+def emotions_of(text: str) -> dict[str, float]:
+    """Strengths by name.
+
+    Example:
+        >>> emotions_of("joy:0.7,pain:0.2"), emotions_of("anger")
+        ({'joy': 0.7, 'pain': 0.2}, {'anger': 1.0})
+    """
+    strengths: dict[str, float] = {}
+    for word in text.split(","):
+        name, colon, number = word.partition(":")
+        try:
+            strengths[name.strip()] = float(number) if colon else 1.0
+        except ValueError as error:
+            raise OptionError("style", "expected emotions with strengths, such as joy:0.7,pain:0.2", text) from error
+    return strengths
