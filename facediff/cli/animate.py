@@ -144,12 +144,12 @@ def animate(
     from facediff.pipelines.opening import open_pipeline
     from facediff.speech.inputs import read_recording
     from facediff.speech.voice_activity import speech_problems
-    from facediff.utils.hub import is_exported
+    from facediff.utils.hub import may_have_weights
 
     if options.direction is not None:
         options = replace(options, direction=direction_for(options.direction, speech[0]))
     check_options(options)
-    check_export(output, files, options.samples, weights=not is_exported(options.checkpoint))
+    check_export(output, files, options.samples, weights=may_have_weights(options.checkpoint))
     speech_samples = read_recording(speech[0], options.max_seconds)  # before the model, which takes longer to load
     for problem in speech_problems(speech_samples):
         tell(f"note: {speech[0]}: {problem}")

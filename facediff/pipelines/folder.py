@@ -23,7 +23,7 @@ from facediff.speech.inputs import read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
-from facediff.utils.hub import is_exported, model_files
+from facediff.utils.hub import is_exported, may_have_weights, model_files
 from facediff.utils.jobs import PerWorker, is_cluster
 from facediff.utils.tables import print_table
 
@@ -77,7 +77,7 @@ def animate_folder(
             "output", f"several recordings go into a folder; give its name, and {{suffix}} {output.suffix}", output
         )
     check_options(options)
-    check_export(output / f"recording{suffix}", export, options.samples, weights=not is_exported(options.checkpoint))
+    check_export(output / f"recording{suffix}", export, options.samples, weights=may_have_weights(options.checkpoint))
     if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
         fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
         raise OptionError("suffix", f"a batch writes one file for each recording; choose {fit}", suffix)

@@ -88,6 +88,11 @@ def is_audio2face(source: str | os.PathLike[str]) -> bool:
     return is_exported(source) and (Path(source) / "network_info.json").is_file()
 
 
+def may_have_weights(source: str | os.PathLike[str]) -> bool:
+    """Whether a model's animations may be made of weights of face shapes: not those of ``facediff export-model``."""
+    return not is_exported(source) or is_audio2face(source)
+
+
 def check_animating_source(source: str | os.PathLike[str]) -> None:
     """Refuse, before anything heavy is imported, what cannot be animated with.
 

@@ -29,11 +29,17 @@ PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
 MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
 SIZES: dict[str, Any] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE), "audio_encoder": MEL}
 
+NETWORK = {
+    **{"model_type": "wav2vec2", "hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2},
+    **{"intermediate_size": 8, "conv_dim": [4] * 7, "num_conv_pos_embeddings": 4, "num_conv_pos_embedding_groups": 2},
+}
+"""A tiny speech network of random weights."""
+
 STYLE_CONTENT = {"dim": 16, "content_dim": 16}
 PUBLISHED = {"audio_dim": 16, "dim": 16}
 SELFTALK = {**PUBLISHED, "lip_reader": "none"}
 VOCA = {**PUBLISHED, "components": 8, "channels": (8, 8)}
-EMOTALK = {**PUBLISHED, "emotion_encoder": MEL, "emotion_dim": 4, "level_dim": 2, "person_dim": 2}
+EMOTALK = {**PUBLISHED, "emotion_config": NETWORK, "emotion_dim": 4, "level_dim": 2, "person_dim": 2}
 FACEDIFFUSER = {**PUBLISHED, "diffusion_steps": 8}
 DIFFSPEAKER = {**PUBLISHED, "sampling_steps": 8, "smooth": True}
 OWN = {"audio_dim": None}  # the encoder's own channels

@@ -28,7 +28,7 @@ from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
 from facediff.models.published.autoregressive import DecoderLayer, Period, decoder_sizes, periodic_bias
-from facediff.models.published.base import DirectModel, SpeakerTable, make_encoder, masked_mean
+from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
@@ -70,17 +70,18 @@ class EmoTalk(DirectModel):
         period: frames that count alike in its attention; those of a second if None.
         levels: how many strengths of emotion there are.
         level: the strength that motion is generated with; the authors' demonstration takes 1.
-        emotion_encoder: speech to features of how it is said; the method's own pretrained network if None.
+        emotion_source: the network that encodes how it is said, a wav2vec 2.0: a name on the Hugging Face hub or a
+            directory.
+        emotion_config: its configuration as plain data; if given, its weights are not read from ``emotion_source`` but
+            left for a checkpoint to fill in. Checkpoints use it.
         finish: what is done with the weights, as the demonstration does: ``smooth`` (Savitzky-Golay, a parabola
             through five frames) and ``blinks`` (stored blinks at random in place of the lids' motion); joined by ``+``.
         options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
+    checkpoint_options = ("emotion_config",)  # without it, a file could have weights fetched from anywhere
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="jonatasgrosman/wav2vec2-large-xlsr-53-english", edges=False
-    )
-    published_emotion_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder, source="r-f/wav2vec-english-speech-emotion-recognition", edges=False
     )
 
     def __init__(
@@ -98,7 +99,8 @@ class EmoTalk(DirectModel):
         period: Period | None = None,
         levels: Annotated[int, Range(1, 1000)] = 2,
         level: Annotated[int, Range(0, 999)] = 1,
-        emotion_encoder: AudioEncoderFactory | None = None,
+        emotion_source: str = "r-f/wav2vec-english-speech-emotion-recognition",
+        emotion_config: dict[str, Any] | None = None,
         finish: str = "",
         **options: Any,  # noqa: ANN401
     ) -> None:
@@ -113,11 +115,9 @@ class EmoTalk(DirectModel):
             raise ArgumentError({"level": level}, f"there are {levels} levels, counted from 0")
         self.level = level
         self.finish = read_finish(finish, self.space)
-        self.emotion_encoder, emotion_width = make_encoder(
-            emotion_encoder or self.published_emotion_encoder, options.get("audio_dim")
-        )
+        self.emotion_encoder = Wav2Vec2Encoder(dim=None, source=emotion_source, config=emotion_config, edges=False)
         self.network = EmoTalkNetwork(
-            widths=(self.audio_width, emotion_width),
+            widths=(self.audio_width, self.emotion_encoder.width),
             coordinates=self.dims * self.n_vertices,
             n_identities=len(self.identities),
             levels=levels,
@@ -134,9 +134,9 @@ class EmoTalk(DirectModel):
         )
 
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
-        """Save the arguments as every model does, with the published emotion network where none was given."""
-        chosen = arguments.get("emotion_encoder") or self.published_emotion_encoder
-        super().keep_hyperparameters({**arguments, "emotion_encoder": chosen})
+        """Save the arguments as every model does, with the emotion network's configuration in place of its source."""
+        config = self.emotion_encoder.network.config.to_dict()
+        super().keep_hyperparameters({**arguments, "emotion_config": config})
 
     def personal_modules(self) -> list[nn.Module]:
         """The table of persons."""
@@ -160,8 +160,6 @@ class EmoTalk(DirectModel):
     def _emotion(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of the emotion network, which is resampled twice."""
         encoder = self.emotion_encoder
-        if not isinstance(encoder, Wav2Vec2Encoder):
-            return encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden")
         features, steps = encoder.frozen_features(heard.audio, heard.audio_lengths)
 
         def encode(x: Tensor, count: int) -> Tensor:
@@ -173,8 +171,7 @@ class EmoTalk(DirectModel):
                 own = int(x.shape[1] / STEP_RATE * EMOTION_RATE)
             return interpolate_ends(encoder.hidden_states(interpolate_ends(x, max(1, own))), count)
 
-        hidden = by_lengths(features, steps, frames, encode)
-        return hidden if encoder.out is None else encoder.out(hidden)
+        return by_lengths(features, steps, frames, encode)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The mean squared error; the authors' own losses are not released."""
@@ -322,13 +319,11 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     for prefix in (content, emotion):
         weights.ignore(f"{prefix}lm_head.", "the speech recogniser's letters")
     weights.ignore("audio_encoder_emo.classifier.", "the names of emotions, which only training needs")
-    encoders = {
-        name: weights.backbone(prefix, kind="wav2vec2", facts=with_own_config(facts, name), into=name, **settings)
-        for name, prefix, settings in (
-            ("audio_encoder", content, EmoTalk.encoder_settings()),
-            ("emotion_encoder", emotion, EmoTalk.encoder_settings()),
-        )
-    }
+    own = EmoTalk.encoder_settings()
+    encoders: list[partial[Wav2Vec2Encoder]] = [
+        weights.backbone(prefix, kind="wav2vec2", facts=with_own_config(facts, name), into=name, **own)
+        for name, prefix in (("audio_encoder", content), ("emotion_encoder", emotion))
+    ]
     for old, new in (
         ("audio_feature_map_cont", "content_map"),
         ("audio_feature_map_emo", "memory_map"),
@@ -345,7 +340,8 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     weights.move_all("transformer_decoder.layers.", "network.layers.", LAYER_NAMES)
     dim, _ = weights.shape("audio_feature_map_emo.weight")
     return {
-        **encoders,
+        "audio_encoder": encoders[0],
+        "emotion_config": encoders[1].keywords["config"],
         **decoder_sizes(weights, "transformer_decoder.", dim),
         "content_dim": weights.shape("audio_feature_map_cont.weight")[0],
         "emotion_dim": weights.shape("audio_feature_map_emo2.weight")[0],

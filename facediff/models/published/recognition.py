@@ -198,7 +198,7 @@ class AuthorsWeights:
         facts: CheckpointFacts,
         into: str = "audio_encoder",
         **settings: Any,  # noqa: ANN401
-    ) -> Callable[..., Any]:
+    ) -> partial[Any]:
         """Use a complete wav2vec 2.0, HuBERT or WavLM under ``audio_encoder``, and give the encoder that it belongs to.
 
         Args:

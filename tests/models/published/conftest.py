@@ -38,7 +38,7 @@ METHODS: dict[str, dict[str, Any]] = {
         **{"prior_heads": 2, "prior_feed_forward_dim": 24, "tokens": 2, "codes": 8},
     },
     "EmoTalk": {
-        **{"audio_encoder": MEL, "emotion_encoder": MEL, "audio_dim": 16, "dim": 16},
+        **{"audio_encoder": MEL, "emotion_config": TEXT, "audio_dim": 16, "dim": 16},
         **{"emotion_dim": 4, "level_dim": 2, "person_dim": 2},
     },
     "FaceDiffuser": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "diffusion_steps": 8},

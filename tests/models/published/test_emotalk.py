@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 import random
 from pathlib import Path
@@ -9,10 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import soundfile
 import torch
 from scipy.signal import savgol_filter
 from torch import Tensor
 
+from facediff.animation.files import read_animation
+from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import EmoTalk, import_checkpoint
 from facediff.models.published.emotalk import BLINKS, finished
@@ -144,3 +149,25 @@ def test_finishing_is_an_option_of_the_import(tmp_path: Path) -> None:
     np.testing.assert_allclose(predict(model, speech, "2"), expected, atol=1e-5)
     with pytest.raises(FaceDiffError, match="smoth"):
         imported(state, tmp_path, finish="smoth")
+
+
+def test_an_imported_checkpoint_animates_to_weights_and_to_the_built_in_face(tmp_path: Path) -> None:
+    torch.save(emotalk_state(), tmp_path / "EmoTalk.pth")
+    (tmp_path / "config.json").write_text(json.dumps(published.AUDIO_CONFIG))
+    words = [str(tmp_path / "EmoTalk.pth"), "--audio-config", str(tmp_path / "config.json")]
+    assert main(["import-checkpoint", *words, "-o", str(tmp_path / "emotalk.ckpt")]) == 0
+    speech = speech_of(205)
+    soundfile.write(tmp_path / "speech.wav", speech.numpy(), 16_000, subtype="FLOAT")
+    words = ["animate", str(tmp_path / "speech.wav"), "--checkpoint", str(tmp_path / "emotalk.ckpt")]
+    assert main([*words, "--condition", "3", "-o", str(tmp_path / "face.csv")]) == 0
+    with (tmp_path / "face.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    expected = reference(emotalk_state(), speech, 1, 3)
+    for name in ("jawOpen", "browDownLeft", "tongueOut"):
+        column = expected[:, layout("arkit").index(name)]
+        written = torch.tensor([float(row[name[0].upper() + name[1:]]) for row in rows[: len(expected)]])
+        torch.testing.assert_close(written, column, rtol=0, atol=1e-5)
+    assert main([*words, "-o", str(tmp_path / "face.npz")]) == 0
+    animation = read_animation(tmp_path / "face.npz")
+    assert animation.triangles.max() < len(animation.template)
+    assert main([*words, "--commercial-only", "-o", str(tmp_path / "face.npy")]) != 0
