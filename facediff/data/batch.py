@@ -299,7 +299,9 @@ class Rig:
 
         A speaker without shapes of their own moves by the mean of all others'.
         """
-        deltas = self.deltas.get(identity, self.mean).to(motion)
+        own = self.deltas.get(identity)
+        # The mean is that of thousands of speakers in some models, so that it is taken where it is needed only.
+        deltas = (self.mean if own is None else own).to(motion)
         weights = motion[..., list(space.face), 0]
         return (weights @ deltas.flatten(1)).view(*weights.shape[:-1], *deltas.shape[1:])
 

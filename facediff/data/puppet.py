@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from facediff import registry
 from facediff import synthetic as puppet
-from facediff.data.batch import Assets, Rig
 from facediff.data.corpus import Clip, Corpus
 from facediff.data.datamodule import Count, SpeechMotionDataModule
 from facediff.data.manifest import read_manifest
@@ -391,14 +390,3 @@ class PuppetMask(SpeechMotionDataModule):
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""
         return next((clip for clip in clips if clip.attributes.get("mood") == "neutral"), clips[0])
-
-
-def with_built_in_face(assets: Assets) -> Assets:
-    """Assets of ARKit's channels with the built-in face as their rig, for models whose corpus has no open face.
-
-    Its speakers look alike, and channels that the face has no shapes for move nothing.
-    """
-    rig = Rig.of(built_in_rig(), assets)
-    # One set of shapes, which the others move by too: some models have thousands of speakers.
-    speaker, shapes = next(iter(rig.deltas.items()))
-    return replace(assets, rig=Rig(rig.mesh, {speaker: shapes}))

@@ -325,16 +325,7 @@ def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[s
         regions=regions,
         space=faces.space,
     )
-    return with_face(assets), list(faces.notes)
-
-
-def with_face(assets: Assets) -> Assets:
-    """Assets whose channels are ARKit's with the built-in face, so that they can be seen; others as they are."""
-    if assets.space.kind != "arkit":
-        return assets
-    from facediff.data.puppet import with_built_in_face
-
-    return with_built_in_face(assets)
+    return assets, list(faces.notes)
 
 
 def read_triangles(mesh: Path | None, count: int) -> Tensor | None:
@@ -503,7 +494,7 @@ def parametric_assets(facts: CheckpointFacts) -> Assets:
     """Faces at rest, whose channels are all 0, and the regions by the channels' names."""
     rest = torch.zeros(facts.n_vertices, 1)
     regions = {name: torch.tensor(facts.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
-    assets = Assets(
+    return Assets(
         corpus=facts.dataset,
         synthetic=False,
         unit="m",
@@ -514,7 +505,6 @@ def parametric_assets(facts: CheckpointFacts) -> Assets:
         regions=regions,
         space=facts.space,
     )
-    return with_face(assets)
 
 
 def read_region(path: Path, n_vertices: int) -> Tensor:

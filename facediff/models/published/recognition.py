@@ -296,7 +296,6 @@ class CheckpointFacts:
         frame_rate: frames a second.
         identities: training identities, in the order of the table's rows.
         n_vertices: vertices V, or channels of the space.
-        space: what the motion's numbers mean.
         audio_config: configuration of the audio encoder, where the user gives it.
         model_options: options of the model or its audio encoder that the user gives.
         graph: file of the frozen graph that the method needs as well.
@@ -308,7 +307,6 @@ class CheckpointFacts:
     frame_rate: float
     identities: list[str]
     n_vertices: int
-    space: Space = VERTICES
     audio_config: Mapping[str, Any] | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     graph: Path | None = None
