@@ -17,7 +17,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
 from facediff.errors import FaceDiffError
-from facediff.utils.files import LockedError, atomic, locked
+from facediff.utils.files import LockedError, atomic, locked, sweep
 from facediff.utils.hub import check_model_source, check_training_source, model_path
 
 STATE_KEY = "facediff_training_state"
@@ -207,6 +207,8 @@ def locked_run(trainer: Trainer, *, new: bool) -> Iterator[None]:
                 logger._version = None  # type: ignore[union-attr] # it looks for a free number again
             else:
                 break
+        for earlier in run_folder(trainer).parent.glob("*/checkpoints"):
+            sweep(earlier)  # what a run left that was killed in its first save, which nobody continues
         yield
 
 

@@ -74,7 +74,7 @@ def atomic(path: Path) -> Iterator[Path]:
         with _new_folders(target.parent):
             if not os.access(target.parent, os.W_OK):  # not every writer's error says so
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-            _sweep(target.parent)
+            sweep(target.parent)
             try:
                 yield temporary
                 _hand_on(target, temporary)
@@ -139,7 +139,7 @@ def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
     with _writing(path):
         place = destination(path)
         with _new_folders(place.parent):
-            _sweep(place.parent)
+            sweep(place.parent)
             folder = _partial(place)
             # The folder is locked before it gets its name, so that no other process removes it as abandoned.
             unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
@@ -287,7 +287,7 @@ def _try_to_write(path: Path) -> None:
     longest = os.pathconf(folder, "PC_NAME_MAX") if hasattr(os, "pathconf") and folder.is_dir() else 255
     if any(len(os.fsencode(part)) > longest for part in path.parts):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
-    _sweep(folder)  # of probes, since nothing else may ever be written here
+    sweep(folder)  # of probes, since nothing else may ever be written here
     probe = folder / _partial(path).name
     try:
         probe.touch()
@@ -333,7 +333,7 @@ def _short_suffix(suffix: str) -> str:
     return suffix if len(os.fsencode(suffix)) <= 24 else ""  # no format has a longer one
 
 
-def _sweep(folder: Path) -> None:
+def sweep(folder: Path) -> None:
     """Remove what killed processes have left of files and folders; others may still be writing theirs."""
     try:
         if _swept.get(str(folder)) == folder.stat().st_mtime_ns:  # else each of many files would cost a look at all
