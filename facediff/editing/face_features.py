@@ -236,16 +236,28 @@ class Seen:
         return np.flatnonzero(kept)
 
     def skin_at(self, window: SearchWindow) -> npt.NDArray[np.bool_] | None:
-        """(V,) the piece of which a window shows most; None where it shows nothing."""
-        low = np.array([window.x - window.half_width, window.y - window.half_height])
-        high = np.array([window.x + window.half_width, window.y + window.half_height])
-        step = window.half_width / 32
-        number, _, _ = self.raster(self.within(low, high), low, step, 64, max(2, int(2 * window.half_height / step)))
-        seen = number[number >= 0]
-        if not len(seen):
+        """(V,) the piece that is the face's skin in a window; None where it shows nothing.
+
+        Of the pieces that a window shows, it is the one that shows most about it: a beard may cover the mouth, but not
+        the nose and the eyes.
+        """
+        counts = [self._shown(window, grown) for grown in (1.0, FACE)]
+        if not len(counts[0][0]):
             return None
+        candidates = counts[0][0][counts[0][1] > SHOWS * counts[0][1].sum()]
+        names, pixels = counts[1]
+        known = np.isin(names, candidates)
+        return np.asarray(self.pieces == names[known][pixels[known].argmax()])
+
+    def _shown(self, window: SearchWindow, grown: float) -> tuple[Indices, Indices]:
+        """Labels of the pieces in a window, which grows mostly upwards, and how many pixels each has."""
+        low = np.array([window.x - grown * window.half_width, window.y - window.half_height])
+        high = np.array([window.x + grown * window.half_width, window.y + (2 * grown - 1) * window.half_height])
+        step = grown * window.half_width / 32
+        number, _, _ = self.raster(self.within(low, high), low, step, 64, max(2, int((high - low)[1] / step)))
+        seen = number[number >= 0]
         names, counts = np.unique(self.pieces[self.faces[seen, 0]], return_counts=True)
-        return np.asarray(self.pieces == names[counts.argmax()])
+        return names, counts
 
     def opening(
         self, window: SearchWindow, skin: npt.NDArray[np.bool_], highest: float, behind: float
@@ -393,6 +405,8 @@ class Seen:
         return codes
 
 
+FACE = 2.0  # The skin about a mouth is looked at in a window that is so many times as wide, and reaches up to the eyes
+SHOWS = 0.05  # Share of a window that the skin shows at least; a beard may cover the rest
 PIXELS = 48  # to the expected width of an opening
 FARTHER, PARTED = 2.5, 0.12
 """Points are parted if the way between them is longer than so many times the distance and this share of the width."""
@@ -542,11 +556,21 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
         if place is None:
             # Proportions of an average face in widths of its mouth; the window leaves room for others.
             sign = 2 * side - 1
-            window = SearchWindow(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)
+            windows = [SearchWindow(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)]
         else:
-            window = SearchWindow(place.centre[0], place.centre[1], 0.85 * place.width, 0.75 * place.width, place.width)
-        eye = seen.opening(window, skin, *OPEN_EYE)
-        eyes.append(None if eye is None else seen.completed(eye, window.expected))
+            # A longer or shorter face has its eyes elsewhere: the larger window comes second, as for the mouth.
+            windows = [
+                SearchWindow(
+                    place.centre[0],
+                    place.centre[1],
+                    0.85 * grown * place.width,
+                    0.75 * grown * place.width,
+                    place.width,
+                )
+                for grown in (1.0, 1.6)
+            ]
+        eye = next((eye for window in windows if (eye := seen.opening(window, skin, *OPEN_EYE)) is not None), None)
+        eyes.append(None if eye is None else seen.completed(eye, windows[0].expected))
     codes = seen.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))
     return Features(mouth, (eyes[0], eyes[1]), skin, codes)
 

@@ -21,17 +21,19 @@ from facediff.editing.correspondence import (
     correspond,
     placed,
     refuse_other_mesh,
+    run_alike,
 )
-from facediff.editing.face_features import facing, sides_of_pairs
+from facediff.editing.face_features import facing, find_features, sides_of_pairs
 from facediff.editing.fit_check import FitReport, check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
 from facediff.editing.lids import with_lids, without_lids
+from facediff.editing.placing import place_face
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
-from facediff.mesh.parts import named_triangles
+from facediff.mesh.parts import mesh_parts, named_triangles
 from facediff.spaces.shape_files import read_shape_files
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
@@ -112,17 +114,50 @@ def retarget(
         return judged(correspondence)
 
     try:
-        carried, correspondence = attempt(landmarks)
-    except FaceDiffError:
-        # Named landmarks come second: a good fit needs none, and they are only known to a vertex, so that they would
-        # pull at it.
-        named = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
-        if named is None or judge is None:
+        try:
+            carried, correspondence = attempt(landmarks)
+        except FaceDiffError:
+            # Named landmarks come second: a good fit needs none, and they are only known to a vertex, so that they
+            # would pull at it.
+            named = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
+            if named is None or judge is None:
+                raise
+            carried, correspondence = attempt(named)
+    except FaceDiffError as error:
+        names = [] if parts else parts_with_a_face(animation, mesh_path, mesh)
+        if not names:
             raise
-        carried, correspondence = attempt(named)
+        hint = f". A face was found in these of its parts: {', '.join(names)}; try {{part}} {names[0]}"
+        if isinstance(error, OptionError):
+            raise OptionError(error.option, error.problem + hint, error.value, place=error.place) from error
+        raise OptionError.naming(f"{error}{hint}") from error
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
     return carried, correspondence
+
+
+MOST_PARTS, LEAST_PART = 6, 60  # So many of the largest parts are looked at, and triangles that a face has at least
+
+
+def parts_with_a_face(animation: Animation, path: Path, mesh: Mesh) -> list[str]:
+    """Names of the parts of a file, the first name of each, in which a mouth is where the animation's face has it."""
+    source = Surface(np.asarray(animation.template, np.float64), animation.triangles.astype(np.int64))
+    features = find_features(source.vertices, source.faces)
+    parts = [part for part in mesh_parts(path) if part.names]
+    if features is None or len(parts) < 2:
+        return []
+    names = []
+    triangles: dict[str, list[Indices]] = {}
+    for part in parts:
+        triangles.setdefault(part.names[0], []).append(part.triangles)
+    largest = sorted(triangles, key=lambda name: -sum(len(some) for some in triangles[name]))
+    for name in largest[:MOST_PARTS]:
+        faces = np.asarray(mesh.faces, np.int64)[np.concatenate(triangles[name])]
+        if len(faces) >= LEAST_PART:
+            target = run_alike(source, Surface(np.asarray(mesh.vertices, np.float64), faces))
+            if place_face(target, source, features)[1] is not None:
+                names.append(name)
+    return names
 
 
 def carry_checked(

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.editing.blendshapes import Weights
 from facediff.editing.correspondence import Correspondence
+from facediff.editing.fit_check import telling_frames
 from facediff.editing.shapes import ShapeSet
 from facediff.export.viewer.packing import millimetres, mouth_opening
 from facediff.render import Camera, Renderer, contact_sheet, heat_colours, save_image
@@ -25,6 +26,7 @@ class DrawnFace:
     vertices: npt.NDArray[np.floating]  # (V, 3), y up, z to the viewer
     faces: npt.NDArray[np.integer]  # (F, 3)
     colours: npt.NDArray[np.uint8] | None = None  # (V, 3) sRGB; plain material if None
+    focus: Sequence[npt.NDArray[np.floating]] | None = None  # points that are in view; those of all faces if None
 
 
 def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights: Weights) -> None:
@@ -44,7 +46,9 @@ def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights
 
 
 def draw_correspondence(path: Path, animation: Animation, carried: Animation, correspondence: Correspondence) -> None:
-    """Draw both meshes with the mouth most open, how far each target vertex moves, and the distance of the meshes.
+    """Draw both meshes with the widest mouth, a full blink and raised brows, and how far each target vertex moves.
+
+    The last column shows how far the meshes lie apart at rest, and the eyes of the target from near.
 
     Args:
         path: the picture (.png).
@@ -52,31 +56,41 @@ def draw_correspondence(path: Path, animation: Animation, carried: Animation, co
         carried: the same on the target mesh.
         correspondence: the correspondence between them.
     """
+    frames = telling_frames(animation, correspondence)
     opening = mouth_opening(animation)
-    if opening is None:  # without known lips, the frame furthest from the neutral face
-        opening = np.array([np.square(frame - animation.template).sum() for frame in animation.vertices])
-    frame = int(opening.argmax())
-    # In the source's axes and unit, so that one camera shows both.
+    if opening is not None:
+        frames["widest mouth"] = int(opening.argmax())
+    if not frames:  # without a face that is recognised, the frame furthest from the neutral one
+        frames["frame"] = int(np.argmax([np.square(frame - animation.template).sum() for frame in animation.vertices]))
+    # In the source's axes and unit, so that one camera shows both; a whole figure would show its face in a few pixels.
     back = correspondence.similarity.inverse()
-    posed = back.apply(carried.vertices[frame])
-    source = np.asarray(animation.vertices[frame])
-    moved, moves = heat(
-        np.linalg.norm(carried.vertices[frame] - carried.template, axis=1) * millimetres(carried), "motion"
-    )
+    face = [animation.template, *(animation.vertices[frame] for frame in frames.values())]
+    source = correspondence.features[0]
+    openings = [] if source is None else [eye for eye in source.eyes if eye is not None]
+    eyes = [np.concatenate([eye.upper, eye.lower]) for eye in openings]
     apart, distances = heat(
         correspondence.distances * (correspondence.share > 0) * millimetres(carried), "distance of the meshes"
     )
-    _draw(
-        path,
-        [
-            DrawnFace(f"{animation.name}, frame {frame}", source, animation.triangles, animation.colours),
+    panels = []
+    for row, (name, frame) in enumerate(frames.items()):
+        posed = back.apply(carried.vertices[frame])
+        moved, moves = heat(
+            np.linalg.norm(carried.vertices[frame] - carried.template, axis=1) * millimetres(carried), "motion"
+        )
+        panels += [
+            DrawnFace(
+                f"{animation.name}, {name}, frame {frame}",
+                np.asarray(animation.vertices[frame]),
+                animation.triangles,
+                animation.colours,
+            ),
             DrawnFace("on the target mesh", posed, carried.triangles, carried.colours),
             DrawnFace(moved, posed, carried.triangles, moves),
-            DrawnFace(apart, back.apply(carried.template), carried.triangles, distances),
-        ],
-        # A whole figure would show its face in a few pixels.
-        focus=[source, animation.template],
-    )
+            DrawnFace(apart, back.apply(carried.template), carried.triangles, distances)
+            if row == 0 or not eyes
+            else DrawnFace("its eyes", posed, carried.triangles, carried.colours, focus=eyes),
+        ]
+    _draw(path, panels, focus=face, columns=4)
 
 
 def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDArray[np.uint8]]:
@@ -86,14 +100,23 @@ def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDAr
 
 
 def _draw(
-    path: Path, panels: Sequence[DrawnFace], size: int = 272, *, focus: Sequence[npt.NDArray[np.floating]] | None = None
+    path: Path,
+    panels: Sequence[DrawnFace],
+    size: int = 272,
+    *,
+    focus: Sequence[npt.NDArray[np.floating]] | None = None,
+    columns: int | None = None,
 ) -> None:
     """Draw faces of one unit next to each other at one scale; the points in ``focus`` are in view, all if None."""
     camera = Camera.framing(focus or [panel.vertices for panel in panels])
     drawn = [
-        Renderer(panel.faces, template=panel.vertices, size=size, camera=camera, colours=panel.colours).render(
-            panel.vertices
-        )
+        Renderer(
+            panel.faces,
+            template=panel.vertices,
+            size=size,
+            camera=camera if panel.focus is None else Camera.framing(panel.focus),
+            colours=panel.colours,
+        ).render(panel.vertices)
         for panel in panels
     ]
-    save_image(path, contact_sheet(drawn, len(drawn), labels=[panel.label for panel in panels]))
+    save_image(path, contact_sheet(drawn, columns or len(drawn), labels=[panel.label for panel in panels]))
