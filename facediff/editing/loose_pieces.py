@@ -21,6 +21,7 @@ CAP = 0.12  # A wider gap than this share says no more
 OVERBITE = 0.05  # So far below the line between the lips, in widths, both rows meet
 LARGE = 2.0  # Pieces larger than so many widths are hair, glasses, a beard or a body
 ABOUT, BEARD = 1.2, 0.1  # A large piece of which so much lies within so many widths of the mouth is a beard
+BELOW = 0.5  # and its middle is no further above the mouth than this share of its width
 ON_SKIN = 0.08  # A piece no further from the skin than this share of the mouth's width lies on it; others are worn
 TOUCHES = 0.05  # What is nearer than this to a thing that is worn, and nearer than to the skin, belongs to it
 LASH, LASHES = 0.1, 1.5  # Lashes begin so near to a lid's edge, and are no wider, in widths of the eye
@@ -83,6 +84,7 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
         (np.linalg.norm(middle - mouth, axis=1) < ORAL * width) & (extent < SMALL * width) & (middle[:, 2] < mouth[2])
     )
     about = mean((np.linalg.norm(points - mouth, axis=1) < ABOUT * width).astype(float)) > BEARD
+    about &= middle[:, 1] < mouth[1] + BELOW * width
     large = extent > LARGE * width
     lower = oral & (middle[:, 1] < _gap(middle[oral, 1], mouth[1], width))
     # What lies between the lids belongs to the eyeball: an iris, a cornea, a reflection.

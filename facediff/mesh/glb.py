@@ -64,7 +64,12 @@ class Glb:
         needed = self.content.get("extensionsRequired", [])
         packed = [str(name) for name in needed if "compression" in str(name)] if isinstance(needed, list) else []
         if packed:
-            raise ValueError(f"is compressed ({', '.join(packed)}): export it without compression")
+            # https://gltf-transform.dev/cli
+            remedy = "write it with `npx @gltf-transform/cli dequantize IN.glb OUT.glb`, or "
+            raise ValueError(
+                f"is compressed ({', '.join(packed)}): {remedy if 'EXT_meshopt_compression' in packed else ''}"
+                f"import it into Blender and export it without compression"
+            )
         self._expanded = 0  # bytes of all accessors that were read: many may share the same data
 
     def entries(self, kind: str, holder: dict[str, Any] | None = None) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from facediff.synthetic.speakers import SPEAKERS
 from tests.fakes.glb_targets import pack
 from tests.fakes.heads import cleaned, eyeballs, teeth
 
-TYPES = {"float32": 5126, "uint16": 5123, "uint8": 5121}
+TYPES = {"float32": 5126, "int16": 5122, "uint16": 5123, "uint8": 5121}
 
 
 @dataclass
@@ -59,6 +59,9 @@ class File:
                 "indices": {"bufferView": self.view(moved.astype("<u2").tobytes()), "componentType": 5123},
                 "values": {"bufferView": self.view(array[moved].tobytes())},
             }
+        elif array.dtype == np.int16:  # rows begin at multiples of four bytes
+            padded = np.pad(array, ((0, 0), (0, 1)))
+            accessor |= {"bufferView": self.view(padded.tobytes(), byteStride=8, **more), "normalized": True}
         else:
             accessor["bufferView"] = self.view(array.tobytes(), **more)
         if bounds:
@@ -171,6 +174,8 @@ def write_avatar(
     animated: bool = True,
     names: dict[str, str] | None = None,
     joined: bool = False,
+    skins: int = 1,
+    quantised: bool = False,
 ) -> dict[str, AvatarPart]:
     """Write an avatar.
 
@@ -186,6 +191,8 @@ def write_avatar(
         animated: whether the file has an animation of joints and of the head's weights.
         names: other names of the targets.
         joined: all parts with targets are primitives of one mesh, as FBX converters write them.
+        skins: how many skins the parts take in turn.
+        quantised: positions are normalised whole numbers by KHR_mesh_quantization, and each node's scale undoes it.
     """
     parts = parts or avatar_parts()
     file = File()
@@ -227,13 +234,17 @@ def write_avatar(
     ]
     if skinned:
         matrices = binds.transpose(0, 2, 1).reshape(2, 16).astype(np.float32)
-        content["skins"] = [{"joints": [1, 2], "skeleton": 1, "inverseBindMatrices": file.add(matrices, "MAT4")}]
+        content["skins"] = [
+            {"joints": [1, 2], "skeleton": 1, "inverseBindMatrices": file.add(matrices, "MAT4")} for _ in range(skins)
+        ]
     whole: dict[str, Any] | None = None
     for k, (name, part) in enumerate(parts.items()):
         points = (unit * part.vertices @ turn.T).astype(np.float32)
         normals = normals_of(part.vertices, part.faces) @ turn.T
+        most = float(np.abs(points).max()) if quantised else 1.0
+        whole_numbers = np.rint(points / most * 32767).astype(np.int16) if quantised else points
         attributes = {
-            "POSITION": file.add(points, "VEC3", bounds=True, target=34962),
+            "POSITION": file.add(whole_numbers, "VEC3", bounds=True, target=34962),
             "NORMAL": file.add(normals.astype(np.float32), "VEC3", target=34962),
             "TEXCOORD_0": file.add((part.vertices[:, :2] % 1).astype(np.float32), "VEC2", target=34962),
         }
@@ -252,7 +263,11 @@ def write_avatar(
         primitive: dict[str, Any] = {"attributes": attributes, "indices": indices, "material": k}
         if part.targets:
             primitive["targets"] = [
-                {"POSITION": file.add((unit * d @ turn.T).astype(np.float32), "VEC3", bounds=True, sparse=sparse)}
+                {
+                    "POSITION": file.add(
+                        (unit / most * d @ turn.T).astype(np.float32), "VEC3", bounds=True, sparse=sparse
+                    )
+                }
                 for d in part.targets.values()
             ]
         labels = [(names or {}).get(target, target) for target in part.targets]
@@ -264,7 +279,9 @@ def write_avatar(
             mesh |= {"weights": [0.0] * len(labels), "extras": {"targetNames": labels}}
             whole = whole or mesh
         content["meshes"].append(mesh)
-        nodes.append({"name": name, "mesh": len(content["meshes"]) - 1, **({"skin": 0} if skinned else {})})
+        nodes.append({"name": name, "mesh": len(content["meshes"]) - 1, **({"skin": k % skins} if skinned else {})})
+        if quantised:
+            nodes[-1]["scale"] = [most] * 3
         root["children"].append(len(nodes) - 1)
     roots = [0]
     if skinned:
@@ -273,6 +290,8 @@ def write_avatar(
         root["children"] = [1]
         roots += own
     content["scenes"] = [{"name": "Scene", "nodes": roots}]
+    if quantised:
+        content["extensionsUsed"] = content["extensionsRequired"] = ["KHR_mesh_quantization"]
     if animated:
         times = file.add(np.float32([0, 0.5, 1]), "SCALAR", bounds=True)
         nod = np.float32([[0, 0, 0, 1], [0.0998334, 0, 0, 0.9950042], [0, 0, 0, 1]])

@@ -19,6 +19,7 @@ from facediff.synthetic.face import EYE_CENTRE, build_face
 from facediff.synthetic.head.parts import build_head
 from facediff.synthetic.head.people import Face
 from facediff.synthetic.head.rig import head_shapes
+from facediff.synthetic.head.rig import lip_pairs as lip_pairs_of_head
 from facediff.synthetic.rig import CONTROLS, Shape, build_rig, lip_pairs
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -305,17 +306,47 @@ APART = ("teeth", "tongue", "hair", "brow_", "lash_", *BALLS)
 
 def second(face: Face, *without: str, **pose: float) -> Mesh:
     """A person of the second edition in metres, posed by ARKit's shapes, without the named groups of vertices."""
-    mesh, shapes = build_head(), head_shapes()
-    posed = mesh.vertices + sum((pose[name] * shapes[name] for name in pose), np.zeros_like(mesh.vertices))
-    gone = np.zeros(len(posed), bool)
-    gone[mesh.both(*without)] = bool(without)
-    return cleaned(face(posed) / 1000.0, mesh.faces[~gone[mesh.faces].any(axis=1)])
+    mesh = build_head()
+    gone = np.zeros(len(mesh.vertices), bool)
+    if without:
+        gone[mesh.both(*without)] = True
+    return cleaned(second_places(face, **pose), mesh.faces[~gone[mesh.faces].any(axis=1)])
 
 
 def only(face: Face, *groups: str) -> Mesh:
     """Some groups of a person of the second edition."""
     mesh = build_head()
     return second(face, *(name for name in mesh.groups if not name.startswith(groups)))
+
+
+def talking_second() -> Animation:
+    """What :func:`talking` does, on the average head of the second edition: (13, 5875, 3)."""
+    pairs = lip_pairs_of_head(build_head())
+    poses: list[dict[str, float]] = [
+        {},
+        {"jawOpen": 0.3},
+        {"jawOpen": 0.5},
+        {"jawOpen": 0.8},
+        {"jawOpen": 0.4, "mouthPucker": 0.8},
+        {"jawOpen": 0.2, "mouthFunnel": 1.0},
+        {"jawOpen": 0.3, "mouthStretchLeft": 0.9, "mouthStretchRight": 0.9},
+        {"mouthUpperUpLeft": 0.8, "mouthUpperUpRight": 0.8, "mouthLowerDownLeft": 0.8, "mouthLowerDownRight": 0.8},
+        {"jawOpen": 0.3, "mouthSmileLeft": 0.8, "mouthSmileRight": 0.8},
+        {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
+        {"browInnerUp": 1.0, "browOuterUpLeft": 1.0, "browOuterUpRight": 1.0},
+        {"browDownLeft": 1.0, "browDownRight": 1.0, "noseSneerLeft": 0.8, "noseSneerRight": 0.8},
+        {},
+    ]
+    vertices = np.stack([second_places(Face(), **pose) for pose in poses]).astype(np.float32)
+    return Animation(
+        "talking",
+        vertices,
+        vertices[0].copy(),
+        25.0,
+        faces=np.asarray(build_head().faces, np.int32),
+        colours=build_head().colours,
+        inner_lip_pairs=np.stack(pairs, axis=1),
+    )
 
 
 WIDE = Face(sex=0.5, width=0.6, eye_gap=0.8, nose_width=0.8, brow_ridge=0.8, mouth_width=0.5)

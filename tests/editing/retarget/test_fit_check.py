@@ -16,7 +16,7 @@ from facediff.editing import face_features
 from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
-from facediff.editing.retargeting import carry
+from facediff.editing.retargeting import carry, carry_checked
 from facediff.mesh import Mesh
 from facediff.mesh.mesh import triangle_areas
 from facediff.synthetic.arkit import puppet_shapes
@@ -35,18 +35,33 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
 
 
 QUICK = ("slit mask",)
+EYES_REST = ("mask", "scan", "painted eyes", "few triangles")
+"""Heads whose eyes are one skin, or so coarse that lids would tear."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FAMILY])
 def test_a_head_from_elsewhere_speaks_or_is_refused(animation: Animation, name: str) -> None:
     head = FAMILY[name]()
-    made, found = carried(animation, head)
-    report = check_fit(animation, made, found)
+    mesh = Mesh(head.vertices, head.faces.astype(np.int32))
+    found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
+    made, found, report = carry_checked(animation, found, mesh)
     assert report.good == head.alive, report.faults
     if not head.alive:
         return
     assert report.lip_ratio is not None
     assert report.lip_ratio <= 0.2
+    assert report.eyes is not None
+    if name in EYES_REST:
+        assert report.eyes.lid_gap is None
+        assert report.remarks
+    else:
+        assert not report.remarks
+        assert report.eyes.lid_gap is not None
+        assert report.eyes.overshoot is not None
+        assert report.eyes.lid_gap <= 0.12
+        assert report.eyes.overshoot <= 0.2
+        assert report.eyes.inside == 0
+    assert report.eyes.stretch < 0.7
     assert report.folded < 0.02
     # The carried pairs of lips say the same without the check's own search for the lips.
     assert made.inner_lip_pairs is not None
@@ -111,6 +126,36 @@ def test_wrecks_are_named(animation: Animation) -> None:
     assert check_fit(still, carry(still, found, whole), found).good
 
 
+def test_wrecks_of_eyes_and_forehead_are_named(animation: Animation) -> None:
+    """The puppet's own face with one eye that stays open, lids that pass, lids that stay open, and a torn forehead."""
+    whole = Mesh(animation.template.astype(np.float64), animation.triangles)
+    found = correspond(whole.vertices, whole.faces, whole.vertices, whole.faces)
+    good = carry(animation, found, whole)
+    report = check_fit(animation, good, found)
+    assert report.good
+    assert report.eyes is not None
+    assert report.eyes.lid_gap == 0
+    rest = animation.template
+    wide = 1.0 * (rest[:, 0] < 0)[:, None]
+    wink, still, far = (rest + share * (good.vertices[9] - rest) for share in (wide, np.float32(0), np.float32(1.7)))
+    forehead = good.vertices[10].copy()
+    ragged = (rest[:, 1] > 0.05) & (rest[:, 2] > 0.04) & (np.arange(len(rest)) % 3 == 0)
+    forehead[ragged] += [0, 0.02, 0.004]
+    words = []
+    for frame, posed in ((9, wink), (9, still), (9, far), (10, forehead)):
+        vertices = good.vertices.copy()
+        vertices[frame] = posed
+        wreck = check_fit(animation, replace(good, vertices=vertices), found)
+        assert not wreck.good
+        words.append(" ".join(wreck.faults))
+    for word, fault in zip(("shut", "shut", "pass", "forehead"), words, strict=True):
+        assert word in fault
+    blind = replace(animation, vertices=animation.vertices[:9])
+    eyes = check_fit(blind, carry(blind, found, whole), found).eyes
+    assert eyes is not None
+    assert eyes.lid_gap is None  # an animation that does not blink says nothing of the lids
+
+
 @pytest.mark.slow
 def test_the_command_refuses_and_accepts(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -135,6 +180,21 @@ def test_the_command_refuses_and_accepts(
     assert main([*words, "--accept-poor"]) == 0
     assert "WARNING" in capsys.readouterr().out
     assert (tmp_path / "out.npz").exists()
+
+
+def test_a_beard_over_the_mouth_is_not_the_face(animation: Animation) -> None:
+    vertices, faces = np.float64(animation.template), animation.triangles.astype(np.int64)
+    seen = find_features(vertices, faces)
+    assert seen is not None
+    x, y = np.meshgrid(np.linspace(-0.03, 0.03, 13), np.linspace(-0.02, 0.02, 9))
+    card = np.stack([x.ravel(), y.ravel() + seen.mouth.centre[1], 0 * x.ravel() + vertices[:, 2].max() + 0.01], axis=1)
+    corner = (np.arange(8)[:, None] * 13 + np.arange(12)).ravel() + len(vertices)
+    quads = np.stack([corner, corner + 1, corner + 14, corner + 13], axis=1)
+    both = np.concatenate([faces, quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    found = find_features(np.concatenate([vertices, card]), both, seen)
+    assert found is not None
+    assert not found.skin[len(vertices) :].any()
+    assert found.mouth.centre == pytest.approx(seen.mouth.centre, abs=1e-3)
 
 
 def test_triangles_without_area_do_not_close_the_mouth() -> None:

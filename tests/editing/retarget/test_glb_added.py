@@ -15,6 +15,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb
+from tests.fakes.glb_targets import pack
 from tests.fakes.meshes import relief
 
 
@@ -149,3 +150,11 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"avatar\.glb: has 144 vertices"):
         add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.05)
     assert not (tmp_path / "out.glb").exists()
+
+
+def test_a_compressed_file_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    avatar(tmp_path / "avatar.glb")
+    content = opened(tmp_path / "avatar.glb").content | {"extensionsRequired": ["EXT_meshopt_compression"]}
+    (tmp_path / "packed.glb").write_bytes(pack(content, b""))
+    with pytest.raises(FaceDiffError, match=r"packed\.glb.*gltf-transform/cli dequantize"):
+        read_mesh(tmp_path / "packed.glb")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation, read_archive, write_archive
@@ -13,9 +14,9 @@ from facediff.cli.app import main
 from facediff.editing.correspondence import correspond
 from facediff.editing.face_features import find_features
 from facediff.editing.loose_pieces import loose_pieces
-from facediff.editing.retargeting import carry
+from facediff.editing.retargeting import carry, parts_with_a_face, retarget
 from facediff.editing.surface import Surface
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.glb_scene import placed_parts
 from facediff.mesh.parts import mesh_parts, named_triangles
@@ -60,6 +61,30 @@ def test_names_of_an_obj(tmp_path: Path) -> None:
         named_triangles(tmp_path / "b.obj", ["Head"])
 
 
+@pytest.mark.slow
+def test_parts_with_a_face_are_named(animation: Animation, tmp_path: Path) -> None:
+    """A ball, and a face that lies behind a plate in which no mouth can be seen: a refusal names the face."""
+    ball = trimesh.creation.icosphere(3, 0.08)
+    text = []
+    for name, points, faces, first in (
+        ("Ball", np.array(ball.vertices) + [0.5, 0, 0], np.array(ball.faces), 1),
+        ("Face", animation.template, animation.triangles, 1 + len(ball.vertices)),
+    ):
+        text += [f"o {name}", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points)]
+        text += [f"f {a} {b} {c}" for a, b, c in faces + first]
+    (tmp_path / "two.obj").write_text("\n".join(text) + "\n")
+    mesh = read_mesh(tmp_path / "two.obj")
+    assert parts_with_a_face(animation, tmp_path / "two.obj", mesh) == ["Face"]
+
+    def refuse(*_: object) -> None:
+        raise OptionError.naming("two.obj: is poor; see {pick}")
+
+    with pytest.raises(OptionError) as caught:
+        retarget(animation, tmp_path / "two.obj", judge=refuse)
+    assert "--part Face" in caught.value.on_command_line
+    assert "--pick" in caught.value.on_command_line
+
+
 def test_names_of_a_glb_are_those_of_nodes_meshes_and_materials(tmp_path: Path) -> None:
     parts = avatar_parts(rounds=0)
     write_avatar(tmp_path / "a.glb", parts)
@@ -96,6 +121,19 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     add("glasses", (0, 0.026, 0.09), (0.15, 0.03, 0.01))
     add("body", (0, -0.5, -0.02), (0.4, 0.6, 0.2))
     add("beard", (0, y - 0.03, z + 0.005), (0.11, 0.03, 0.01))
+    eye = features.eyes[1]
+    assert eye is not None
+    skin = vertices[features.skin]
+
+    def on_skin(at_x: float, at_y: float, ahead: float) -> tuple[float, float, float]:
+        near = skin[(np.abs(skin[:, 0] - at_x) < 0.01) & (np.abs(skin[:, 1] - at_y) < 0.01)]
+        return at_x, at_y, float(near[:, 2].max()) + ahead
+
+    add("lens", on_skin(eye.centre[0], eye.centre[1], 0.015), (0.045, 0.035, 0.001))
+    add("bridge", on_skin(0.0, eye.centre[1], 0.012), (0.02, 0.002, 0.002))
+    add("brow", on_skin(eye.centre[0], eye.centre[1] + 0.02, 0.0), (0.012, 0.004, 0.002))
+    add("iris", tuple(eye.centre), (0.004, 0.003, 0.001))
+    add("lash", tuple(eye.upper[16] + [0, 0.002, 0.002]), (0.012, 0.003, 0.003))
     head = joined(**wanted)
     begins = dict(zip(wanted, np.cumsum([0, *(len(points) for points, _ in wanted.values())]), strict=False))
     whole = Surface(head.vertices, head.faces)
@@ -110,7 +148,17 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     assert {name for name, kind in kinds.items() if kind == "jaw"} == {
         "tongue", *(f"lower {k}" for k in range(-3, 4))
     }  # fmt: skip
-    assert {name for name, kind in kinds.items() if kind == "skin"} == {"skin", "moustache", "beard"}
+    assert {name for name, kind in kinds.items() if kind == "skin"} == {"skin", "moustache", "beard", "brow", "lash"}
+    # What lies on the skin moves with it, and lashes with the edge of their lid.
+    assert {name for name, first in begins.items() if first in loose.followers} == {
+        "moustache",
+        "beard",
+        "brow",
+        "lash",
+    }
+    lash = np.isin(loose.followers, begins["lash"] + np.arange(8))
+    assert np.isin(loose.follower_corners[lash], eye.upper_seeds).all()
+    assert loose.follower_weights.sum(axis=1) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("words", [["--part", "Head"], pytest.param([], marks=pytest.mark.slow)])
