@@ -2,8 +2,8 @@
 
     python tools/own_mesh_table.py [--edition 2] [--pictures FOLDER] [NAME ...]
 
-The heads are made by ``tests/fakes/heads.py``. Seconds are of one processor. Pictures show the widest mouth, a full blink
-and raised brows.
+The heads are made by ``tests/fakes/heads.py``. Seconds are of one processor. Pictures show the widest mouth, a full
+blink and raised brows.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ def pick_on_page(
     """Serve the page on which landmarks are picked, until they are saved."""
     from facediff.export.viewer.picking import pick_landmarks
     from facediff.mesh import read_mesh
-    from facediff.mesh.parts import named_triangles
+    from facediff.mesh.parts import mesh_parts, named_triangles
 
     def ready(address: str) -> None:
         tell(f"{address} shows both faces: pick the same places and save; Ctrl-C ends the command")
@@ -167,6 +167,7 @@ def pick_on_page(
         names=(animation.name, target_mesh.name),
         start=landmarks,
         shown=named_triangles(target_mesh, parts) if parts else None,
+        parts=mesh_parts(target_mesh),
         host=host,
         port=port,
         ready=ready,

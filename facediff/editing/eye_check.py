@@ -22,7 +22,7 @@ PASSED = 0.3  # Share of the opening by which the upper lid may pass the lower o
 INSIDE, DEEP = 0.15, 0.04  # Share of a lid's vertices that may lie this share of the eye's width inside the eyeball
 UNEVEN = 0.25  # How much more of one eye's opening than of the other's may be left
 STRETCHED = 0.6  # Edges of the forehead may grow or shrink by this share more than the animation's
-FOLDED = 0.01  # Share of the forehead's moving triangles that may turn over
+FOLDED = 0.02  # Share of the forehead's moving triangles that may turn over
 PIXELS = 96  # across an eye's window
 FOREHEAD, BESIDE = 1.6, 0.5
 """The forehead reaches so many widths of an eye up from the eyes, and begins so many away from the lids."""
@@ -231,6 +231,8 @@ def _forehead(
     # Edges that decimation left almost without length say nothing.
     pairs = pairs[long > 0.2 * np.median(long)]
     long = long[long > 0.2 * np.median(long)]
+    areas = np.linalg.norm(_face_normals(points, faces), axis=1)
+    faces = faces[areas > 0.1 * np.median(areas)]
     normals = _face_normals(points, faces)
     stretch, turned, moving = 0.0, np.zeros(len(faces), bool), np.zeros(len(faces), bool)
     for frame in frames:

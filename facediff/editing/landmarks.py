@@ -196,6 +196,9 @@ def _lie_as_on_a_face(points: Array, landmarks: Mapping[str, int]) -> bool:
     return order == sorted(order) and order[-1] > float(down @ down) > 0.05 * size**2
 
 
+EYES_ABOVE = 1.4  # Height of the eyes above the mouth, in widths of an average mouth
+
+
 def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | None = None) -> dict[str, int]:
     """Vertices of the names that a mesh's openings show: corners and middle of the mouth, corners of the eyes, nose.
 
@@ -226,16 +229,16 @@ def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | Non
             landmarks["eye_inner" + side] = nearest(vertices, _end(eye, inner), skin)
             landmarks["eye_outer" + side] = nearest(vertices, _end(eye, -1 - inner), skin)
     eyes = [eye for eye in features.eyes if eye is not None]
-    if len(eyes) == 2:
-        x, y = mouth.centre[:2]
-        level = 0.5 * (eyes[0].centre[1] + eyes[1].centre[1])
-        points = vertices[skin]
-        # Of what lies between the mouth and the eyes, in the middle, the tip of the nose is furthest forward.
-        between = (np.abs(points[:, 0] - x) < 0.25 * mouth.width) & (
-            np.abs(points[:, 1] - 0.5 * (y + level)) < 0.35 * (level - y)
-        )
-        if between.any():
-            landmarks["nose_tip"] = int(skin[np.where(between, points[:, 2], -np.inf).argmax()])
+    x, y = mouth.centre[:2]
+    # Eyes that are painted are not found: then they are where an average face has them.
+    level = float(np.mean([eye.centre[1] for eye in eyes])) if eyes else y + EYES_ABOVE * mouth.width
+    points = vertices[skin]
+    # Of what lies between the mouth and the eyes, in the middle, the tip of the nose is furthest forward.
+    between = (np.abs(points[:, 0] - x) < 0.25 * mouth.width) & (
+        np.abs(points[:, 1] - 0.5 * (y + level)) < 0.35 * (level - y)
+    )
+    if between.any():
+        landmarks["nose_tip"] = int(skin[np.where(between, points[:, 2], -np.inf).argmax()])
     return {name: landmarks[name] for name in NAMES if name in landmarks}
 
 

@@ -7,7 +7,7 @@ are seen from the front. It sends the places as triangles and weights of the mes
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,7 @@ from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, bounds, millimetres
 from facediff.export.viewer.page import assemble
 from facediff.mesh import Mesh, Similarity
+from facediff.mesh.parts import MeshPart
 from facediff.utils.server import (
     OwnPagesOnly,
     RefusedError,
@@ -70,6 +71,7 @@ class Picking:
         file: where the places are saved.
         start: what the page begins with; None for nothing.
         shown: numbers of the target's triangles that the face is searched for in; None for all.
+        parts: of the target, which the page can hide.
     """
 
     source: Animation
@@ -78,6 +80,7 @@ class Picking:
     file: Path
     start: Landmarks | None = None
     shown: npt.NDArray[np.integer] | None = None
+    parts: Sequence[MeshPart] = ()
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -124,7 +127,7 @@ def picking_page(picking: Picking) -> list[str]:
             (picking.names[1], laid, moved.faces, target.colours),
         )
     ]
-    facts = {
+    facts: dict[str, Any] = {
         "format": FORMAT,
         "file": picking.file.name,
         "fewest": FEWEST,
@@ -140,6 +143,7 @@ def picking_page(picking: Picking) -> list[str]:
             )
         },
     }
+    facts["sides"]["target"]["parts"] = _runs(picking.parts)
     return assemble(
         "picking.html",
         ("style.css", "picking.css"),
@@ -149,6 +153,15 @@ def picking_page(picking: Picking) -> list[str]:
         blobs,
         loads="img-src data:; connect-src 'self'",
     )
+
+
+def _runs(parts: Sequence[MeshPart]) -> list[tuple[str, list[tuple[int, int]]]]:
+    """The parts by their first names, each with its runs of triangles: the first of them and how many."""
+    runs: dict[str, list[tuple[int, int]]] = {}
+    for part in parts:
+        if part.names and len(part.triangles):
+            runs.setdefault(part.names[0], []).append((int(part.triangles[0]), len(part.triangles)))
+    return list(runs.items())
 
 
 ALIKE = 0.4, 2.5  # widths of the mouth of a mesh that is laid well, in the source's
@@ -241,6 +254,7 @@ def pick_landmarks(
     names: tuple[str, str],
     start: Path | None = None,
     shown: npt.NDArray[np.integer] | None = None,
+    parts: Sequence[MeshPart] = (),
     host: str = "127.0.0.1",
     port: int = 0,
     ready: Callable[[str], object] | None = None,
@@ -254,6 +268,7 @@ def pick_landmarks(
         names: what the page calls both.
         start: landmarks to begin with instead; None for none.
         shown: numbers of the target's triangles that the face is searched for in; None for all.
+        parts: of the target, which the page can hide.
         host: address to listen at; by default nobody but this machine reaches it.
         port: to listen at; 0 for any free one.
         ready: called with the page's address as soon as it can be opened.
@@ -270,6 +285,6 @@ def pick_landmarks(
         counts = len(source.template), len(target.vertices)
         landmarks = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices), counts)
         landmarks.check(*counts)
-    picking = Picking(source, target, names, file, landmarks, shown)
+    picking = Picking(source, target, names, file, landmarks, shown, parts)
     page = "".join(picking_page(picking))
     return run_server(lambda stop: make_app(picking, page, names_of(host), stop), host=host, port=port, ready=ready)

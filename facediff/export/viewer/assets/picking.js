@@ -71,6 +71,7 @@ class Side {
     this.box.addEventListener("dblclick", (event) => event.stopImmediatePropagation()); // two quick clicks are no reset
     this.camera = new Camera(this.box, () => app.moved(this));
     this.listen();
+    this.listParts(facts.parts ?? []);
     new ResizeObserver(() => app.request()).observe(this.box);
   }
 
@@ -105,6 +106,28 @@ class Side {
     }
     for (const button of this.root.querySelectorAll("[data-turn]")) {
       button.addEventListener("click", (event) => this.rotate(Number(button.dataset.turn), event.shiftKey ? 15 : 90));
+    }
+  }
+
+  /** A box for each part, [name, [[first triangle, number of triangles], …]], that hides and shows it. */
+  listParts(parts) {
+    const menu = this.root.querySelector(".parts");
+    if (!menu || parts.length < 2) return;
+    menu.hidden = false;
+    const whole = this.face.faces, hidden = new Set();
+    for (const part of parts) {
+      const label = document.createElement("label"), box = document.createElement("input");
+      box.type = "checkbox";
+      box.checked = true;
+      box.addEventListener("change", () => {
+        if (box.checked) hidden.delete(part);
+        else hidden.add(part);
+        this.face.faces = withoutParts(whole, [...hidden].flatMap(([, runs]) => runs));
+        this.scene.sendFaces(0);
+        this.app.request();
+      });
+      label.append(box, ` ${part[0]}`);
+      menu.querySelector("div").append(label);
     }
   }
 
@@ -501,6 +524,13 @@ class Picker {
     event.preventDefault();
     actions[letter]();
   }
+}
+
+/** Corners of triangles less those of some runs of them. */
+function withoutParts(faces, runs) {
+  const gone = new Uint8Array(faces.length / 3);
+  for (const [first, count] of runs) gone.fill(1, first, first + count);
+  return faces.filter((_, corner) => !gone[Math.floor(corner / 3)]);
 }
 
 async function readSide(side) {

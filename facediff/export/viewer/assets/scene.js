@@ -200,6 +200,18 @@ class Scene {
     gl.disable(gl.SCISSOR_TEST);
   }
 
+  /** Send an animation's triangles again, some of which are hidden now or shown again. */
+  sendFaces(number) {
+    const gl = this.gl;
+    const face = this.faces[number], mesh = this.meshes[number];
+    gl.bindVertexArray(mesh.array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.faces);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.faces, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    gl.deleteBuffer(mesh.edges ?? null);
+    mesh.edges = face.edges = null;
+  }
+
   /** Draw an animation's edges; they are found when they are shown for the first time. */
   drawEdges(number, [red, green, blue, opacity]) {
     const gl = this.gl;
