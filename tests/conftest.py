@@ -16,7 +16,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def pytest_configure(config: pytest.Config) -> None:
     """What takes seconds to import is for the processes that run tests, not for the one that hands them out."""
-    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+    handed_out = config.getoption("numprocesses", None) and not config.option.collectonly
+    if handed_out and not hasattr(config, "workerinput"):
         return
     # The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports.
     from jaxtyping import install_import_hook
