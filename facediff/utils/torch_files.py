@@ -307,7 +307,7 @@ AUTHORS = "expected a checkpoint as its authors distribute it (.pth, .pth.tar, .
 def read_state_dict(path: Path) -> dict[str, Any]:
     """The tensors of another project's checkpoint by name, on the CPU, without a leading ``module.``.
 
-    A state dict may lie in the file as it is, or under ``state_dict`` or ``model``. Files with more than tensors and
+    A state dict may lie in the file as it is, or under ``state_dict``, ``model`` or ``encoder``. Files with more than tensors and
     plain data (optimisers, options of a library) are read too: of these objects nothing is imported or run. A file that
     asks for a function to be called is refused, wherever it asks.
 
@@ -339,6 +339,40 @@ def read_state_dict(path: Path) -> dict[str, Any]:
     return tensors
 
 
+def read_arguments(path: Path, name: str = "args") -> dict[str, Any]:
+    """The options that another project's checkpoint keeps next to its tensors, as an ``argparse.Namespace`` or a dict.
+
+    Nothing of the file is imported or run. Numbers, texts, lists of these and paths are kept, paths as texts; other
+    values are left out.
+
+    Args:
+        path: a file that :func:`read_state_dict` reads.
+        name: where the options lie.
+
+    Returns:
+        options by name; empty if the file holds none.
+    """
+    try:
+        with path.open("rb") as stream:
+            content = read_outline(stream, path, ArgumentReader)
+    except FaceDiffError:
+        raise
+    except Exception as error:  # as in read_state_dict
+        raise FaceDiffError(f"{path}: not a checkpoint that can be read safely; {AUTHORS}") from error
+    options = content.get(name) if isinstance(content, Mapping) else None
+    options = options.state if isinstance(options, StoredNamespace) else options
+    if not isinstance(options, Mapping):
+        return {}
+    return {key: value for key, value in options.items() if isinstance(key, str) and is_plain(value)}
+
+
+def is_plain(value: object) -> bool:
+    """Whether it is a number, a text, None, or a list of such."""
+    if isinstance(value, list | tuple):
+        return all(is_plain(item) and not isinstance(item, list | tuple) for item in value)
+    return value is None or isinstance(value, bool | int | float | str)
+
+
 def state_of(content: object) -> dict[str, StoredTensor]:
     """The tensors by name of a state dict, or of what wraps one."""
     if not isinstance(content, Mapping):
@@ -346,7 +380,7 @@ def state_of(content: object) -> dict[str, StoredTensor]:
     own = {name: value for name, value in content.items() if isinstance(name, str) and isinstance(value, StoredTensor)}
     if own:
         return own
-    for wrapper in ("state_dict", "model", "model_state_dict"):
+    for wrapper in ("state_dict", "model", "model_state_dict", "encoder"):
         if inner := state_of(content.get(wrapper)):
             return inner
     return {}
@@ -495,3 +529,28 @@ class ForeignReader(OutlineReader):
             raise pickle.UnpicklingError("it holds a tensor in an unknown form")
         entry = f"{self.folder}/data/{storage.key}"
         return StoredTensor(checked.bytes, storage.key, entry, storage.type, offset, shape, stride)
+
+
+class StoredNamespace:
+    """In place of an ``argparse.Namespace``: its attributes as a dict."""
+
+    def __init__(self) -> None:
+        self.state: dict[Any, Any] = {}
+
+    def __setstate__(self, state: object) -> None:
+        """Keep the attributes, whatever they are called."""
+        self.state = state if isinstance(state, dict) else {}
+
+
+class ArgumentReader(ForeignReader):
+    """As :class:`ForeignReader`, which also keeps the attributes of an ``argparse.Namespace``, and paths as texts."""
+
+    names: ClassVar[dict[tuple[str, str], Any]] = {
+        **ForeignReader.names,
+        ("argparse", "Namespace"): StoredNamespace,
+        **{
+            (module, name): lambda *parts: "/".join(map(str, parts))
+            for module in ("pathlib", "pathlib._local")
+            for name in ("Path", "PosixPath", "PurePath", "PurePosixPath", "WindowsPath")
+        },
+    }

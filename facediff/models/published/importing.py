@@ -45,7 +45,7 @@ from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
 from facediff.utils.plain_options import as_hinted, fits, in_words, is_name, parameters
 from facediff.utils.tensorflow_files import read_bundle
-from facediff.utils.torch_files import read_state_dict
+from facediff.utils.torch_files import read_arguments, read_state_dict
 
 if TYPE_CHECKING:
     from facediff.models.base import AnimationModel
@@ -169,6 +169,7 @@ def read_weights(files: Sequence[Path]) -> AuthorsWeights:
     if not files:
         raise FaceDiffError("import-checkpoint: no checkpoint was given; expected that of a published method")
     together: dict[str, Tensor] = {}
+    arguments: dict[str, Mapping[str, Any]] = {}
     for path, shards in bundles(files).items():
         state = read_bundle(path, shards) if path.suffix == ".index" else read_state_dict(path)
         if "facediff_format" in state:
@@ -179,7 +180,9 @@ def read_weights(files: Sequence[Path]) -> AuthorsWeights:
                 f"one method"
             )
         together |= state
-    return AuthorsWeights(together, ", ".join(map(str, files)))
+        if path.suffix != ".index" and (options := read_arguments(path)):
+            arguments |= dict.fromkeys(state, options)
+    return AuthorsWeights(together, ", ".join(map(str, files)), arguments)
 
 
 def recognise(weights: AuthorsWeights) -> Recogniser:

@@ -86,6 +86,7 @@ class AuthorsWeights:
     Args:
         tensors: by the authors' names.
         source: the files, for messages.
+        arguments: the options that each tensor's file says its model was made with, by the tensor's name.
 
     Attributes:
         renamed: tensors by the names of facediff's model.
@@ -93,9 +94,12 @@ class AuthorsWeights:
         notes: what the user should know of them.
     """
 
-    def __init__(self, tensors: Mapping[str, Tensor], source: str) -> None:
+    def __init__(
+        self, tensors: Mapping[str, Tensor], source: str, arguments: Mapping[str, Mapping[str, Any]] | None = None
+    ) -> None:
         self.source = source
         self.tensors = dict(tensors)
+        self._arguments = arguments or {}
         self.renamed: dict[str, Tensor] = {}
         self.ignored: dict[str, str] = {}
         self.notes: list[str] = []
@@ -165,6 +169,15 @@ class AuthorsWeights:
             if owner == place and old.endswith(other):
                 return f"{old.removesuffix(other)}{kind}"
         return new
+
+    def add(self, new: str, value: Tensor) -> None:
+        """Use a tensor that follows from a formula, where the files lack it."""
+        self.renamed[new] = value
+        self._origins[new] = new
+
+    def arguments(self, name: str) -> Mapping[str, Any]:
+        """The options that the file of a tensor says its model was made with; empty if it says none."""
+        return self._arguments.get(name, {})
 
     def move_all(self, old: str, new: str, renames: Iterable[tuple[str, str]] = ()) -> None:
         """Use all tensors whose names begin with ``old``, but for ignored ones, under names that begin with ``new``.

@@ -1,0 +1,525 @@
+"""DiffPoseTalk (Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head Pose Generation via
+Diffusion Models", 2024).
+
+Diffusion over windows of FLAME's parameters, each of which continues the one before it; the style comes from a clip.
+From top to bottom: the model, training, sampling, the authors' checkpoints. The network and the process stand in
+:mod:`facediff.models.published.diffposetalk_network`; docs/methods.md says what of the published code is an option.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch
+from facediff.errors import ArgumentError, OptionError, choices
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.inference import BatchMotion, Progress, Style
+from facediff.models.layers import Heads, Layers, Share, Width
+from facediff.models.published.base import NO_STYLE
+from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style, style_contrast
+from facediff.models.published.diffposetalk_network import (
+    Condition,
+    CosineProcess,
+    Draw,
+    Guidance,
+    PoseDenoiser,
+    Threshold,
+    clamped,
+    guided,
+)
+from facediff.models.published.parametric import ParametricModel, window_at
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.spaces.layouts import layout
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+
+Weight = Annotated[float, Range(0, 1e9)]
+
+NO_SPEECH, NO_PERSON = 0.9, 0.55
+"""Above these, a clip's random number takes its speech and style, or its style alone, from it in training: 10 % and
+45 %."""
+
+
+@registry.model.register("DiffPoseTalk")
+class DiffPoseTalk(ParametricModel):
+    """DiffPoseTalk: diffusion of expression and head pose in windows, with the style of a clip.
+
+    Args:
+        dim: channels of the Transformer.
+        num_layers: its layers.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its feed-forward layers; four times ``dim`` if None.
+        dropout: in both Transformers, in training.
+        style_dim: channels of the style.
+        style_layers: layers of the style encoder.
+        style_heads: its attention heads.
+        style_rows: rows of its table of positions.
+        style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
+            influence; ``frames`` gives each its own, as was meant.
+        window: frames that are generated in one pass.
+        context: frames before it that the network sees.
+        diffusion_steps: noising steps, all of which sampling takes.
+        indicator: tell the network which frames fill up the last window.
+        memory_width: frames that lie fewer than so many frames from a moment of speech attend to it; 0 for all.
+        head: generate the head's rotation; else the head stays at rest.
+        shape_dim: coefficients of a person's shape that the network is conditioned on; 0 for none.
+        padding: what the last window's speech is filled up with: ``zero``, or the last sample (``replicate``).
+        speech_context: encode the speech of all windows in one pass; else of each window by itself.
+        conditions: what training drops and sampling may be guided by, ``audio`` before ``style``.
+        guidance: how guided predictions are combined: ``incremental``, or ``independent``.
+        guidance_form: ``published`` takes the second difference of independent guidance from the prediction that the
+            first has changed already; ``corrected`` from the one without conditions.
+        audio_scale: scale of the guidance by speech.
+        style_scale: scale of the guidance by style.
+        threshold: clamp every prediction to this quantile of its magnitudes, itself between the second and the third
+            number; not at all if None.
+        velocity_weight: weight of the squared error of first differences.
+        smoothness_weight: weight of the prediction's squared second differences.
+        head_weight: weight of the head's squared error, on top of the other channels'.
+        head_velocity_weight: weight of that of its first differences.
+        style_weight: weight of the contrast of styles (NT-Xent), from which alone the style encoder learns.
+        temperature: of that contrast.
+        options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
+    """
+
+    samples: ClassVar[bool] = True
+    chosen: ClassVar[tuple[str, ...]] = (*ParametricModel.chosen, "scales", "guiding")
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder, source="facebook/hubert-base-ls960", frozen_layers=2, edges=False
+    )
+
+    def __init__(
+        self,
+        *,
+        dim: Width = 512,
+        num_layers: Layers = 8,
+        num_heads: Heads = 8,
+        feed_forward_dim: Width | None = None,
+        dropout: Share = 0.1,
+        style_dim: Width = 128,
+        style_layers: Layers = 4,
+        style_heads: Heads = 4,
+        style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
+        style_positions: StylePositions = "published",
+        window: Annotated[int, Range(2, 10_000)] = 100,
+        context: Annotated[int, Range(1, 10_000)] = 10,
+        diffusion_steps: Annotated[int, Range(1, 10_000)] = 500,
+        indicator: bool = True,
+        memory_width: Annotated[int, Range(0, 10_000)] = 1,
+        head: bool = True,
+        shape_dim: Annotated[int, Range(0, 1000)] = 0,
+        padding: Literal["zero", "replicate"] = "zero",
+        speech_context: bool = True,
+        conditions: Sequence[Condition] = ("audio", "style"),
+        guidance: Guidance = "incremental",
+        guidance_form: Literal["published", "corrected"] = "published",
+        audio_scale: Annotated[float, Range(0, 100)] = 1.15,
+        style_scale: Annotated[float, Range(0, 100)] = 3.0,
+        threshold: Sequence[float] | None = None,
+        velocity_weight: Weight = 5.0,
+        smoothness_weight: Weight = 0.5,
+        head_weight: Weight = 0.05,
+        head_velocity_weight: Weight = 5.0,
+        style_weight: Weight = 0.1,
+        temperature: Annotated[float, Range(0, 100, above=True)] = 0.1,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(shape_dim=shape_dim, head=head, **options)
+        for width, heads, name in ((dim, num_heads, "dim"), (style_dim, style_heads, "style_dim")):
+            if width % heads or width % 2:
+                raise ArgumentError({name: width}, "it must be even, and a multiple of its attention heads")
+        if context > window:
+            raise ArgumentError({"context": context, "window": window}, "a window must hold the context of the next")
+        if threshold is not None and not (len(threshold) == 3 and 0 <= threshold[0] <= 1):
+            raise ArgumentError({"threshold": list(threshold)}, "expected a quantile and two bounds, such as 0.99, 1, 4")
+        self.window_frames, self.context = window, context
+        self.padding, self.speech_context = padding, speech_context
+        self.guiding: tuple[Condition, ...] = tuple(name for name in ("audio", "style") if name in conditions)
+        self.guidance, self.literal_guidance = guidance, guidance_form == "published"
+        self.scales: dict[str, float] = {"audio": audio_scale, "style": style_scale}
+        self.threshold: Threshold | None = None if threshold is None else (threshold[0], threshold[1], threshold[2])
+        self.weights = {
+            "velocity": velocity_weight,
+            "smoothness": smoothness_weight,
+            "head": head_weight,
+            "head_velocity": head_velocity_weight,
+            "style": style_weight,
+        }
+        self.temperature = temperature
+        channels = len(self.modelled)
+        self.audio_map = nn.Linear(self.audio_width, dim)
+        self.start_audio = nn.Parameter(torch.randn(1, context, dim))
+        self.start_motion = nn.Parameter(torch.randn(1, context, channels))
+        self.no_audio = nn.Parameter(torch.randn(1, 1, dim))
+        self.no_style = nn.Parameter(torch.randn(1, 1, style_dim))
+        self.style_encoder = ClipStyleEncoder(
+            channels,
+            style_dim,
+            num_layers=style_layers,
+            num_heads=style_heads,
+            feed_forward_dim=4 * style_dim,
+            rows=style_rows,
+            positions=style_positions,
+            dropout=dropout,
+        )
+        self.process = CosineProcess(diffusion_steps)
+        self.network = PoseDenoiser(
+            channels=channels,
+            person_dim=shape_dim + style_dim,
+            dim=dim,
+            num_layers=num_layers,
+            num_heads=num_heads,
+            feed_forward_dim=feed_forward_dim or 4 * dim,
+            window=window,
+            context=context,
+            steps=diffusion_steps,
+            indicator=indicator,
+            memory_width=memory_width,
+            dropout=dropout,
+        )
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The style encoder."""
+        return [self.style_encoder]
+
+    def choose_guidance(self, scales: Mapping[str, float]) -> None:
+        """Follow speech (``audio``) or ``style`` by other scales.
+
+        Raises:
+            FaceDiffError: if the model was not trained without such a condition.
+        """
+        for name in scales:
+            if name not in self.guiding:
+                raise OptionError.naming(f"{{guidance}} {name}: expected {choices(name, list(self.guiding))}")
+        self.scales = {**self.scales, **scales}
+
+    # The style of a clip.
+
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vectors of reference motions, of which as many frames as a window has are used."""
+        motion = self.standardised(reference)[:, : self.window_frames]
+        style: Tensor = self.style_encoder(motion, mask[:, : self.window_frames])
+        return style
+
+    def default_style(self, identity: str) -> Any:  # noqa: ANN401 - a reference, or a style
+        """The stored reference of an identity; no style, as the model was trained to do without, if there is none."""
+        return self.assets.references.get(identity, NO_STYLE)
+
+    def given_style(self, batch: Batch) -> Float[Tensor, "batch style_dim"] | None:
+        """The batch's styles; None where it has none."""
+        if isinstance(batch.style, Tensor) and not batch.style.shape[1]:
+            return None
+        return self.style_of(batch)
+
+    # Training.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """Errors of the predicted clean motion of two windows, the second of which continues the first."""
+        motion = self.standardised(batch.motion)
+        size, frames = self.window_frames, batch.frame_lengths
+        usual = self.encode_style(batch.reference, batch.reference_mask)
+        own: Tensor = self.style_encoder(motion, batch.mask)
+        terms = {"style": style_contrast(usual, own, self.temperature)}
+        features = self.hear(batch, frames)
+        first = self._randint(max(1, int(frames.max()) - size + 1), len(batch), generator) % frames.clamp_min(1)
+        drop = torch.rand(len(batch), device=self.device, generator=generator)
+        person = torch.where(drop[:, None] > NO_PERSON, self.no_style[0], usual.detach())
+        person = torch.cat([self.shapes_of(batch), person], 1)
+        before = (self.start_motion.expand(len(batch), -1, -1), self.start_audio.expand(len(batch), -1, -1))
+        errors: list[dict[str, Tensor]] = []
+        for number in range(2):
+            clean, valid = window_at(motion, frames, first, size)
+            heard, _ = window_at(features, frames, first, size)
+            if number and not bool(valid.any()):
+                break
+            silent = torch.where(drop[:, None, None] > NO_SPEECH, self.no_audio, heard)
+            step = self._randint(self.process.steps, len(batch), generator) + 1
+            noise = torch.randn(clean.shape, device=self.device, generator=generator)
+            noisy = self.process.noised(clean, step, noise)
+            predicted = self.network(noisy, silent, person, before, step, valid.to(clean))
+            errors.append(self._errors(predicted[:, self.context :], clean, valid))
+            before, first = (clean[:, -self.context :], heard[:, -self.context :]), first + size
+        terms |= {name: torch.stack([error[name] for error in errors]).mean() for name in errors[0]}
+        terms["loss"] = terms["reconstruction"] + sum(
+            (weight * terms[name] for name, weight in self.weights.items()), start=torch.zeros((), device=self.device)
+        )
+        return terms
+
+    def _randint(self, bound: int, count: int, generator: torch.Generator | None) -> Int[Tensor, " batch"]:
+        return torch.randint(0, bound, (count,), device=self.device, generator=generator)
+
+    def _errors(
+        self, predicted: Tensor, clean: Tensor, valid: Bool[Tensor, "batch frames"]
+    ) -> dict[str, Tensor]:
+        """Mean squared errors over the valid frames."""
+
+        def mean(squares: Tensor, frames: Tensor) -> Tensor:
+            return (squares * frames[..., None]).sum() / (frames.sum() * squares.shape[2]).clamp_min(1)
+
+        pairs, triples = valid[:, 1:], valid[:, 2:]
+        error = predicted - clean
+        moved, bent = error.diff(dim=1), predicted.diff(dim=1).diff(dim=1)
+        head = list(self.head_places)
+        return {
+            "reconstruction": mean(error.square(), valid),
+            "velocity": mean(moved.square(), pairs),
+            "smoothness": mean(bent.square(), triples),
+            "head": mean(error[..., head].square(), valid),
+            "head_velocity": mean(moved[..., head].square(), pairs),
+        }
+
+    # Speech.
+
+    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames dim"]:
+        """Speech of each clip's frames."""
+        rows = [
+            self.hear_wave(self.standard_speech(batch.audio[i, : int(batch.audio_lengths[i])]), int(frames[i]))
+            for i in range(len(batch))
+        ]
+        return nn.utils.rnn.pad_sequence(rows, batch_first=True)
+
+    @staticmethod
+    def standard_speech(audio: Float[Tensor, " samples"]) -> Float[Tensor, " samples"]:
+        """(x − mean)/(s + 1e-5) with the unbiased deviation s of the whole file."""
+        return (audio - audio.mean()) / (audio.std() + 1e-5)
+
+    def hear_wave(self, wave: Float[Tensor, " samples"], frames: int) -> Float[Tensor, "frames dim"]:
+        """Speech of so many frames that ``wave``, standardised already, lasts for."""
+        encoder = self.audio_encoder
+        if isinstance(encoder, Wav2Vec2Encoder):
+            hidden = encoder.hidden_of(fitted(wave)[None], 2 * frames, most=4 * frames)
+            hidden = F.interpolate(hidden.transpose(1, 2), size=frames, mode="linear").transpose(1, 2)
+        else:
+            lengths = torch.tensor([len(wave)], device=wave.device)
+            hidden = encoder.at_steps(wave[None], lengths, torch.tensor([frames], device=wave.device), "hidden")
+        mapped: Tensor = self.audio_map(hidden)
+        return mapped[0]
+
+    # Sampling.
+
+    def frames_of(self, samples: int) -> int:
+        """Whole frames."""
+        return int(samples / SAMPLE_RATE * self.frame_rate)
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Windows one after the other; a clip's noise depends on its seed alone."""
+        style, shapes = self.given_style(batch), self.shapes_of(batch)
+        rows = []
+        for i, seed in enumerate(seeds):
+            stream = torch.Generator(self.device).manual_seed(seed)
+
+            def draw(like: Tensor, stream: torch.Generator = stream) -> Tensor:
+                return torch.randn(like.shape, device=like.device, dtype=like.dtype, generator=stream)
+
+            audio = batch.audio[i, : int(batch.audio_lengths[i])]
+            motion = self.sample(audio, shapes[i : i + 1], None if style is None else style[i : i + 1], draw, progress)
+            rows.append(self.absolute(motion))
+        motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)
+        return F.pad(motion, (0, 0, 0, 0, 0, max(0, int(frames.max()) - motion.shape[1])))[:, : int(frames.max())]
+
+    def sample(
+        self,
+        audio: Float[Tensor, " samples"],
+        shape: Float[Tensor, "1 shape_dim"],
+        style: Float[Tensor, "1 style_dim"] | None,
+        draw: Draw,
+        progress: Progress | None = None,
+    ) -> Float[Tensor, "frames channels"]:
+        """The reverse process of all windows of a recording.
+
+        Args:
+            audio: speech at 16 kHz.
+            shape: standardised coefficients of the person's shape.
+            style: as :meth:`encode_style` gives it; None for no style.
+            draw: noise in the order in which the published code draws it: the start, which all windows share, then one
+                for every step of every window but its last.
+            progress: wraps the iteration over windows.
+
+        Returns:
+            standardised motion of the channels that the network generates.
+        """
+        size, unit = self.window_frames, SAMPLE_RATE / self.frame_rate
+        audio = self.standard_speech(audio)
+        windows = max(1, math.ceil(self.frames_of(len(audio)) / size))
+        missing = round(unit * size) * windows - len(audio)
+        if missing > 0:
+            audio = F.pad(audio, (0, missing), value=float(audio[-1]) if self.padding == "replicate" else 0.0)
+        filled = max(0, math.ceil(missing / unit))
+        features = self.hear_wave(audio, size * windows) if self.speech_context else None
+        start = draw(audio.new_empty(1, size, len(self.modelled)))
+        before = (self.start_motion, self.start_audio)
+        parts = []
+        for number in progress(range(windows)) if progress is not None else range(windows):
+            first = number * size
+            if features is None:
+                heard = self.hear_wave(audio[round(first * unit) : round((first + size) * unit)], size)
+            else:
+                heard = features[first : first + size]
+            real = audio.new_ones(1, size)
+            if number == windows - 1 and filled:
+                real[:, size - min(size, filled) :] = 0
+            motion = self.sample_window(heard[None], shape, style, before, start, real, draw)
+            before = (motion[:, -self.context :], heard[None, -self.context :])
+            parts.append(motion[0])
+        return torch.cat(parts)[: size * windows - filled]
+
+    def sample_window(
+        self,
+        heard: Float[Tensor, "1 window dim"],
+        shape: Float[Tensor, "1 shape_dim"],
+        style: Float[Tensor, "1 style_dim"] | None,
+        before: tuple[Tensor, Tensor],
+        start: Float[Tensor, "1 window channels"],
+        real: Float[Tensor, "1 window"],
+        draw: Draw,
+    ) -> Float[Tensor, "1 window channels"]:
+        """The reverse process of one window, guided by those conditions that :attr:`guiding` names."""
+        style = self.no_style[0] if style is None else style
+        silent = self.no_audio.expand_as(heard) if "audio" in self.guiding else heard
+        nobody = self.no_style[0] if "style" in self.guiding else style
+        # Without any condition first, then one more in each branch; or, independently, each one by itself.
+        speech, styles = [silent], [nobody]
+        for name in self.guiding:
+            speech.append(silent if name == "style" and self.guidance == "independent" else heard)
+            styles.append(style if name == "style" else nobody)
+        count = len(speech)
+        audio = torch.cat(speech)
+        person = torch.cat([torch.cat([shape, one], 1) for one in styles])
+        wide = (before[0].expand(count, -1, -1), before[1].expand(count, -1, -1))
+        scales = [self.scales[name] for name in self.guiding]
+        noisy = start
+        for step in range(self.process.steps, 0, -1):
+            noise = draw(noisy) if step > 1 else None
+            steps = torch.full((count,), step, device=noisy.device)
+            predicted = self.network(
+                noisy.expand(count, -1, -1), audio, person, wide, steps, real.expand(count, -1)
+            )
+            if self.threshold is not None:
+                predicted = clamped(predicted, self.window_frames, self.threshold)
+            branches = predicted[:, self.context :].split(1)
+            clean = guided(branches, scales, self.guidance, literal=self.literal_guidance)
+            noisy = self.process.before(noisy, clean, step, noise)
+        return noisy
+
+
+def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
+    """Speech with its ends mirrored, so that HuBERT gives exactly 50 steps a second: 320·n + 80 samples."""
+    missing = 320 * (len(wave) // 320) + 80 - len(wave)
+    side = math.ceil(missing / 2)
+    if side < 0:
+        return wave
+    padded = wave[None]
+    # In two halves, as the authors do: a reflection can be no longer than the speech.
+    for _ in range(2):
+        padded = F.pad(padded, (side // 2, side // 2), mode="reflect")
+    return F.pad(padded, (side % 2, side % 2), mode="replicate")[0]
+
+
+# The authors' checkpoints.
+
+RENAMES = (
+    ("PE", "positions"),
+    ("person_proj.", "person_in."),
+    ("diff_step_map.", "step_map."),
+    ("feature_proj.", "motion_in."),
+    ("transformer.", "transformer."),
+    ("motion_dec.", "motion_out."),
+)
+
+
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
+    """DiffPoseTalk's tensors under the names of this file, and its options."""
+    said = weights.arguments("start_motion_feat")
+    _, context, channels = weights.shape("start_motion_feat", 3)
+    _, positions, dim = weights.shape("denoising_net.PE", 3)
+    _, person_dim = weights.shape("denoising_net.person_proj.weight")
+    _, frame_dim = weights.shape("denoising_net.feature_proj.weight")
+    style_dim = weights.shape("null_style_feat", 3)[2]
+    if str(said.get("target", "sample")) != "sample":
+        raise OptionError.naming(f"{weights.source}: it predicts {said['target']}; expected a model of clean motion")
+    kind: Literal["wav2vec2", "hubert"] = "wav2vec2" if said.get("audio_model") == "wav2vec2" else "hubert"
+    encoder = weights.backbone("audio_encoder.", kind=kind, facts=facts, **DiffPoseTalk.encoder_settings())
+    for old, new in RENAMES:
+        weights.move_all(f"denoising_net.{old}", f"network.{new}")
+    for old, new in (
+        ("start_audio_feat", "start_audio"),
+        ("start_motion_feat", "start_motion"),
+        ("null_audio_feat", "no_audio"),
+        ("null_style_feat", "no_style"),
+        ("diffusion_sched.alphas", "process.alphas"),
+        ("diffusion_sched.alpha_bars", "process.signal"),
+        ("diffusion_sched.sigmas_inflex", "process.deviations"),
+    ):
+        weights.move(old, new)
+    weights.move_all("audio_feature_map.", "audio_map.")
+    weights.ignore("denoising_net.TE.pe", "sinusoids, which the authors make anew as well")
+    weights.ignore("diffusion_sched.betas", "follows from the other variances")
+    weights.ignore("diffusion_sched.sigmas_flex", "deviations of a sampler with more noise, which nothing uses")
+    mask = "denoising_net.alignment_mask"
+    width = int((~weights.get(mask).bool())[1].sum()) if mask in weights else 0
+    weights.ignore(mask, "follows from the number of frames")
+    style_said = weights.arguments(next(name for name in weights.tensors if name.endswith("motion_proj.weight")))
+    rows = convert_style(weights, "", "style_encoder.")
+    options: dict[str, Any] = {
+        "audio_encoder": encoder,
+        "dim": dim,
+        "num_layers": count_layers(weights, "denoising_net.transformer.layers."),
+        "feed_forward_dim": weights.shape("denoising_net.transformer.layers.0.linear1.weight")[0],
+        "style_dim": style_dim,
+        "style_layers": count_layers(weights, "transformer.layers.", "encoder.transformer.layers."),
+        "style_rows": rows,
+        "window": positions - context - 1,
+        "context": context,
+        "diffusion_steps": weights.shape("diffusion_sched.alphas", 1)[0] - 1,
+        "indicator": frame_dim > channels,
+        "memory_width": width,
+        "head": channels >= 54,
+        "shape_dim": person_dim - style_dim,
+    }
+    for theirs, ours, where in (
+        ("n_heads", "num_heads", said),
+        ("n_heads", "style_heads", style_said),
+        ("pad_mode", "padding", said),
+        ("cfg_mode", "guidance", said),
+    ):
+        if where.get(theirs) is not None:
+            options[ours] = where[theirs]
+    guiding = said.get("guiding_conditions")
+    if isinstance(guiding, str):
+        options["conditions"] = [name for name in ("audio", "style") if name in guiding.split(",")]
+    return options
+
+
+def count_layers(weights: AuthorsWeights, *prefixes: str) -> int:
+    """Layers whose tensors' names begin so."""
+    return len({name.removeprefix(old).partition(".")[0] for old in prefixes for name in weights.names(old)})
+
+
+register(
+    Recogniser(
+        method="DiffPoseTalk",
+        marks=("denoising_net.person_proj.weight", "start_motion_feat", "null_style_feat"),
+        unless=(),
+        convert=convert,
+        vertices=lambda _: 56,
+        count=lambda _: 0,
+        frame_rate=25.0,
+        space=lambda _: layout("flame_diffposetalk"),
+        licence="none stated",
+        licence_source="github.com/DiffPoseTalk/DiffPoseTalk",
+    )
+)
