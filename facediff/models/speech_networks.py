@@ -168,6 +168,23 @@ class Wav2Vec2Encoder(AudioEncoder):
         hidden = by_lengths(features, lengths, steps, encode)
         return hidden if self.out is None else self.out(hidden)
 
+    def hidden_of(
+        self, wave: Waves, steps: int | None = None, *, most: int | None = None
+    ) -> Float[Tensor, "batch steps width"]:
+        """Hidden states of waves that the caller has standardised and filled up, all of one length.
+
+        Args:
+            wave: speech at 16 kHz.
+            steps: what the convolutions give is interpolated to so many steps before the Transformer runs, each in its
+                own stretch of time; as many as they give if None.
+            most: steps of theirs that are used before that; all if None.
+        """
+        features = self.network.feature_extractor(wave).transpose(1, 2)[:, :most]
+        if steps is not None and features.shape[1] != steps:
+            features = nn.functional.interpolate(features.transpose(1, 2), size=steps, mode="linear").transpose(1, 2)
+        hidden = self.hidden_states(features)
+        return hidden if self.out is None else self.out(hidden)
+
     def hidden_states(self, features: Tensor) -> Tensor:
         """Hidden states of the last layer, of clips of one length."""
         network, settings = self.network, self.network.config

@@ -1,0 +1,608 @@
+"""ARTalk (Chu et al.: "ARTalk: Speech-Driven 3D Head Animation via Autoregressive Model", 2025).
+
+A Transformer predicts the bits of 100 frames from coarse to fine, from their speech, the chunk before and a style clip;
+a codec makes motion of them. From top to bottom: the model, training, generation, the generator, smoothing, the
+authors' checkpoints. The codec stands in :mod:`facediff.models.published.artalk_codec`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from facediff import registry
+from facediff.data import Batch, SpeechMotionDataModule
+from facediff.errors import ArgumentError
+from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.inference import BatchMotion, Progress
+from facediff.models.layers import Heads, Layers, Share, Width
+from facediff.models.published.artalk_codec import BitCodec, Bits, resized
+from facediff.models.published.base import NO_STYLE
+from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style
+from facediff.models.published.diffposetalk import count_layers
+from facediff.models.published.parametric import ParametricModel, window_at
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.spaces.layouts import layout
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.ranges import Range
+
+Weight = Annotated[float, Range(0, 1e9)]
+
+STYLE_FRAMES = 50
+"""Frames of a style clip."""
+
+LARGEST_SCALE = math.log(100)
+"""Of the logarithm that attention's queries are multiplied by."""
+
+
+@dataclass(frozen=True)
+class ChunkState:
+    """What a chunk leaves for the next one.
+
+    Attributes:
+        bits: of its motion, encoded again by itself.
+        memory: tokens that the generator attends to, without their positions.
+    """
+
+    bits: Bits
+    memory: Float[Tensor, "1 tokens dim"]
+
+
+@registry.model.register("ARTalk")
+class ARTalk(ParametricModel):
+    """ARTalk: bits of motion from coarse to fine, chunk after chunk.
+
+    Args:
+        dim: channels of the generator.
+        num_layers: its blocks.
+        num_heads: its attention heads.
+        feed_forward_dim: channels between the two maps of its blocks; four times ``dim`` if None.
+        scales: tokens of a chunk at each rate; the first is 1, the last the frames of a chunk.
+        code_dim: bits of a token.
+        codec_dim: channels of the codec.
+        codec_layers: layers of its encoder, and of its decoder.
+        codec_heads: their attention heads.
+        style_dim: channels of the style.
+        style_layers: layers of the style encoder.
+        style_heads: its attention heads.
+        style_rows: rows of its table of positions.
+        style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
+            influence; ``frames`` gives each its own, as was meant.
+        style_scale: how far the style goes from no style; 1 takes it as it is.
+        memory_chunks: chunks that the generator attends to.
+        smooth: filter the result (Savitzky–Golay), as the authors' programs do.
+        still_jaw: set the jaw's rotation about y and z to zero, as they do.
+        stage: train the ``codec``, the ``generator`` with the codec as it is, or ``both``; the authors train one after
+            the other.
+        flipped_bits: share of the given bits that are turned over in training.
+        dropped: share of clips whose style, speech or chunk before is taken away in training, each by itself.
+        velocity_weight: weight of the codec's error of first differences.
+        head_weight: weight of the codec's error of the head, on top of the other channels'.
+        commitment_weight: weight of the distance of codes from their bits.
+        jaw: all of a jaw's rotation is generated.
+        options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
+    """
+
+    published_encoder: ClassVar[AudioEncoderFactory] = partial(
+        Wav2Vec2Encoder, source="facebook/wav2vec2-xls-r-300m", edges=False
+    )
+
+    style_mean: Tensor
+    style_std: Tensor
+
+    def __init__(
+        self,
+        *,
+        dim: Width = 768,
+        num_layers: Layers = 12,
+        num_heads: Heads = 12,
+        feed_forward_dim: Width | None = None,
+        scales: Sequence[int] = (1, 5, 25, 50, 100),
+        code_dim: Width = 32,
+        codec_dim: Width = 512,
+        codec_layers: Layers = 8,
+        codec_heads: Heads = 8,
+        style_dim: Width = 128,
+        style_layers: Layers = 4,
+        style_heads: Heads = 4,
+        style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
+        style_positions: StylePositions = "published",
+        style_scale: Annotated[float, Range(0, 100)] = 1.1,
+        memory_chunks: Annotated[int, Range(1, 100)] = 1,
+        smooth: bool = True,
+        still_jaw: bool = True,
+        stage: Literal["codec", "generator", "both"] = "both",
+        flipped_bits: Share = 0.3,
+        dropped: Share = 0.1,
+        velocity_weight: Weight = 5.0,
+        head_weight: Weight = 1.0,
+        commitment_weight: Weight = 0.2,
+        jaw: Literal["all"] = "all",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(jaw=jaw, **options)
+        if len(scales) < 2 or scales[0] != 1 or list(scales) != sorted(set(scales)):
+            raise ArgumentError({"scales": list(scales)}, "expected growing numbers from 1, such as 1, 5, 25, 50, 100")
+        for width, heads, name in ((dim, num_heads, "dim"), (codec_dim, codec_heads, "codec_dim")):
+            if width % heads:
+                raise ArgumentError({name: width}, "it must be a multiple of its attention heads")
+        self.scales, self.style_scale = tuple(scales), style_scale
+        self.smooth, self.still_jaw, self.stage = smooth, still_jaw, stage
+        self.flipped_bits, self.dropped = flipped_bits, dropped
+        self.weights = {"velocity": velocity_weight, "head": head_weight, "commitment": commitment_weight}
+        channels = len(self.modelled)
+        self.codec = BitCodec(channels, scales, code_dim, codec_dim, codec_layers, codec_heads)
+        self.style_encoder = ClipStyleEncoder(
+            channels,
+            style_dim,
+            num_layers=style_layers,
+            num_heads=style_heads,
+            feed_forward_dim=4 * style_dim,
+            rows=style_rows,
+            positions=style_positions,
+        )
+        self.register_buffer("style_mean", torch.zeros(channels))
+        self.register_buffer("style_std", torch.ones(channels))
+        self.generator = BitGenerator(
+            code_dim=code_dim,
+            style_dim=style_dim,
+            audio_width=self.audio_width,
+            dim=dim,
+            num_layers=num_layers,
+            num_heads=num_heads,
+            feed_forward_dim=feed_forward_dim or 4 * dim,
+            scales=scales,
+            memory_chunks=memory_chunks,
+        )
+        self.codec.requires_grad_(stage != "generator")
+        if stage == "codec":
+            for module in (self.generator, self.style_encoder, self.audio_encoder):
+                module.requires_grad_(False)
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The style encoder."""
+        return [self.style_encoder]
+
+    def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
+        """Take the mean and the deviation of every channel, which codec and style encoder have as well."""
+        result = super().measure(data, at_least)
+        for mean, deviation in ((self.codec.motion_mean, self.codec.motion_std), (self.style_mean, self.style_std)):
+            mean.copy_(self.motion_mean[list(self.modelled)])
+            deviation.copy_(self.motion_std[list(self.modelled)])
+        return result
+
+    # The style of a clip.
+
+    def encode_style(
+        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch style_dim"]:
+        """Style vectors of the first 50 frames of reference motions."""
+        motion = (reference.flatten(2)[:, :STYLE_FRAMES, list(self.modelled)] - self.style_mean) / self.style_std
+        style: Tensor = self.style_encoder(motion, mask[:, :STYLE_FRAMES])
+        return style
+
+    def default_style(self, identity: str) -> Any:  # noqa: ANN401 - a reference, or a style
+        """The stored reference of an identity; no style, as the model was trained to do without, if there is none."""
+        return self.assets.references.get(identity, NO_STYLE)
+
+    def style_token(self, batch: Batch) -> Float[Tensor, "batch 1 dim"]:
+        """The first token of every sequence."""
+        nothing = self.generator.no_style
+        if isinstance(batch.style, Tensor) and not batch.style.shape[1]:
+            return nothing.expand(len(batch), -1, -1)
+        style = self.generator.style_in(self.style_of(batch))[:, None]
+        # By two products, as the authors compute it.
+        return style * self.style_scale - nothing * (self.style_scale - 1.0)
+
+    # Training.
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The codec's errors, and the generator's cross-entropy of the true bits of a chunk, given the chunk before."""
+        motion = batch.motion.flatten(2)[..., list(self.modelled)]
+        size, frames = self.scales[-1], batch.frame_lengths
+        latest = max(1, int(frames.max()) - size // 2)
+        first = torch.randint(0, latest, (len(batch),), device=self.device, generator=generator) % frames.clamp_min(1)
+        now, valid = window_at(motion, frames, first, size)
+        past, was = window_at(motion, frames, (first - size).clamp_min(0), size)
+        # Before the first frame there is the face at rest, as in generation.
+        past = past * (first >= size)[:, None, None]
+        codes = self.codec.encode(torch.cat([past, now], 1))
+        stands_past, bits_past, _ = self.codec.quantise(codes[:, :size])
+        stands, bits, distance = self.codec.quantise(codes[:, size:])
+        terms: dict[str, Tensor] = {}
+        total = torch.zeros((), device=self.device)
+        if self.stage != "generator":
+            _, decoded = self.codec.decode_codes(torch.cat([stands_past, stands], 1))
+            error = (decoded - now) / self.codec.motion_std * valid[..., None]
+            count = (valid.sum() * error.shape[2]).clamp_min(1)
+            pairs = valid[:, 1:, None]
+            terms["reconstruction"] = error.abs().sum() / count
+            terms["velocity"] = (error.diff(dim=1) * pairs).abs().sum() / count
+            terms["head"] = error[..., list(self.head_places)].abs().sum() / count
+            terms["commitment"] = distance
+            total = terms["reconstruction"] + sum(
+                (weight * terms[name] for name, weight in self.weights.items()), start=total
+            )
+        if self.stage != "codec":
+            with torch.no_grad():
+                flipped = self.codec.quantise(codes[:, size:], self.flipped_bits)[1] if self.training else bits
+                memory_bits = bits_past.clone()
+            style = self.drop(self.style_token(batch), self.generator.no_style)
+            audio = torch.stack([self.hear_chunk(wave) for wave in self.chunk_waves(batch, first)])
+            audio = self.drop(audio, torch.zeros((), device=self.device))
+            memory = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(memory_bits))], 1)
+            memory = self.drop(memory, self.generator.no_style).repeat(1, self.generator.memory_chunks, 1)
+            tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(flipped))], 1)
+            logits = self.generator(tokens, memory, audio)
+            counted = self.counted_tokens(valid)
+            entropy = F.cross_entropy(logits.permute(0, 3, 1, 2), bits, reduction="none").mean(2)
+            terms["bits"] = (entropy * counted).sum() / counted.sum().clamp_min(1)
+            terms["accuracy"] = ((logits.argmax(3) == bits).float().mean(2) * counted).sum() / counted.sum().clamp_min(1)
+            total = total + terms["bits"]
+        terms["loss"] = total
+        return terms
+
+    def counted_tokens(self, valid: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch tokens"]:
+        """Which share of a token's frames are a clip's."""
+        shares = valid.float()[..., None]
+        return torch.cat([resized(shares, scale, "area") for scale in self.scales], 1)[..., 0]
+
+    def drop(self, values: Tensor, instead: Tensor) -> Tensor:
+        """In training, some clips without what is replaced."""
+        if not self.training or not self.dropped:
+            return values
+        without = torch.rand(len(values), device=values.device) < self.dropped
+        return torch.where(without.view(-1, *[1] * (values.dim() - 1)), instead, values)
+
+    def chunk_waves(self, batch: Batch, first: Int[Tensor, " batch"]) -> Float[Tensor, "batch samples"]:
+        """The speech of chunks that begin at these frames, filled up with zeros."""
+        unit, size = SAMPLE_RATE / self.frame_rate, self.chunk_samples
+        waves = batch.audio.new_zeros(len(batch), size)
+        for row, (start, length) in enumerate(zip(first.tolist(), batch.audio_lengths.tolist(), strict=True)):
+            part = batch.audio[row, round(start * unit) : min(length, round(start * unit) + size)]
+            waves[row, : len(part)] = part
+        return waves
+
+    # Speech.
+
+    @property
+    def chunk_samples(self) -> int:
+        """Samples of a chunk's speech."""
+        return int(self.scales[-1] / self.frame_rate * SAMPLE_RATE)
+
+    def hear_chunk(self, wave: Float[Tensor, " samples"]) -> Float[Tensor, "tokens width"]:
+        """What the tokens of a chunk are conditioned on: its speech at all rates."""
+        wave = (wave - wave.mean()) / (wave.std() + 1e-6)
+        encoder = self.audio_encoder
+        if isinstance(encoder, Wav2Vec2Encoder):
+            heard = encoder.hidden_of(wave[None])
+        else:
+            lengths, frames = (torch.tensor([count], device=wave.device) for count in (len(wave), self.scales[-1]))
+            heard = encoder.at_steps(wave[None], lengths, frames, "hidden")
+        return torch.cat([resized(heard, scale, "area") for scale in self.scales], 1)[0]
+
+    # Generation.
+
+    def frames_of(self, samples: int) -> int:
+        """As many as the speech touches."""
+        return math.ceil(samples / SAMPLE_RATE * self.frame_rate)
+
+    def generate_frames(
+        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
+    ) -> BatchMotion:
+        """Chunk after chunk; nothing is random."""
+        style, rows = self.style_token(batch), []
+        for i, samples in enumerate(batch.audio_lengths.tolist()):
+            motion, _ = self.animate_wave(batch.audio[i, :samples], style[i : i + 1], progress)
+            whole = motion.new_zeros(len(motion), self.n_vertices * self.dims)
+            whole[:, list(self.modelled)] = motion
+            rows.append(self.finished(whole).view(len(whole), self.n_vertices, self.dims))
+        longest = int(frames.max())
+        motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)[:, :longest]
+        return F.pad(motion, (0, 0, 0, 0, 0, longest - motion.shape[1]))
+
+    def animate_wave(
+        self, audio: Float[Tensor, " samples"], style: Float[Tensor, "1 1 dim"], progress: Progress | None = None
+    ) -> tuple[Float[Tensor, "frames channels"], Float[Tensor, "chunks tokens bits 2"]]:
+        """Motion of a recording before it is smoothed, and what the generator gave for the bits of every chunk.
+
+        Args:
+            audio: speech at 16 kHz.
+            style: as :meth:`style_token` gives it.
+            progress: wraps the iteration over chunks.
+        """
+        count = max(1, math.ceil(self.frames_of(len(audio)) / self.scales[-1]))
+        chunks = F.pad(audio, (0, max(0, count * self.chunk_samples - len(audio)))).split(self.chunk_samples)[:count]
+        state, parts, logits = self.begin(style), [], []
+        for number in progress(range(count)) if progress is not None else range(count):
+            motion, given, state = self.next_chunk(chunks[number], style, state)
+            parts.append(motion)
+            logits.append(given)
+        return torch.cat(parts)[: self.frames_of(len(audio))], torch.stack(logits)
+
+    def begin(self, style: Float[Tensor, "1 1 dim"]) -> ChunkState:
+        """The state before the first chunk: that of motion that is zero."""
+        rest = style.new_zeros(1, self.scales[-1], len(self.modelled))
+        bits = self.codec.bits_of(rest)
+        return ChunkState(bits, self.memory_of(bits, style).repeat(1, self.generator.memory_chunks, 1))
+
+    def memory_of(self, bits: Bits, style: Float[Tensor, "1 1 dim"]) -> Float[Tensor, "1 tokens dim"]:
+        """A chunk's tokens as the next chunk attends to them."""
+        return torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(bits))], 1)
+
+    def next_chunk(
+        self, wave: Float[Tensor, " samples"], style: Float[Tensor, "1 1 dim"], state: ChunkState
+    ) -> tuple[Float[Tensor, "frames channels"], Float[Tensor, "tokens bits 2"], ChunkState]:
+        """Motion of a chunk, what the generator gave for its bits, and the state for the next chunk."""
+        audio, tokens = self.hear_chunk(wave)[None], style
+        count = 0
+        for number, scale in enumerate(self.scales):
+            count += scale
+            logits = self.generator(tokens, state.memory, audio[:, :count])
+            # All bits are taken anew from every pass, those of coarser rates too, as the authors do.
+            bits = logits.argmax(3)
+            if number + 1 < len(self.scales):
+                tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(bits))], 1)
+        _, motion = self.codec.decode(state.bits, bits)
+        again = self.codec.bits_of(motion)
+        own = self.memory_of(again, style)
+        memory = torch.cat([state.memory[:, own.shape[1] :], own], 1)
+        return motion[0], logits[0], ChunkState(again, memory)
+
+    def finished(self, motion: Float[Tensor, "frames channels"]) -> Float[Tensor, "frames channels"]:
+        """Motion as the authors' programs write it: smoothed, and with a jaw that only opens."""
+        if self.smooth:
+            motion = torch.from_numpy(smoothed(motion.cpu().numpy(), self.space.head)).to(motion)
+        turned = () if self.space.is_vertices else self.space.rotations
+        places = [place for turn in turned if turn.joint == "jaw" for place in turn.channels[1:]]
+        if self.still_jaw and places:
+            motion = motion.clone()
+            motion[:, places] = 0.0
+        return motion
+
+
+def smoothed(motion: npt.NDArray[np.float32], head: Sequence[int]) -> npt.NDArray[np.float32]:
+    """Savitzky–Golay filters over time: parabolas over 5 frames, for the head cubics over 9.
+
+    Motion that is shorter than a filter is left as it is by it.
+    """
+    from scipy.signal import savgol_filter
+
+    result = savgol_filter(motion, 5, 2, axis=0) if len(motion) >= 5 else motion.copy()
+    if len(motion) >= 9 and head:
+        result[:, list(head)] = savgol_filter(motion[:, list(head)], 9, 3, axis=0)
+    return np.asarray(result, np.float32)
+
+
+# The generator.
+
+
+class PastAttention(nn.Module):
+    """Attention of a chunk's tokens to those of the chunks before and to each other, by the angle between them.
+
+    Args:
+        dim: channels.
+        num_heads: attention heads.
+    """
+
+    def __init__(self, dim: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.scale = nn.Parameter(torch.full((1, num_heads, 1, 1), math.log(4.0)))
+        self.query, self.value, self.proj = nn.Linear(dim, dim), nn.Linear(dim, dim), nn.Linear(dim, dim)
+        self.key = nn.Linear(dim, dim, bias=False)
+
+    def forward(
+        self, x: Float[Tensor, "batch tokens dim"], memory: Float[Tensor, "batch past dim"], mask: Tensor
+    ) -> Float[Tensor, "batch tokens dim"]:
+        """What is added to the tokens; ``mask`` is added to the scores of past and present tokens."""
+        both = torch.cat([memory, x], 1)
+        query, key, value = (
+            mapped.unflatten(2, (self.num_heads, -1)).transpose(1, 2)
+            for mapped in (self.query(x), self.key(both), self.value(both))
+        )
+        query = F.normalize(query, dim=3) * self.scale.clamp_max(LARGEST_SCALE).exp()
+        mixed = F.scaled_dot_product_attention(query, F.normalize(key, dim=3), value, attn_mask=mask, scale=1.0)
+        result: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
+        return result
+
+
+class ModulatedBlock(nn.Module):
+    """Attention and a map of each token, which the token's speech scales and shifts.
+
+    Args:
+        dim: channels.
+        audio_width: channels of the speech.
+        num_heads: attention heads.
+        hidden: channels between the two maps.
+    """
+
+    def __init__(self, dim: int, audio_width: int, num_heads: int, hidden: int) -> None:
+        super().__init__()
+        self.attention = PastAttention(dim, num_heads)
+        self.feed_forward = nn.Sequential(nn.Linear(dim, hidden), nn.GELU("tanh"), nn.Linear(hidden, dim))
+        self.modulation = nn.Sequential(nn.SiLU(), nn.Linear(audio_width, 6 * dim))
+        self.norm = nn.LayerNorm(dim, eps=1e-6, elementwise_affine=False)
+
+    def forward(self, x: Tensor, memory: Tensor, audio: Tensor, mask: Tensor) -> Float[Tensor, "batch tokens dim"]:
+        """Tokens after the block."""
+        gate, gate_map, scale, scale_map, shift, shift_map = self.modulation(audio).chunk(6, 2)
+        x = x + gate * self.attention(self.norm(x) * (1 + scale) + shift, memory, mask)
+        mapped: Tensor = self.feed_forward(self.norm(x) * (1 + scale_map) + shift_map)
+        return x + gate_map * mapped
+
+
+class BitGenerator(nn.Module):
+    """Bits of a chunk's tokens from the tokens, those of the chunks before, and speech.
+
+    Args:
+        code_dim: bits of a token.
+        style_dim: channels of the style.
+        audio_width: channels of the speech.
+        dim: channels of the tokens.
+        num_layers: blocks.
+        num_heads: attention heads.
+        feed_forward_dim: channels between the two maps of a block.
+        scales: tokens of each rate.
+        memory_chunks: chunks before.
+    """
+
+    mask: Tensor
+    levels: Tensor
+
+    def __init__(
+        self,
+        *,
+        code_dim: int,
+        style_dim: int,
+        audio_width: int,
+        dim: int,
+        num_layers: int,
+        num_heads: int,
+        feed_forward_dim: int,
+        scales: Sequence[int],
+        memory_chunks: int,
+    ) -> None:
+        super().__init__()
+        self.memory_chunks, self.code_dim = memory_chunks, code_dim
+        count, deviation = sum(scales), math.sqrt(1 / (3 * dim))
+        self.code_in, self.style_in = nn.Linear(code_dim, dim), nn.Linear(style_dim, dim)
+        self.no_style = nn.Parameter(torch.randn(1, 1, dim) * 0.5)
+        self.positions = nn.Parameter(torch.randn(1, count, dim) * deviation)
+        self.past_positions = nn.Parameter(torch.randn(1, count * memory_chunks, dim) * deviation)
+        self.level_table = nn.Parameter(torch.randn(len(scales), dim) * deviation)
+        self.blocks = nn.ModuleList(
+            ModulatedBlock(dim, audio_width, num_heads, feed_forward_dim) for _ in range(num_layers)
+        )
+        self.modulation = nn.Sequential(nn.SiLU(), nn.Linear(audio_width, 2 * dim))
+        self.norm = nn.LayerNorm(dim, eps=1e-6, elementwise_affine=False)
+        self.bits_out = nn.Linear(dim, 2 * code_dim)
+        levels = torch.repeat_interleave(torch.arange(len(scales)), torch.tensor(list(scales)))
+        # A token sees all of the past, and of its own chunk what is as coarse as itself or coarser.
+        finer = torch.zeros(count, count).masked_fill(levels[:, None] < levels, -torch.inf)
+        self.register_buffer("mask", F.pad(finer, (count * memory_chunks, 0)), persistent=False)
+        self.register_buffer("levels", levels, persistent=False)
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch tokens dim"],
+        memory: Float[Tensor, "batch past dim"],
+        audio: Float[Tensor, "batch tokens width"],
+    ) -> Float[Tensor, "batch tokens bits 2"]:
+        """Scores of either value of every bit.
+
+        Args:
+            tokens: of the rates so far: the style, then for each finer rate what the coarser ones stand for.
+            memory: tokens of the chunks before.
+            audio: speech of the tokens.
+        """
+        count, level = tokens.shape[1], self.level_table[self.levels]
+        memory = memory + level.repeat(self.memory_chunks, 1) + self.past_positions
+        x = tokens + (level + self.positions)[:, :count]
+        mask = self.mask[:count, : memory.shape[1] + count]
+        for block in self.blocks:
+            x = block(x, memory, audio, mask)
+        scale, shift = self.modulation(audio).chunk(2, 2)
+        scores: Tensor = self.bits_out(self.norm(x) * (1 + scale) + shift)
+        return scores.unflatten(2, (self.code_dim, 2))
+
+
+# The authors' checkpoints.
+
+BLOCK_NAMES = (
+    ("attn.scale_mul_1H11", "attention.scale"),
+    ("attn.", "attention."),
+    ("ffn.", "feed_forward."),
+    ("ada_lin.", "modulation."),
+)
+
+CODEC_NAMES = (
+    ("inp_mapping.", "first."),
+    ("encoder_transformer.", "blocks."),
+    ("decoder_transformer.", "blocks."),
+    ("code_mapping.", "last."),
+    ("out_mapping.", "last."),
+)
+
+
+def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
+    """ARTalk's tensors under the names of this file, and its options."""
+    level = weights.get("lvl_idx").flatten().long()
+    scales = [int(count) for count in torch.bincount(level)]
+    _, past, dim = weights.shape("prev_pos_embed", 3)
+    first = next((name for name in weights.tensors if name.endswith("feature_extractor.conv_layers.0.conv.weight")), "")
+    prefix = first.removesuffix("feature_extractor.conv_layers.0.conv.weight") or "audio_encoder."
+    encoder = weights.backbone(prefix, kind="wav2vec2", facts=facts, **ARTalk.encoder_settings())
+    for part in ("encoder", "decoder"):
+        weights.move_all(f"basic_vae.{part}.", f"codec.{part}.", CODEC_NAMES)
+    for old, new in (
+        ("basic_vae.enc_pos_embed", "codec.encoder_positions"),
+        ("basic_vae.dec_pos_embed", "codec.decoder_positions"),
+        ("basic_vae.motion_mean", "codec.motion_mean"),
+        ("basic_vae.motion_std", "codec.motion_std"),
+        ("style_encoder.motion_mean", "style_mean"),
+        ("style_encoder.motion_std", "style_std"),
+        ("null_style_cond", "generator.no_style"),
+        ("pos_embed", "generator.positions"),
+        ("prev_pos_embed", "generator.past_positions"),
+        ("lvl_embed.weight", "generator.level_table"),
+    ):
+        weights.move(old, new)
+    for old, new in (
+        ("vqfeat_embed.", "code_in."),
+        ("style_cond_embed.", "style_in."),
+        ("logits_head.", "bits_out."),
+        ("cond_logits_head.ada_lin.", "modulation."),
+    ):
+        weights.move_all(old, f"generator.{new}")
+    weights.move_all("attn_blocks.", "generator.blocks.", BLOCK_NAMES)
+    rows = convert_style(weights, "style_encoder.", "style_encoder.")
+    for name in ("attn_bias_for_masking", "basic_vae.attn_mask"):
+        weights.ignore(name, "follows from the rates")
+    weights.add("motion_mean", weights.get("basic_vae.motion_mean"))
+    weights.add("motion_std", weights.get("basic_vae.motion_std"))
+    style_dim, _ = weights.shape("style_encoder.encoder.motion_proj.weight")
+    codec_dim, _ = weights.shape("basic_vae.encoder.inp_mapping.0.weight")
+    return {
+        "audio_encoder": encoder,
+        "dim": dim,
+        "num_layers": count_layers(weights, "attn_blocks."),
+        "num_heads": weights.shape("attn_blocks.0.attn.scale_mul_1H11", 4)[1],
+        "feed_forward_dim": weights.shape("attn_blocks.0.ffn.0.weight")[0],
+        "scales": scales,
+        "code_dim": weights.shape("vqfeat_embed.weight")[1],
+        "codec_dim": codec_dim,
+        "codec_layers": count_layers(weights, "basic_vae.encoder.encoder_transformer.") // 2,
+        "style_dim": style_dim,
+        "style_layers": count_layers(weights, "style_encoder.encoder.transformer.layers."),
+        "style_rows": rows,
+        "memory_chunks": past // sum(scales),
+    }
+
+
+register(
+    Recogniser(
+        method="ARTalk",
+        marks=("basic_vae.enc_pos_embed", "prev_pos_embed", "vqfeat_embed.weight"),
+        unless=(),
+        convert=convert,
+        vertices=lambda weights: weights.shape("basic_vae.motion_mean", 1)[0],
+        count=lambda _: 0,
+        frame_rate=25.0,
+        space=lambda _: layout("flame_artalk"),
+        licence="MIT",
+        commercial="allowed",
+        licence_source="github.com/xg-chu/ARTalk",
+    )
+)

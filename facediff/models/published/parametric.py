@@ -1,0 +1,111 @@
+"""What the published methods in parameters have in common: standardised channels, of which a network sees some."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from facediff.data import Batch, SpeechMotionDataModule
+from facediff.models.evaluation import IdentityPolicy
+from facediff.models.published.base import Alignment, PublishedModel
+from facediff.speech.frame_clock import FrameClock
+
+DEAD = 0.01
+"""Channels whose deviation is a smaller share than this of the largest are divided by that share of it: a channel that
+hardly moves would otherwise be blown up to noise."""
+
+
+class ParametricModel(PublishedModel):
+    """Base of the published methods that generate parameters, in windows of their own and of speech of any length.
+
+    Args:
+        head: generate the head's rotation, where the space has one; else it stays at rest.
+        jaw: of a jaw's axis-angle: ``all``, or its ``x`` alone, the others being their mean.
+        shape_dim: coefficients of a person's shape that the network is conditioned on.
+        alignment: speech is interpolated to the frames.
+        unseen_identity: as in :class:`facediff.models.AnimationModel`; the methods know a speaker by a style clip.
+        options: those of :class:`~facediff.models.published.base.PublishedModel`.
+    """
+
+    motion_mean: Tensor
+    motion_std: Tensor
+    shapes: Tensor
+
+    def __init__(
+        self,
+        *,
+        head: bool = True,
+        jaw: str = "x",
+        shape_dim: int = 0,
+        alignment: Alignment = "interpolated",
+        unseen_identity: IdentityPolicy = "style_only",
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(alignment=alignment, unseen_identity=unseen_identity, **options)
+        self.plan_long_speech("extend")  # the methods cut speech into windows by themselves
+        numbers = self.n_vertices * self.dims
+        turned = () if self.space.is_vertices else self.space.rotations
+        still = {place for turn in turned if turn.joint == "head" and not head for place in turn.channels}
+        for turn in turned:
+            if turn.joint == "jaw" and turn.form == "axis_angle" and jaw == "x":
+                still |= {*turn.channels[1:]}
+        self.modelled = tuple(place for place in range(numbers) if place not in still)
+        turning = self.space.head if not self.space.is_vertices else ()
+        self.head_places = tuple(i for i, place in enumerate(self.modelled) if place in turning)
+        self.resting = () if head else tuple(turning)
+        self.register_buffer("motion_mean", torch.zeros(numbers))
+        self.register_buffer("motion_std", torch.ones(numbers))
+        self.register_buffer("shapes", torch.zeros(len(self.identities), shape_dim))
+
+    def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
+        """Take the mean and the deviation of every channel from the training split."""
+        result = super().measure(data, at_least)
+        mean, components = data.principal_motion(len(self.motion_mean))
+        deviation = components.square().sum(0).sqrt()
+        self.motion_mean.copy_(mean)
+        self.motion_std.copy_(deviation.clamp_min(DEAD * float(deviation.max())))
+        return result
+
+    @property
+    def clock(self) -> FrameClock:
+        """Whole frames of the speech."""
+        return FrameClock(self.frame_rate)
+
+    def standardised(self, motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames channels"]:
+        """The channels that the network sees, with zero mean and unit deviation."""
+        return ((motion.flatten(2) - self.motion_mean) / self.motion_std)[..., list(self.modelled)]
+
+    def absolute(self, motion: Float[Tensor, "frames channels"]) -> Float[Tensor, "frames points dims"]:
+        """The inverse of :meth:`standardised`; channels that the network does not see have their mean, a still head 0."""
+        whole = motion.new_zeros(len(motion), len(self.motion_mean))
+        whole[:, list(self.modelled)] = motion
+        whole = whole * self.motion_std + self.motion_mean
+        whole[:, list(self.resting)] = 0.0
+        return whole.view(len(whole), self.n_vertices, self.dims)
+
+    def shapes_of(self, batch: Batch) -> Float[Tensor, "batch shape_dim"]:
+        """Each clip's coefficients of shape; those of the first identity for an unknown one."""
+        return self.shapes[batch.identity.clamp_min(0)]
+
+
+def window_at(
+    values: Float[Tensor, "batch frames width"], lengths: Int[Tensor, " batch"], first: Int[Tensor, " batch"], size: int
+) -> tuple[Float[Tensor, "batch size width"], Bool[Tensor, "batch size"]]:
+    """A window of each clip and which of its frames are the clip's; the others are zero."""
+    places = first[:, None] + torch.arange(size, device=values.device)
+    valid = places < lengths[:, None]
+    rows = torch.arange(len(values), device=values.device)[:, None]
+    return values[rows, places.clamp_max(values.shape[1] - 1)] * valid[..., None], valid
+
+
+def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Tensor, Tensor]:
+    """Mean and deviation of some arrays of a file of statistics (``exp_mean``, ``exp_std`` …), one after the other."""
+    mean, deviation = (
+        torch.cat([torch.as_tensor(content[f"{key}_{name}"]).float().flatten() for key in keys])
+        for name in ("mean", "std")
+    )
+    return mean, deviation.clamp_min(1e-9)
