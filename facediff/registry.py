@@ -272,7 +272,9 @@ model = Kind(
     "model",
     "facediff.models.dual_path "
     "facediff.models.style_content "
+    "facediff.models.published.artalk "
     "facediff.models.published.codetalker facediff.models.published.codetalker_checkpoints "
+    "facediff.models.published.diffposetalk "
     "facediff.models.published.diffspeaker "
     "facediff.models.published.emotalk "
     "facediff.models.published.facediffuser "

@@ -9,7 +9,9 @@ if TYPE_CHECKING:
     from facediff.models.checkpoint import load_model as load_model
     from facediff.models.dual_path import DualPathDiffusion as DualPathDiffusion
     from facediff.models.inference import Style as Style
+    from facediff.models.published.artalk import ARTalk as ARTalk
     from facediff.models.published.codetalker import CodeTalker as CodeTalker
+    from facediff.models.published.diffposetalk import DiffPoseTalk as DiffPoseTalk
     from facediff.models.published.diffspeaker import DiffSpeaker as DiffSpeaker
     from facediff.models.published.emotalk import EmoTalk as EmoTalk
     from facediff.models.published.facediffuser import FaceDiffuser as FaceDiffuser
@@ -29,7 +31,9 @@ __getattr__, __dir__, __all__ = lazy_names(
         "checkpoint": "load_model",
         "dual_path": "DualPathDiffusion",
         "inference": "Style",
+        "published.artalk": "ARTalk",
         "published.codetalker": "CodeTalker",
+        "published.diffposetalk": "DiffPoseTalk",
         "published.diffspeaker": "DiffSpeaker",
         "published.emotalk": "EmoTalk",
         "published.facediffuser": "FaceDiffuser",

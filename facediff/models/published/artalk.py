@@ -31,9 +31,14 @@ from facediff.models.published.base import NO_STYLE
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style
 from facediff.models.published.diffposetalk import count_layers
 from facediff.models.published.parametric import ParametricModel, window_at
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.published.recognition import (
+    AuthorsWeights,
+    CheckpointFacts,
+    Recogniser,
+    parametric_faces,
+    register,
+)
 from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.spaces.layouts import layout
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
@@ -248,7 +253,9 @@ class ARTalk(ParametricModel):
             counted = self.counted_tokens(valid)
             entropy = F.cross_entropy(logits.permute(0, 3, 1, 2), bits, reduction="none").mean(2)
             terms["bits"] = (entropy * counted).sum() / counted.sum().clamp_min(1)
-            terms["accuracy"] = ((logits.argmax(3) == bits).float().mean(2) * counted).sum() / counted.sum().clamp_min(1)
+            terms["accuracy"] = ((logits.argmax(3) == bits).float().mean(2) * counted).sum() / counted.sum().clamp_min(
+                1
+            )
             total = total + terms["bits"]
         terms["loss"] = total
         return terms
@@ -323,10 +330,11 @@ class ARTalk(ParametricModel):
             progress: wraps the iteration over chunks.
         """
         count = max(1, math.ceil(self.frames_of(len(audio)) / self.scales[-1]))
-        chunks = F.pad(audio, (0, max(0, count * self.chunk_samples - len(audio)))).split(self.chunk_samples)[:count]
+        size = self.chunk_samples
+        filled = F.pad(audio, (0, max(0, count * size - len(audio))))
         state, parts, logits = self.begin(style), [], []
         for number in progress(range(count)) if progress is not None else range(count):
-            motion, given, state = self.next_chunk(chunks[number], style, state)
+            motion, given, state = self.next_chunk(filled[number * size : (number + 1) * size], style, state)
             parts.append(motion)
             logits.append(given)
         return torch.cat(parts)[: self.frames_of(len(audio))], torch.stack(logits)
@@ -515,7 +523,7 @@ class BitGenerator(nn.Module):
             x = block(x, memory, audio, mask)
         scale, shift = self.modulation(audio).chunk(2, 2)
         scores: Tensor = self.bits_out(self.norm(x) * (1 + scale) + shift)
-        return scores.unflatten(2, (self.code_dim, 2))
+        return scores.view(*scores.shape[:2], self.code_dim, 2)
 
 
 # The authors' checkpoints.
@@ -572,6 +580,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
         weights.ignore(name, "follows from the rates")
     weights.add("motion_mean", weights.get("basic_vae.motion_mean"))
     weights.add("motion_std", weights.get("basic_vae.motion_std"))
+    weights.add("shapes", torch.zeros(len(facts.identities), 0))
     style_dim, _ = weights.shape("style_encoder.encoder.motion_proj.weight")
     codec_dim, _ = weights.shape("basic_vae.encoder.inp_mapping.0.weight")
     return {
@@ -599,8 +608,9 @@ register(
         convert=convert,
         vertices=lambda weights: weights.shape("basic_vae.motion_mean", 1)[0],
         count=lambda _: 0,
-        frame_rate=25.0,
-        space=lambda _: layout("flame_artalk"),
+        faces=lambda weights, options: parametric_faces(
+            "ARTalk", "flame_artalk", len(options.identities or [""]), 25.0, "", options, weights.source
+        ),
         licence="MIT",
         commercial="allowed",
         licence_source="github.com/xg-chu/ARTalk",

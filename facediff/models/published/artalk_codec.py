@@ -91,7 +91,13 @@ class BitCodec(nn.Module):
     motion_std: Tensor
 
     def __init__(
-        self, channels: int, scales: Sequence[int], code_dim: int = 32, dim: int = 512, depth: int = 8, num_heads: int = 8
+        self,
+        channels: int,
+        scales: Sequence[int],
+        code_dim: int = 32,
+        dim: int = 512,
+        depth: int = 8,
+        num_heads: int = 8,
     ) -> None:
         super().__init__()
         self.scales, self.code_dim, self.frames = tuple(scales), code_dim, scales[-1]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -22,10 +23,16 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Progress, Style
+from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.base import NO_STYLE
-from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style, style_contrast
+from facediff.models.published.clip_style import (
+    TABLE_ROWS,
+    ClipStyleEncoder,
+    StylePositions,
+    convert_style,
+    style_contrast,
+)
 from facediff.models.published.diffposetalk_network import (
     Condition,
     CosineProcess,
@@ -36,11 +43,13 @@ from facediff.models.published.diffposetalk_network import (
     clamped,
     guided,
 )
-from facediff.models.published.parametric import ParametricModel, window_at
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.published.import_options import ImportOptions
+from facediff.models.published.parametric import ParametricModel, statistics_of, window_at
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, FaceFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces.layouts import layout
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.ranges import Range
 
 Weight = Annotated[float, Range(0, 1e9)]
@@ -141,7 +150,9 @@ class DiffPoseTalk(ParametricModel):
         if context > window:
             raise ArgumentError({"context": context, "window": window}, "a window must hold the context of the next")
         if threshold is not None and not (len(threshold) == 3 and 0 <= threshold[0] <= 1):
-            raise ArgumentError({"threshold": list(threshold)}, "expected a quantile and two bounds, such as 0.99, 1, 4")
+            raise ArgumentError(
+                {"threshold": list(threshold)}, "expected a quantile and two bounds, such as 0.99, 1, 4"
+            )
         self.window_frames, self.context = window, context
         self.padding, self.speech_context = padding, speech_context
         self.guiding: tuple[Condition, ...] = tuple(name for name in ("audio", "style") if name in conditions)
@@ -260,9 +271,7 @@ class DiffPoseTalk(ParametricModel):
     def _randint(self, bound: int, count: int, generator: torch.Generator | None) -> Int[Tensor, " batch"]:
         return torch.randint(0, bound, (count,), device=self.device, generator=generator)
 
-    def _errors(
-        self, predicted: Tensor, clean: Tensor, valid: Bool[Tensor, "batch frames"]
-    ) -> dict[str, Tensor]:
+    def _errors(self, predicted: Tensor, clean: Tensor, valid: Bool[Tensor, "batch frames"]) -> dict[str, Tensor]:
         """Mean squared errors over the valid frames."""
 
         def mean(squares: Tensor, frames: Tensor) -> Tensor:
@@ -361,7 +370,7 @@ class DiffPoseTalk(ParametricModel):
         filled = max(0, math.ceil(missing / unit))
         features = self.hear_wave(audio, size * windows) if self.speech_context else None
         start = draw(audio.new_empty(1, size, len(self.modelled)))
-        before = (self.start_motion, self.start_audio)
+        before: tuple[Tensor, Tensor] = (self.start_motion, self.start_audio)
         parts = []
         for number in progress(range(windows)) if progress is not None else range(windows):
             first = number * size
@@ -405,9 +414,7 @@ class DiffPoseTalk(ParametricModel):
         for step in range(self.process.steps, 0, -1):
             noise = draw(noisy) if step > 1 else None
             steps = torch.full((count,), step, device=noisy.device)
-            predicted = self.network(
-                noisy.expand(count, -1, -1), audio, person, wide, steps, real.expand(count, -1)
-            )
+            predicted = self.network(noisy.expand(count, -1, -1), audio, person, wide, steps, real.expand(count, -1))
             if self.threshold is not None:
                 predicted = clamped(predicted, self.window_frames, self.threshold)
             branches = predicted[:, self.context :].split(1)
@@ -472,6 +479,8 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     mask = "denoising_net.alignment_mask"
     width = int((~weights.get(mask).bool())[1].sum()) if mask in weights else 0
     weights.ignore(mask, "follows from the number of frames")
+    for name, value in facts.details.items():
+        weights.add(name, value)
     style_said = weights.arguments(next(name for name in weights.tensors if name.endswith("motion_proj.weight")))
     rows = convert_style(weights, "", "style_encoder.")
     options: dict[str, Any] = {
@@ -504,6 +513,53 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     return options
 
 
+def faces_of(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
+    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised.
+
+    Raises:
+        FaceDiffError: if a file cannot be read, or does not fit.
+    """
+    _, person_dim = weights.shape("denoising_net.person_proj.weight")
+    count = person_dim - weights.shape("null_style_feat", 3)[2]
+    statistics, given = options.statistics, options.templates
+    if statistics is None:
+        raise OptionError.naming(
+            f"{{statistics}}: {weights.source} lacks the statistics of its training motion; give stats_train.npz of its "
+            f"authors"
+        )
+    if not isinstance(statistics, Mapping):
+        statistics = read_arrays(Path(statistics), STATISTICS, remedy="expected stats_train.npz of DiffPoseTalk")
+    motion, deviation = statistics_of(statistics, ("exp", "pose"))
+    mean_shape, shape_deviation = statistics_of(statistics, ("shape",))
+    if len(motion) != 56 or len(mean_shape) != count:
+        raise OptionError.naming(
+            f"{{statistics}}: has {len(motion)} numbers of motion and {len(mean_shape)} of shape; expected 56 (exp 50, "
+            f"pose 6) and {count}"
+        )
+    if given is None:
+        shapes = {"speaker": torch.zeros(count)}
+    elif isinstance(given, Mapping):
+        shapes = {str(name): torch.as_tensor(value).float() for name, value in given.items()}
+    else:
+        path = Path(given)
+        content = open_array(path) if path.suffix == ".npy" else read_arrays(path, ("shape",))["shape"]
+        shapes = {path.stem: torch.as_tensor(content).float()}
+    rows = {name: value[0] if value.dim() == 2 else value for name, value in shapes.items()}
+    if not rows or any(row.shape != (count,) for row in rows.values()):
+        raise OptionError.naming(f"{{templates}}: expected {count} coefficients of FLAME's shape for every speaker")
+    space = layout("flame_diffposetalk")
+    rest = torch.zeros(len(space.channels), 1)
+    details = {
+        "motion_mean": motion,
+        "motion_std": deviation,
+        "shapes": (torch.stack([*rows.values()]) - mean_shape) / shape_deviation,
+    }
+    return FaceFacts("HDTF_TFHP", space, 25.0, list(rows), len(rest), dict.fromkeys(rows, rest), details=details)
+
+
+STATISTICS = tuple(f"{key}_{name}" for key in ("exp", "pose", "shape") for name in ("mean", "std"))
+
+
 def count_layers(weights: AuthorsWeights, *prefixes: str) -> int:
     """Layers whose tensors' names begin so."""
     return len({name.removeprefix(old).partition(".")[0] for old in prefixes for name in weights.names(old)})
@@ -517,8 +573,7 @@ register(
         convert=convert,
         vertices=lambda _: 56,
         count=lambda _: 0,
-        frame_rate=25.0,
-        space=lambda _: layout("flame_diffposetalk"),
+        faces=faces_of,
         licence="none stated",
         licence_source="github.com/DiffPoseTalk/DiffPoseTalk",
     )

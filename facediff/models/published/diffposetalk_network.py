@@ -76,7 +76,9 @@ class PoseDenoiser(nn.Module):
         self.motion_out = nn.Sequential(nn.Linear(dim, dim // 2), nn.GELU(), nn.Linear(dim // 2, channels))
         # The released checkpoints hold this table too, and the authors drop it when they load them.
         self.register_buffer("steps_table", sinusoids(steps + 1, dim), persistent=False)
-        self.register_buffer("memory_mask", frame_alignment(context + window, memory_width) if memory_width else None, persistent=False)
+        self.register_buffer(
+            "memory_mask", frame_alignment(context + window, memory_width) if memory_width else None, persistent=False
+        )
 
     def forward(
         self,

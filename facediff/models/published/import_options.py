@@ -36,10 +36,13 @@ class ImportOptions:
         dataset: what it was trained on, where the number of vertices does not say it; of UniTalker the data set whose
             faces are animated, D3 (ARKit's weights) by default
         identities: training identities in the order of the training command; by default the data set's usual ones
-        templates: neutral faces by speaker (templates.pkl); in Python also arrays (V, 3) or (3V,) by name
+        templates: neutral faces by speaker (templates.pkl), of DiffPoseTalk a speaker's shape (.npy, or an .npz with
+            shape); in Python also arrays by name, (V, 3) or (3V,), or (S,) of shapes
         regions: folder with lve.txt and fdd.txt, the vertices of lips and upper face
         mesh: the data set's mesh, for triangles, so that faces can be drawn
         audio_config: config.json of an audio encoder of unusual size; in Python also its content
+        statistics: means and deviations of DiffPoseTalk's training motion (stats_train.npz), without which nothing has
+            a scale; in Python also the arrays by name
         data_root: folder of UniTalker's data release, with principal components and neutral faces
         template_row: neutral face of that release, by default the published demo's
         hparams: JSON file with what the checkpoint does not say: any of these options by name, audio_config (or
@@ -55,6 +58,7 @@ class ImportOptions:
     regions: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None
     mesh: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None
     audio_config: Annotated[Path | Mapping[str, Any] | None, Option(metavar="FILE", reads=True)] = None
+    statistics: Annotated[Path | Mapping[str, Any] | None, Option(metavar="FILE", reads=True)] = None
     data_root: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None
     template_row: Annotated[int | None, Option(metavar="N"), Range(0, 100_000)] = None
     hparams: Annotated[Path | Mapping[str, Any] | None, Option(metavar="FILE", reads=True)] = None

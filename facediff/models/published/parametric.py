@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -39,7 +39,7 @@ class ParametricModel(PublishedModel):
         self,
         *,
         head: bool = True,
-        jaw: str = "x",
+        jaw: Literal["x", "all"] = "x",
         shape_dim: int = 0,
         alignment: Alignment = "interpolated",
         unseen_identity: IdentityPolicy = "style_only",

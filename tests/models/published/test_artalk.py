@@ -1,0 +1,104 @@
+"""ARTalk against its formulas, on a tiny checkpoint in its authors' layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import savgol_coeffs
+from torch import Tensor
+
+from facediff.data import Reference
+from facediff.models import import_checkpoint
+from facediff.models.published.artalk import ARTalk, smoothed
+from facediff.models.published.artalk_codec import BitCodec
+from tests.fakes import published_parameters as author
+from tests.fakes.published import AUDIO_CONFIG
+
+
+@pytest.fixture(scope="module")
+def state() -> dict[str, Tensor]:
+    return author.artalk_state()
+
+
+@pytest.fixture(scope="module")
+def model(state: dict[str, Tensor], tmp_path_factory: pytest.TempPathFactory) -> ARTalk:
+    path = tmp_path_factory.mktemp("artalk") / "ARTalk_wav2vec.pt"
+    torch.save(state, path)
+    options: dict[str, Any] = {"codec_heads": 2, "audio_config": AUDIO_CONFIG}
+    imported = import_checkpoint(path, **options)
+    assert isinstance(imported, ARTalk)
+    return imported
+
+
+def speech(frames: float) -> Tensor:
+    return 0.1 * torch.randn(int(frames * 640), generator=torch.Generator().manual_seed(2)) + 0.02
+
+
+def style_clip() -> Tensor:
+    return torch.randn(50, 106, generator=torch.Generator().manual_seed(6))
+
+
+def token(model: ARTalk, motion: Tensor | None) -> Tensor:
+    if motion is None:
+        return model.generator.no_style
+    vector = model.encode_style(motion[None, :, :, None], torch.ones(1, len(motion), dtype=torch.bool))
+    return model.generator.style_in(vector)[:, None] * 1.1 - model.generator.no_style * (1.1 - 1.0)
+
+
+@pytest.mark.parametrize(("frames", "styled"), [(23.2, True), (23.2, False), (10, True), (4.5, False)])
+def test_generation_equals_the_formulas(
+    frames: float, styled: bool, model: ARTalk, state: dict[str, Tensor]
+) -> None:
+    motion, audio = style_clip() if styled else None, speech(frames)
+    with torch.no_grad():
+        result, scores = model.animate_wave(audio, token(model, motion))
+        expected, expected_scores = author.artalk_reference(state, audio, motion)
+    torch.testing.assert_close(scores, expected_scores, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_animation_is_smoothed_and_its_jaw_only_opens(model: ARTalk) -> None:
+    audio, clip = speech(23), Reference("clip", style_clip()[..., None])
+    finished = model.animate(audio, identity="speaker0", style=clip).vertices[..., 0]
+    with torch.no_grad():
+        raw, _ = model.animate_wave(audio, token(model, clip.motion[..., 0]))
+    assert finished.shape == (23, 106)
+    assert not finished[:, 104:].any()
+    inner = raw.numpy()
+    five, nine = savgol_coeffs(5, 2), savgol_coeffs(9, 3)
+    np.testing.assert_allclose(finished[8, 7], inner[6:11, 7] @ five[::-1], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(finished[8, 101], inner[4:13, 101] @ nine[::-1], rtol=1e-3, atol=1e-5)
+    assert np.array_equal(smoothed(inner[:3], (100, 101, 102)), inner[:3])
+
+
+def test_bits_give_back_what_they_stand_for() -> None:
+    codec = BitCodec(6, (1, 2, 4), code_dim=4, dim=8, depth=1, num_heads=2)
+    codes = torch.randn(2, 4, 4)
+    total, bits, _ = codec.quantise(codes)
+    torch.testing.assert_close(codec.sums(bits)[-1], total, rtol=1e-5, atol=1e-6)
+    assert bits.shape == (2, 7, 4)
+    assert codec.inputs_of_next(bits).shape == (2, 6, 4)
+
+
+def test_chunk_before_does_not_see_the_next() -> None:
+    codec = BitCodec(6, (1, 2, 4), code_dim=4, dim=8, depth=2, num_heads=2)
+    motion = torch.randn(1, 8, 6)
+    changed = torch.cat([motion[:, :4], motion[:, 4:] + 1.0], 1)
+    with torch.no_grad():
+        torch.testing.assert_close(codec.encode(motion)[:, :4], codec.encode(changed)[:, :4])
+        torch.testing.assert_close(codec.encode(motion)[:, :4], codec.encode(motion[:, :4]), rtol=1e-5, atol=1e-6)
+
+
+def test_tensors_are_as_many_as_the_released_file_has(tmp_path: Path) -> None:
+    # The depth of the released model is 12 blocks, 8 layers of the codec and 4 of the style encoder: 392 own tensors.
+    own = [name for name in author.artalk_state() if not name.startswith("audio_encoder.")]
+    more = 10 * 14 + 2 * 6 * 9 + 2 * 12
+    assert len(own) + more == 392
+    denoiser, style = author.diffposetalk_states(head=True)
+    own = [name for name in denoiser if not name.startswith("audio_encoder.")]
+    assert len(own) + 6 * 18 == 170
+    assert len(style) + 2 * 12 == 51
