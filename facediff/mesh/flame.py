@@ -63,7 +63,10 @@ class Flame:
 
     @classmethod
     def read(cls, path: Path) -> Flame:
-        """Read a model file: FLAME 2019, 2020 or 2023 as distributed (``.pkl``), or ``.npz`` with the same keys."""
+        """Read a model file.
+
+        FLAME 2019, 2020 or 2023 as distributed (``.pkl``), ``.npz`` with the same keys, or ARTalk's ``FLAME_with_eye.pt``.
+        """
         return cls(read_flame_arrays(path))
 
     @property
@@ -180,9 +183,13 @@ def read_flame_arrays(path: Path) -> FlameArrays:
     """Read a model file as :meth:`Flame.read` does."""
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; {HELP}")
-    content = (
-        read_arrays(path, KEYS, remedy=HELP) if path.suffix.lower() == ".npz" else load_pickle(path, stand_ins=PACKAGES)
-    )
+    match path.suffix.lower():
+        case ".npz":
+            content: object = read_arrays(path, KEYS, remedy=HELP)
+        case ".pt":
+            content = read_tensors(path)
+        case _:
+            content = load_pickle(path, stand_ins=PACKAGES)
     if not isinstance(content, Mapping):
         raise FaceDiffError(f"{path}: holds a {type(content).__name__}, no FLAME model; {HELP}")
     absent = [key for key in KEYS if key not in content]
@@ -211,6 +218,18 @@ def read_flame_arrays(path: Path) -> FlameArrays:
         weights=weights,
         faces=faces.astype(np.int32),
     )
+
+
+def read_tensors(path: Path) -> object:
+    """The model in a file of PyTorch's: its tensors as arrays, which may lie under ``flame_model``."""
+    from facediff.utils.torch_files import load_tensors
+
+    with path.open("rb") as stream:
+        content = load_tensors(stream, path)
+    inner = content.get("flame_model", content) if isinstance(content, Mapping) else content
+    if not isinstance(inner, Mapping):
+        return inner
+    return {name: value.numpy() for name, value in inner.items() if hasattr(value, "numpy")}
 
 
 def _numbers(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -249,6 +250,9 @@ def test_model_files_are_read(form: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(arrays.weights, expected["weights"])
     np.testing.assert_array_equal(arrays.parents, [-1, 0, 1, 1, 1])
     parameters = RNG.normal(size=300), RNG.normal(size=(2, 100)), RNG.normal(size=(2, 3))
+    tensors = {"flame_model": {name: torch.from_numpy(value.astype(float)) for name, value in expected.items()}}
+    torch.save({**tensors, "lmk_embeddings": {}}, tmp_path / "FLAME_with_eye.pt")
+    np.testing.assert_array_equal(read_flame_arrays(tmp_path / "FLAME_with_eye.pt").parents, arrays.parents)
     np.testing.assert_allclose(
         Flame.read(path).vertices(*parameters), layer(expected).vertices(*parameters), atol=1e-14
     )

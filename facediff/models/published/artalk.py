@@ -22,9 +22,9 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import ArgumentError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Progress
+from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
 from facediff.models.published.base import NO_STYLE
@@ -39,6 +39,7 @@ from facediff.models.published.recognition import (
     register,
 )
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
@@ -312,9 +313,7 @@ class ARTalk(ParametricModel):
         style, rows = self.style_token(batch), []
         for i, samples in enumerate(batch.audio_lengths.tolist()):
             motion, _ = self.animate_wave(batch.audio[i, :samples], style[i : i + 1], progress)
-            whole = motion.new_zeros(len(motion), self.n_vertices * self.dims)
-            whole[:, list(self.modelled)] = motion
-            rows.append(self.finished(whole).view(len(whole), self.n_vertices, self.dims))
+            rows.append(self.finished(self.placed(motion)).view(len(motion), self.n_vertices, self.dims))
         longest = int(frames.max())
         motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)[:, :longest]
         return F.pad(motion, (0, 0, 0, 0, 0, longest - motion.shape[1]))
@@ -368,6 +367,17 @@ class ARTalk(ParametricModel):
         memory = torch.cat([state.memory[:, own.shape[1] :], own], 1)
         return motion[0], logits[0], ChunkState(again, memory)
 
+    def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
+        """Animate speech of any length while it arrives, chunk by chunk; see the base class."""
+        whole = super().stream(plan=plan, **choices)
+        return ChunkStream(self, whole.clip, seeds=whole.seeds, plan=plan)
+
+    def placed(self, motion: Float[Tensor, "frames modelled"]) -> Float[Tensor, "frames channels"]:
+        """What the codec gives as all channels of the space; the others are 0."""
+        whole = motion.new_zeros(len(motion), self.n_vertices * self.dims)
+        whole[:, list(self.modelled)] = motion
+        return whole
+
     def finished(self, motion: Float[Tensor, "frames channels"]) -> Float[Tensor, "frames channels"]:
         """Motion as the authors' programs write it: smoothed, and with a jaw that only opens."""
         if self.smooth:
@@ -378,6 +388,88 @@ class ARTalk(ParametricModel):
             motion = motion.clone()
             motion[:, places] = 0.0
         return motion
+
+
+class ChunkStream(SpeechStream):
+    """Animates speech that arrives in pieces, chunk by chunk: the very frames that the whole recording gives.
+
+    A frame is certain four seconds and four frames later at most: a chunk, and half of the longest filter.
+
+    Args:
+        model: the animating model.
+        clip: as :class:`~facediff.models.inference.SpeechStream` takes it.
+        seeds: as there; nothing is random.
+        plan: as there; the chunks are the model's own.
+    """
+
+    model: ARTalk
+
+    def __init__(
+        self, model: ARTalk, clip: Batch, *, seeds: Sequence[int] = (0,), plan: WindowPlan | None = None
+    ) -> None:
+        super().__init__(model, clip, seeds=seeds, plan=plan)
+        with torch.inference_mode():
+            self._token = model.style_token(self.clip)
+            self._state = model.begin(self._token)
+        self._wave = self._token.new_zeros(0)
+        self._raw = self._token.new_zeros(0, model.n_vertices * model.dims)  # not smoothed yet
+        self._first = 0  # the frame that it begins with
+
+    @torch.inference_mode()
+    def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
+        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames.
+
+        Raises:
+            FaceDiffError: if the stream was finished.
+        """
+        self._refuse_finished()
+        self._wave = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)])
+        while len(self._wave) >= self.model.chunk_samples:
+            self._next(self._wave[: self.model.chunk_samples], self.model.scales[-1])
+            self._wave = self._wave[self.model.chunk_samples :]
+        end = self._first + len(self._raw)
+        certain = end - LONGEST_FILTER // 2 if end >= LONGEST_FILTER else 0
+        return self._given(certain if self.model.smooth else end)
+
+    @torch.inference_mode()
+    def finish(self, frames: int | None = None) -> Motion:
+        """Give the motion that is left; arguments and errors are those of the base class.
+
+        Raises:
+            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
+                the stream was finished.
+        """
+        self._refuse_finished()
+        self._finished = True
+        left = self.model.frames_of(len(self._wave))
+        if left:
+            self._next(F.pad(self._wave, (0, self.model.chunk_samples - len(self._wave))), left)
+        end = self._first + len(self._raw)
+        total = end if frames is None else frames
+        if not end or total < self.frames:
+            raise FaceDiffError(f"frames: {total} are none, or fewer than the {self.frames} that were given out already")
+        wanted = total - self.frames
+        motion = self._given(end)[:, :wanted]
+        return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
+
+    def _next(self, wave: Tensor, frames: int) -> None:
+        """Animate a chunk, of which so many frames are wanted."""
+        motion, _, self._state = self.model.next_chunk(wave, self._token, self._state)
+        self._raw = torch.cat([self._raw, self.model.placed(motion[:frames])])
+
+    def _given(self, until: int) -> Motion:
+        """The frames up to one that can be smoothed as within the whole recording."""
+        start, end = self.frames, self._first + len(self._raw)
+        finished = self.model.finished(self._raw)[max(0, start - self._first) : max(0, until - self._first)]
+        motion = finished.view(1, len(finished), self.model.n_vertices, self.model.dims)
+        # Frames that later ones are smoothed with stay, and as many as the fit at the very end needs.
+        kept = max(0, min(until - LONGEST_FILTER // 2, end - LONGEST_FILTER))
+        self._raw, self._first = self._raw[max(0, kept - self._first) :], max(kept, self._first)
+        return self._counted([motion.expand(len(self.seeds), -1, -1, -1)])
+
+
+LONGEST_FILTER = 9
+"""Frames of the head's filter."""
 
 
 def smoothed(motion: npt.NDArray[np.float32], head: Sequence[int]) -> npt.NDArray[np.float32]:

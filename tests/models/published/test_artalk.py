@@ -102,3 +102,14 @@ def test_tensors_are_as_many_as_the_released_file_has(tmp_path: Path) -> None:
     own = [name for name in denoiser if not name.startswith("audio_encoder.")]
     assert len(own) + 6 * 18 == 170
     assert len(style) + 2 * 12 == 51
+
+
+@pytest.mark.parametrize("pieces", [[14_720], [100, 3000, 6400, 5220], [6400, 6400, 1920]])
+def test_stream_equals_the_file_bit_for_bit(pieces: list[int], model: ARTalk) -> None:
+    audio, clip = speech(23), Reference("clip", style_clip()[..., None])
+    whole = model.animate(audio, identity="speaker0", style=clip).vertices
+    stream = model.stream(identity="speaker0", style=clip)
+    parts = [stream.feed(part) for part in audio.split(pieces)]
+    assert sum(part.shape[1] for part in parts) == 16  # two chunks but for half of a filter
+    parts.append(stream.finish())
+    assert torch.equal(torch.cat(parts, 1)[0], whole)
