@@ -65,7 +65,8 @@ class Flame:
     def read(cls, path: Path) -> Flame:
         """Read a model file.
 
-        FLAME 2019, 2020 or 2023 as distributed (``.pkl``), ``.npz`` with the same keys, or ARTalk's ``FLAME_with_eye.pt``.
+        FLAME 2019, 2020 or 2023 as distributed (``.pkl``), ``.npz`` with the same keys, or ARTalk's
+        ``FLAME_with_eye.pt``.
         """
         return cls(read_flame_arrays(path))
 

@@ -307,9 +307,9 @@ AUTHORS = "expected a checkpoint as its authors distribute it (.pth, .pth.tar, .
 def read_state_dict(path: Path) -> dict[str, Any]:
     """The tensors of another project's checkpoint by name, on the CPU, without a leading ``module.``.
 
-    A state dict may lie in the file as it is, or under ``state_dict``, ``model`` or ``encoder``. Files with more than tensors and
-    plain data (optimisers, options of a library) are read too: of these objects nothing is imported or run. A file that
-    asks for a function to be called is refused, wherever it asks.
+    A state dict may lie in the file as it is, or under ``state_dict``, ``model`` or ``encoder``. Files with more than
+    tensors and plain data (optimisers, options of a library) are read too: of these objects nothing is imported or run.
+    A file that asks for a function to be called is refused, wherever it asks.
 
     Args:
         path: the file.

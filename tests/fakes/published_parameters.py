@@ -176,7 +176,9 @@ def diffposetalk_speech(s: State, wave: Tensor) -> Tensor:
     """Speech of a wave of whole frames: 20 samples mirrored at either end, twice."""
     for _ in range(2):
         wave = torch.cat([wave[1:21].flip(0), wave, wave[-21:-1].flip(0)])
-    return linear(halved(hidden_of(features_of(wave, s, "audio_encoder."), s, "audio_encoder.")), s, "audio_feature_map")
+    return linear(
+        halved(hidden_of(features_of(wave, s, "audio_encoder."), s, "audio_encoder.")), s, "audio_feature_map"
+    )
 
 
 def diffposetalk_reference(
@@ -216,7 +218,12 @@ def diffposetalk_reference(
         for t in range(STEPS, 0, -1):
             z = draw(x[None])[0] if t > 1 else torch.zeros_like(x)
 
-            def predicted(a: bool, b: bool, x: Tensor = x, speech: Tensor = speech, t: int = t) -> Tensor:
+            def predicted(
+                a: bool,
+                b: bool,
+                state: tuple[Tensor, Tensor, int, Tensor, tuple[Tensor, Tensor]] = (x, speech, t, real, before),
+            ) -> Tensor:
+                x, speech, t, real, before = state
                 person = torch.cat([shape, style if b or "style" not in conditions else no_style])
                 chosen = speech if a or "audio" not in conditions else no_audio
                 whole = denoised(s, x, chosen, person, before, t, real)

@@ -27,7 +27,6 @@ from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
-from facediff.models.published.base import NO_STYLE
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style
 from facediff.models.published.diffposetalk import count_layers
 from facediff.models.published.parametric import ParametricModel, window_at
@@ -35,7 +34,6 @@ from facediff.models.published.recognition import (
     AuthorsWeights,
     CheckpointFacts,
     Recogniser,
-    parametric_faces,
     register,
 )
 from facediff.models.speech_networks import Wav2Vec2Encoder
@@ -197,10 +195,6 @@ class ARTalk(ParametricModel):
         motion = (reference.flatten(2)[:, :STYLE_FRAMES, list(self.modelled)] - self.style_mean) / self.style_std
         style: Tensor = self.style_encoder(motion, mask[:, :STYLE_FRAMES])
         return style
-
-    def default_style(self, identity: str) -> Any:  # noqa: ANN401 - a reference, or a style
-        """The stored reference of an identity; no style, as the model was trained to do without, if there is none."""
-        return self.assets.references.get(identity, NO_STYLE)
 
     def style_token(self, batch: Batch) -> Float[Tensor, "batch 1 dim"]:
         """The first token of every sequence."""
@@ -381,7 +375,7 @@ class ARTalk(ParametricModel):
     def finished(self, motion: Float[Tensor, "frames channels"]) -> Float[Tensor, "frames channels"]:
         """Motion as the authors' programs write it: smoothed, and with a jaw that only opens."""
         if self.smooth:
-            motion = torch.from_numpy(smoothed(motion.cpu().numpy(), self.space.head)).to(motion)
+            motion = torch.from_numpy(smoothed(motion.detach().cpu().numpy(), self.space.head)).to(motion)
         turned = () if self.space.is_vertices else self.space.rotations
         places = [place for turn in turned if turn.joint == "jaw" for place in turn.channels[1:]]
         if self.still_jaw and places:
@@ -447,7 +441,9 @@ class ChunkStream(SpeechStream):
         end = self._first + len(self._raw)
         total = end if frames is None else frames
         if not end or total < self.frames:
-            raise FaceDiffError(f"frames: {total} are none, or fewer than the {self.frames} that were given out already")
+            raise FaceDiffError(
+                f"frames: {total} are none, or fewer than the {self.frames} that were given out already"
+            )
         wanted = total - self.frames
         motion = self._given(end)[:, :wanted]
         return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
@@ -700,9 +696,8 @@ register(
         convert=convert,
         vertices=lambda weights: weights.shape("basic_vae.motion_mean", 1)[0],
         count=lambda _: 0,
-        faces=lambda weights, options: parametric_faces(
-            "ARTalk", "flame_artalk", len(options.identities or [""]), 25.0, "", options, weights.source
-        ),
+        frame_rate=25.0,
+        layout="flame_artalk",
         licence="MIT",
         commercial="allowed",
         licence_source="github.com/xg-chu/ARTalk",

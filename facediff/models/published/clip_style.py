@@ -78,12 +78,10 @@ class ClipStyleEncoder(nn.Module):
         motion = motion[:, : self.longest]
         batch, frames = motion.shape[:2]
         mask = torch.ones(batch, frames, dtype=torch.bool, device=motion.device) if mask is None else mask[:, :frames]
-        if self.positions == "published":
-            # The authors index the table with the number of frames, so one row stands for all of them and the order of
-            # the frames has no influence. Released weights were trained so.
-            rows = self.table[0, mask.sum(1)][:, None]
-        else:
-            rows = self.table[:, :frames]
+        # The authors index the table with the number of frames, so one row stands for all of them and the order of the
+        # frames has no influence. Released weights were trained so.
+        literal = self.positions == "published"
+        rows = self.table[0, mask.sum(1)][:, None] if literal else self.table[:, :frames]
         x = self.dropout(self.motion_in(motion) + rows)
         x = self.transformer(x, src_key_padding_mask=None if bool(mask.all()) else ~mask)
         valid = mask[..., None].to(x)

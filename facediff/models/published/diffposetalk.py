@@ -1,5 +1,7 @@
-"""DiffPoseTalk (Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head Pose Generation via
-Diffusion Models", 2024).
+"""DiffPoseTalk: windows of FLAME's parameters by diffusion, in the style of a clip.
+
+Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head Pose Generation via Diffusion Models",
+2024.
 
 Diffusion over windows of FLAME's parameters, each of which continues the one before it; the style comes from a clip.
 From top to bottom: the model, training, sampling, the authors' checkpoints. The network and the process stand in
@@ -25,7 +27,6 @@ from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
-from facediff.models.published.base import NO_STYLE
 from facediff.models.published.clip_style import (
     TABLE_ROWS,
     ClipStyleEncoder,
@@ -75,7 +76,7 @@ class DiffPoseTalk(ParametricModel):
         style_rows: rows of its table of positions.
         style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
             influence; ``frames`` gives each its own, as was meant.
-        window: frames that are generated in one pass.
+        window_frames: frames that are generated in one pass.
         context: frames before it that the network sees.
         diffusion_steps: noising steps, all of which sampling takes.
         indicator: tell the network which frames fill up the last window.
@@ -120,7 +121,7 @@ class DiffPoseTalk(ParametricModel):
         style_heads: Heads = 4,
         style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
         style_positions: StylePositions = "published",
-        window: Annotated[int, Range(2, 10_000)] = 100,
+        window_frames: Annotated[int, Range(2, 10_000)] = 100,
         context: Annotated[int, Range(1, 10_000)] = 10,
         diffusion_steps: Annotated[int, Range(1, 10_000)] = 500,
         indicator: bool = True,
@@ -147,13 +148,15 @@ class DiffPoseTalk(ParametricModel):
         for width, heads, name in ((dim, num_heads, "dim"), (style_dim, style_heads, "style_dim")):
             if width % heads or width % 2:
                 raise ArgumentError({name: width}, "it must be even, and a multiple of its attention heads")
-        if context > window:
-            raise ArgumentError({"context": context, "window": window}, "a window must hold the context of the next")
+        if context > window_frames:
+            raise ArgumentError(
+                {"context": context, "window_frames": window_frames}, "a window must hold the context of the next"
+            )
         if threshold is not None and not (len(threshold) == 3 and 0 <= threshold[0] <= 1):
             raise ArgumentError(
                 {"threshold": list(threshold)}, "expected a quantile and two bounds, such as 0.99, 1, 4"
             )
-        self.window_frames, self.context = window, context
+        self.window_frames, self.context = window_frames, context
         self.padding, self.speech_context = padding, speech_context
         self.guiding: tuple[Condition, ...] = tuple(name for name in ("audio", "style") if name in conditions)
         self.guidance, self.literal_guidance = guidance, guidance_form == "published"
@@ -191,7 +194,7 @@ class DiffPoseTalk(ParametricModel):
             num_layers=num_layers,
             num_heads=num_heads,
             feed_forward_dim=feed_forward_dim or 4 * dim,
-            window=window,
+            window=window_frames,
             context=context,
             steps=diffusion_steps,
             indicator=indicator,
@@ -223,10 +226,6 @@ class DiffPoseTalk(ParametricModel):
         motion = self.standardised(reference)[:, : self.window_frames]
         style: Tensor = self.style_encoder(motion, mask[:, : self.window_frames])
         return style
-
-    def default_style(self, identity: str) -> Any:  # noqa: ANN401 - a reference, or a style
-        """The stored reference of an identity; no style, as the model was trained to do without, if there is none."""
-        return self.assets.references.get(identity, NO_STYLE)
 
     def given_style(self, batch: Batch) -> Float[Tensor, "batch style_dim"] | None:
         """The batch's styles; None where it has none."""
@@ -260,7 +259,11 @@ class DiffPoseTalk(ParametricModel):
             noise = torch.randn(clean.shape, device=self.device, generator=generator)
             noisy = self.process.noised(clean, step, noise)
             predicted = self.network(noisy, silent, person, before, step, valid.to(clean))
-            errors.append(self._errors(predicted[:, self.context :], clean, valid))
+            # The frames before a window are predicted too; those before the first one have no truth.
+            known = torch.cat([before[0], clean], 1) if number else clean
+            counted = F.pad(valid, (self.context, 0), value=True) if number else valid
+            counted = counted & valid[:, :1]
+            errors.append(self._errors(predicted[:, predicted.shape[1] - known.shape[1] :], known, counted))
             before, first = (clean[:, -self.context :], heard[:, -self.context :]), first + size
         terms |= {name: torch.stack([error[name] for error in errors]).mean() for name in errors[0]}
         terms["loss"] = terms["reconstruction"] + sum(
@@ -491,7 +494,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
         "style_dim": style_dim,
         "style_layers": count_layers(weights, "transformer.layers.", "encoder.transformer.layers."),
         "style_rows": rows,
-        "window": positions - context - 1,
+        "window_frames": positions - context - 1,
         "context": context,
         "diffusion_steps": weights.shape("diffusion_sched.alphas", 1)[0] - 1,
         "indicator": frame_dim > channels,
@@ -524,8 +527,8 @@ def faces_of(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
     statistics, given = options.statistics, options.templates
     if statistics is None:
         raise OptionError.naming(
-            f"{{statistics}}: {weights.source} lacks the statistics of its training motion; give stats_train.npz of its "
-            f"authors"
+            f"{{statistics}}: {weights.source} lacks the statistics of its training motion; give its authors' "
+            f"stats_train.npz"
         )
     if not isinstance(statistics, Mapping):
         statistics = read_arrays(Path(statistics), STATISTICS, remedy="expected stats_train.npz of DiffPoseTalk")

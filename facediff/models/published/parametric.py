@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from facediff.data import Batch, SpeechMotionDataModule
+from facediff.data import Batch, Reference, SpeechMotionDataModule
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.published.base import Alignment, PublishedModel
+from facediff.models.inference import Style
+from facediff.models.person_styles import PersonStyles
+from facediff.models.published.base import NO_STYLE, Alignment, PublishedModel
 from facediff.speech.frame_clock import FrameClock
 
 DEAD = 0.01
@@ -75,12 +77,29 @@ class ParametricModel(PublishedModel):
         """Whole frames of the speech."""
         return FrameClock(self.frame_rate)
 
+    def own_styles(self) -> dict[str, Style]:
+        """None: the methods take a style from a clip, and know no table of speakers."""
+        return {}
+
+    def styled_identities(self) -> list[str]:
+        """Those of whom a style is stored."""
+        return PersonStyles.styled_identities(self)
+
+    def default_style(self, identity: str) -> Reference | Style:
+        """The person's style or the stored reference; no style, as the models train to do without, if there is none."""
+        if identity in self.person_styles or identity in self.assets.references:
+            return PersonStyles.default_style(self, identity)
+        return NO_STYLE
+
     def standardised(self, motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames channels"]:
         """The channels that the network sees, with zero mean and unit deviation."""
         return ((motion.flatten(2) - self.motion_mean) / self.motion_std)[..., list(self.modelled)]
 
     def absolute(self, motion: Float[Tensor, "frames channels"]) -> Float[Tensor, "frames points dims"]:
-        """The inverse of :meth:`standardised`; channels that the network does not see have their mean, a still head 0."""
+        """The inverse of :meth:`standardised`.
+
+        Channels that the network does not see have their mean, and a head that stays still has 0.
+        """
         whole = motion.new_zeros(len(motion), len(self.motion_mean))
         whole[:, list(self.modelled)] = motion
         whole = whole * self.motion_std + self.motion_mean

@@ -58,6 +58,22 @@ METHODS: dict[str, dict[str, Any]] = {
     "DiffSpeaker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "sampling_steps": 8, "smooth": True},
     "Voca": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "components": 8, "channels": (8, 8)},
     "LamAudio2Expression": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "identity_dim": 4},
+    "DiffPoseTalk": {
+        **{"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 2, "num_heads": 2, "style_dim": 8},
+        **{
+            "style_layers": 1,
+            "style_heads": 2,
+            "window_frames": 12,
+            "context": 3,
+            "diffusion_steps": 4,
+            "dropout": 0.0,
+        },
+    },
+    "ARTalk": {
+        **{"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 1, "num_heads": 2, "scales": (1, 3, 12)},
+        **{"code_dim": 4, "codec_dim": 8, "codec_layers": 1, "codec_heads": 2, "style_dim": 8, "style_layers": 1},
+        **{"style_heads": 2},
+    },
     "UniTalker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "style_dim": 4, "components": 0},
 }
 """Options by which each published method is small."""

@@ -50,9 +50,7 @@ def token(model: ARTalk, motion: Tensor | None) -> Tensor:
 
 
 @pytest.mark.parametrize(("frames", "styled"), [(23.2, True), (23.2, False), (10, True), (4.5, False)])
-def test_generation_equals_the_formulas(
-    frames: float, styled: bool, model: ARTalk, state: dict[str, Tensor]
-) -> None:
+def test_generation_equals_the_formulas(frames: float, styled: bool, model: ARTalk, state: dict[str, Tensor]) -> None:
     motion, audio = style_clip() if styled else None, speech(frames)
     with torch.no_grad():
         result, scores = model.animate_wave(audio, token(model, motion))
@@ -63,7 +61,7 @@ def test_generation_equals_the_formulas(
 
 def test_animation_is_smoothed_and_its_jaw_only_opens(model: ARTalk) -> None:
     audio, clip = speech(23), Reference("clip", style_clip()[..., None])
-    finished = model.animate(audio, identity="speaker0", style=clip).vertices[..., 0]
+    finished = model.animate(audio, identity="0", style=clip).vertices[..., 0]
     with torch.no_grad():
         raw, _ = model.animate_wave(audio, token(model, clip.motion[..., 0]))
     assert finished.shape == (23, 106)
@@ -107,8 +105,8 @@ def test_tensors_are_as_many_as_the_released_file_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize("pieces", [[14_720], [100, 3000, 6400, 5220], [6400, 6400, 1920]])
 def test_stream_equals_the_file_bit_for_bit(pieces: list[int], model: ARTalk) -> None:
     audio, clip = speech(23), Reference("clip", style_clip()[..., None])
-    whole = model.animate(audio, identity="speaker0", style=clip).vertices
-    stream = model.stream(identity="speaker0", style=clip)
+    whole = model.animate(audio, identity="0", style=clip).vertices
+    stream = model.stream(identity="0", style=clip)
     parts = [stream.feed(part) for part in audio.split(pieces)]
     assert sum(part.shape[1] for part in parts) == 16  # two chunks but for half of a filter
     parts.append(stream.finish())

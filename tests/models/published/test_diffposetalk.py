@@ -20,14 +20,13 @@ from tests.fakes import published_parameters as author
 from tests.fakes.published import AUDIO_CONFIG
 
 
-def imported(folder: Path, *, head: bool = True, **options: Any) -> DiffPoseTalk:
+def imported(folder: Path, *, head: bool = True) -> DiffPoseTalk:
     shape = 0.5 * torch.randn(author.SHAPE, generator=torch.Generator().manual_seed(3))
     model: AnimationModel = import_checkpoint(
         author.write_diffposetalk(folder, head=head),
         audio_config=AUDIO_CONFIG,
         statistics=author.statistics(),
         templates={"A": shape},
-        **options,
     )
     assert isinstance(model, DiffPoseTalk)
     return model
@@ -90,7 +89,9 @@ def test_coefficients_get_back_what_the_network_does_not_see(head: bool, tmp_pat
         pose[:, :3] = 0.0
     np.testing.assert_allclose(whole[:, 50:], pose, rtol=1e-5, atol=1e-6)
     if head:
-        torch.testing.assert_close(model.standardised(model.absolute(standard)[None])[0], standard, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            model.standardised(model.absolute(standard)[None])[0], standard, rtol=1e-4, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("head", [True, False])

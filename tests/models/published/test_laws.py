@@ -152,7 +152,7 @@ def test_a_trained_model_is_tested_saved_and_loaded(
 
 def test_rows_of_training_identities_may_be_mixed(method: str, make_method: MakeMethod) -> None:
     model = with_assets(make_method(method, **({"noised": "offsets"} if method == "FaceDiffuser" else {})))
-    if not model.personal_modules():
+    if not model.own_styles():
         with pytest.raises(FaceDiffError, match="style"):
             style_from("A:0.3,B:0.7", "A", model)
         return
