@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.data import Batch
+from facediff.data import Batch, Reference
 from facediff.errors import ArgumentError, OptionError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay
@@ -202,7 +202,7 @@ class PublishedModel(AnimationModel):
         rows = torch.eye(len(self.identities))
         return {name: Style(name, row) for name, row in zip(self.identities, rows, strict=True)}
 
-    def default_style(self, identity: str) -> Style:
+    def default_style(self, identity: str) -> Reference | Style:
         """A style vector of no numbers, since the method takes no reference motion."""
         return NO_STYLE
 

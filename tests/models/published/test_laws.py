@@ -34,7 +34,7 @@ def clips(*frames: int) -> list[Sample]:
             motion=0.1 * torch.randn(count, VERTICES, 3, generator=generator),
             template=torch.randn(VERTICES, 3, generator=generator),
             identity=(0, 1, -1)[number % 3],
-            reference=torch.zeros(1, VERTICES, 3),
+            reference=0.1 * torch.randn(4, VERTICES, 3, generator=torch.Generator().manual_seed(number)),
             name=f"clip{number}",
             identity_name=(*SEEN, UNSEEN)[number % 3],
             sentence="",
