@@ -253,7 +253,7 @@ def write_distilled(
     goal = "other voices" if options.look_ahead is None else "low latency"
     with progress_bar(goal, options.steps, shown=not quiet) as step:
         error = distil_audio_encoder(model, data, options, step, teacher=teacher)
-    weights = encoder_weights(model)
+    weights = {**encoder_weights(model), **model.fit_to_features(data)}
     # With averaged weights, those of the last step are kept for a training that goes on.
     for key in ("state_dict", "current_model_state"):
         if key in content:

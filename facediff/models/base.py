@@ -265,6 +265,17 @@ class AnimationModel(PersonStyles, ABC):
         """A batch's own style vectors, or else those of its references."""
         return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
 
+    def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:  # noqa: ARG002
+        """Fit again what was fitted to the speech features, after the audio encoder alone was trained.
+
+        Args:
+            data: the corpus of the training, set up.
+
+        Returns:
+            what has changed, by its name in the state dict; by itself a model has nothing of the kind.
+        """
+        return {}
+
     def personal_modules(self) -> list[nn.Module]:
         """The parts that hold identity and style; ``facediff adapt --train person`` trains them alone."""
         return []

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from facediff.models.folding import WeightCache
 from facediff.models.speaker_encoders import mean_and_deviation
 
-MEMORY = 0.998
-"""Share of what is known that stays after a training step: the last 4 000 clips of steps of eight count."""
-RIDGE = 0.03
+MEMORY = 0.999
+"""Share of what is known that stays after a training step: the last 8 000 clips of steps of eight count."""
+RIDGE = 0.3
 """Penalty of the map, as a share of the statistics' variance."""
 USUAL = 3.0
 """Standard deviations up to which a statistic counts; rooms and voices that nobody trained with lie beyond."""
@@ -64,6 +64,7 @@ class SpeechStyle(nn.Module):
         mask: Bool[Tensor, "batch frames"],
         style: Float[Tensor, "batch style_dim"],
         identity: Int[Tensor, " batch"],
+        memory: float = MEMORY,
     ) -> None:
         """Take in the clips of a training step; those of hidden identities are left out.
 
@@ -72,6 +73,7 @@ class SpeechStyle(nn.Module):
             mask: True on valid frames.
             style: their style vectors.
             identity: indices, −1 for hidden.
+            memory: share of what is known that stays.
         """
         known = identity >= 0
         style, identity = style.float()[known], identity[known]
@@ -79,9 +81,14 @@ class SpeechStyle(nn.Module):
             numbers = self._numbers(features[known], mask[known])
             for vector, index in zip(style, identity.tolist(), strict=True):
                 self.counts[index] += 1
-                self.styles[index].lerp_(vector, max(1 / float(self.counts[index]), 1 - MEMORY**8))
-            self.squares.mul_(MEMORY).addmm_(numbers.T, numbers)
-            self.products.mul_(MEMORY).addmm_(numbers.T, style - self.styles[identity])
+                self.styles[index].lerp_(vector, max(1 / float(self.counts[index]), 1 - memory**8))
+            self.squares.mul_(memory).addmm_(numbers.T, numbers)
+            self.products.mul_(memory).addmm_(numbers.T, style - self.styles[identity])
+
+    def forget(self) -> None:
+        """Begin again, without any clip."""
+        for sums in self.buffers():
+            sums.zero_()
 
     def usual(self, identity: int) -> Float[Tensor, " style_dim"] | None:
         """The mean style of a training identity; None if no clip of it was seen."""

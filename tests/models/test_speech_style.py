@@ -152,6 +152,17 @@ def test_step_of_the_graph_hears_the_same(model: DualPathDiffusion, batch: Batch
     torch.testing.assert_close(predicted, expected)
 
 
+def test_fitting_again_takes_each_clips_own_style_once(model: DualPathDiffusion, tiny: Tiny) -> None:
+    changed = model.fit_to_features(tiny)
+    dataset = tiny.dataset("train")
+    assert {name: bool(value.any()) for name, value in changed.items()}["network.speech_style.squares"]
+    assert float(changed["network.speech_style.squares"][-1, -1]) == len(dataset)
+    own = [sample for sample in dataset if sample.identity == 0]
+    vectors = [model.encode_style(s.motion[None], torch.ones(1, len(s.motion), dtype=torch.bool))[0, :-1] for s in own]
+    torch.testing.assert_close(changed["network.speech_style.styles"][0], torch.stack(vectors).mean(0))
+    assert model.fit_to_features(tiny).keys() <= model.state_dict().keys()
+
+
 def test_stream_equals_the_file(model: DualPathDiffusion) -> None:
     model.windows = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
     speech = 0.1 * torch.randn(50_000, generator=torch.Generator().manual_seed(0))

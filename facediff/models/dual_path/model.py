@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Batch, Reference, SpeechMotionDataModule
+from facediff.data import Batch, Reference, SpeechMotionDataModule, collate
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
@@ -578,6 +578,24 @@ class DualPathDiffusion(AnimationModel):
         if learnt is None or identity not in self.assets.identities or identity in self.person_styles:
             return super().default_style(identity)
         return Style("speech", nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))))
+
+    @torch.no_grad()
+    def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:
+        """What speech says of the style, from each training clip's own style.
+
+        Training gathers it on the way, from encoders that still change and styles of other clips in the same mood.
+        """
+        network, speech_style = self.eval().network, self.network.speech_style
+        if speech_style is None:
+            return {}
+        speech_style.forget()
+        dataset = data.dataset("train")
+        for place in range(len(dataset)):
+            batch = collate([dataset[place]]).to(self.device)
+            features = network.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths)
+            style = network.dynamic_style(self._scaled(batch.motion), batch.mask)
+            speech_style.update(features, batch.mask, style, batch.identity, memory=1.0)
+        return {f"network.speech_style.{name}": sums.clone() for name, sums in speech_style.named_buffers()}
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames *numbers"], mask: Bool[Tensor, "batch frames"]
