@@ -12,7 +12,7 @@ from facediff.utils.option import Option
 from facediff.utils.plain_files import load_json
 from facediff.utils.ranges import Range
 
-ALIASES = {"encoder_config": "audio_config"}
+ALIASES = {"encoder_config": "audio_config", "num_attention_heads": "num_heads", "heads": "num_heads"}
 """Names of a file of hyper-parameters that stand for an option of another name."""
 
 HPARAMS: dict[str, Callable[[Any], bool]] = {

@@ -312,7 +312,6 @@ class CheckpointFacts:
         audio_config: configuration of the audio encoder, where the user gives it.
         model_options: options of the model or its audio encoder that the user gives.
         graph: file of the frozen graph that the method needs as well.
-        space: of the motion.
         details: what the method's own faces need, see :class:`FaceFacts`.
     """
 
@@ -323,7 +322,6 @@ class CheckpointFacts:
     audio_config: Mapping[str, Any] | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     graph: Path | None = None
-    space: Space = VERTICES
     details: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -1,0 +1,225 @@
+"""LAM-Audio2Expression from its authors' files gives what a reference of PyTorch's own layers gives."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facediff.errors import FaceDiffError
+from facediff.models import LamAudio2Expression, import_checkpoint
+from facediff.models.published.lam_finishing import CONTEXT_FRAMES, Finishing, damp_mouth, loudness
+from facediff.spaces.layouts import layout
+from tests.models.published.conftest import MEL, TEXT
+
+DIM, PEOPLE, PERSON = 16, 3, 4
+
+
+def speech_of(samples: int) -> Tensor:
+    time = np.arange(samples) / 16_000
+    noise = np.random.default_rng(samples).normal(size=samples)
+    return torch.from_numpy((0.3 * np.sin(1300 * time) * np.sin(9 * time) + 0.02 * noise).astype(np.float32))
+
+
+class Block(nn.Module):
+    """A layer with the authors' names."""
+
+    def __init__(self, inputs: int, residual: bool) -> None:
+        super().__init__()
+        self.conv, self.norm, self.residual = nn.Conv1d(inputs, DIM, 3, padding=1), nn.LayerNorm(DIM), residual
+        if residual and inputs != DIM:
+            self.residual_layer = nn.Sequential(nn.Conv1d(inputs, DIM, 3, padding=1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = self.norm(self.conv(x).transpose(1, 2)).transpose(1, 2)
+        if self.residual:
+            out = out + (self.residual_layer(x) if hasattr(self, "residual_layer") else x)
+        return out.relu()
+
+
+class Author(nn.Module):
+    """The published network by the formulas of its report, with its names."""
+
+    def __init__(self, layers: int) -> None:
+        from transformers import Wav2Vec2Config, Wav2Vec2Model
+
+        super().__init__()
+        self.audio_encoder = Wav2Vec2Model(Wav2Vec2Config(**TEXT, mask_time_prob=0.05))
+        self.audio_encoder.lm_head = nn.Linear(8, 3)
+        self.feature_projection = nn.Linear(8, DIM)
+        self.identity_encoder = nn.Module()
+        self.identity_encoder.id_mlp = nn.Conv1d(PEOPLE, PERSON, 1)
+        self.identity_encoder.first_net = nn.Module()
+        blocks = [Block(DIM + PERSON, True), Block(DIM, True), Block(DIM, True)]
+        self.identity_encoder.first_net.conv_layers = nn.Sequential(*blocks)
+        self.identity_encoder.grus = nn.GRU(DIM, DIM)
+        if layers:
+            layer = nn.TransformerEncoderLayer(DIM, 8, 2 * DIM, batch_first=True)
+            self.identity_encoder.transformer_encoder = nn.TransformerEncoder(layer, layers)
+        self.decoder = nn.ModuleList([nn.Sequential(*(Block(DIM, False) for _ in range(3)))])
+        self.output_proj = nn.Linear(DIM, 52)
+
+    @torch.inference_mode()
+    def forward(self, speech: Tensor, person: int) -> Tensor:
+        frames = math.ceil(len(speech) / 16_000 * 30)
+        network = self.audio_encoder
+        features = F.interpolate(network.feature_extractor(speech[None]), frames, mode="linear", align_corners=True)
+        hidden = network.encoder(network.feature_projection(features.transpose(1, 2))[0]).last_hidden_state
+        x = self.feature_projection(hidden).transpose(1, 2)
+        one_hot = F.one_hot(torch.tensor([person]), PEOPLE).float()[..., None].expand(-1, -1, frames)
+        x = self.identity_encoder.first_net.conv_layers(torch.cat([x, self.identity_encoder.id_mlp(one_hot)], 1))
+        if hasattr(self.identity_encoder, "transformer_encoder"):
+            x = self.identity_encoder.transformer_encoder(x.transpose(1, 2)).transpose(1, 2)
+        return torch.sigmoid(self.output_proj(self.decoder[0](x).transpose(1, 2)))[0]
+
+
+def author(folder: Path, layers: int, prefix: str = "module.backbone.") -> tuple[Author, Path]:
+    torch.manual_seed(layers)
+    made = Author(layers).eval()
+    path = folder / "lam_audio2exp.tar"
+    torch.save({"epoch": 3, "state_dict": {prefix + name: value for name, value in made.state_dict().items()}}, path)
+    return made, path
+
+
+def imported(path: Path, **options: Any) -> LamAudio2Expression:  # noqa: ANN401
+    model = import_checkpoint(path, audio_config=TEXT, **options)
+    assert isinstance(model, LamAudio2Expression)
+    return model
+
+
+@pytest.mark.parametrize(("layers", "prefix"), [(0, "module.backbone."), (2, "backbone."), (0, "")])
+def test_parity(layers: int, prefix: str, tmp_path: Path) -> None:
+    reference, path = author(tmp_path, layers, prefix)
+    model, speech = imported(path, num_heads=8), speech_of(13_270)
+    assert model.space.channels == layout("arkit").channels
+    for person, name in enumerate(model.identities):
+        values = model.animate(speech, identity=name).vertices[..., 0]
+        assert values.shape == (25, 52)  # 24.88 frames
+        torch.testing.assert_close(values, reference(speech, person), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("context", [True, False])
+def test_the_published_stream(context: bool, tmp_path: Path) -> None:
+    """Every chunk is the end of 64 frames: after the speech before it, or after silence as published."""
+    reference, path = author(tmp_path, 0)
+    model = imported(path, chunks="context" if context else "silence")
+    speech, window = speech_of(40_000), 16_000 * CONTEXT_FRAMES // 30
+    parts = []
+    for start in range(0, 40_000, 16_000):
+        chunk = speech[start : start + 16_000]
+        past = speech[:start] if context else speech[:0]
+        heard = torch.cat([torch.zeros(window), past, chunk])[-window:]
+        parts.append(reference(heard, 1)[int(64 - len(chunk) / 16_000 * 30) :])
+    values = model.animate(speech, identity=model.identities[1]).vertices[..., 0]
+    torch.testing.assert_close(values, torch.cat(parts), rtol=0, atol=1e-5)
+
+
+def test_hyperparameters_come_from_one_file(tmp_path: Path) -> None:
+    reference, path = author(tmp_path, 0)
+    file = tmp_path / "hparams.json"
+    file.write_text(json.dumps({"encoder_config": TEXT, "do_normalize": True, "fps": 30}), encoding="utf-8")
+    model = import_checkpoint(path, hparams=file)
+    assert model.audio_encoder.do_normalize
+    speech = speech_of(8000)
+    level = (speech - speech.mean()) / (speech.var(correction=0) + 1e-7).sqrt()
+    values = model.animate(speech, identity="2").vertices[..., 0]
+    torch.testing.assert_close(values, reference(level, 2), rtol=0, atol=1e-5)
+    file.write_text("[]", encoding="utf-8")
+    with pytest.raises(FaceDiffError, match="hparams"):
+        import_checkpoint(path, hparams=file)
+
+
+def test_channels_of_a_range_are_bounded_and_rotations_are_not() -> None:
+    space = layout("live_link")
+    torch.manual_seed(0)
+    model = LamAudio2Expression(
+        n_vertices=61, identities=["A"], frame_rate=30.0, space=space, audio_encoder=MEL, audio_dim=8, dim=8
+    )
+    torch.nn.init.normal_(model.network.motion_out.weight, std=30.0)
+    values = model.network(torch.randn(1, 9, 8), torch.ones(1, 1))[0]
+    assert values[:, list(space.face)].amin() >= 0
+    assert values[:, list(space.face)].amax() <= 1
+    turns = [*space.head, *space.eyes]
+    assert values[:, turns].abs().amax() > 1
+
+
+# What is done with the weights afterwards.
+
+SPACE = layout("arkit")
+
+
+def weights(frames: int) -> np.ndarray:
+    return np.random.default_rng(3).random((frames, 52)).astype(np.float32)
+
+
+def test_loudness_is_the_root_mean_square_around_the_begin_of_a_frame() -> None:
+    speech = speech_of(5000).numpy()
+    volume = loudness(speech, 30.0)
+    assert len(volume) == 10
+    around = speech[3 * 533 - 266 : 3 * 533 + 267]
+    assert volume[3] == pytest.approx(math.sqrt(np.mean(around.astype(float) ** 2)), rel=1e-5)
+
+
+def test_silence_damps_the_mouth_alone() -> None:
+    values, volume = weights(30), np.ones(30, np.float32)
+    volume[10:20] = 0
+    mouth = Finishing.of("mouth", SPACE, 30.0).start(0).mouth
+    damped = damp_mouth(values.copy(), volume, mouth)
+    np.testing.assert_allclose(damped[13:17, mouth], 0.1 * values[13:17, mouth], rtol=1e-6)
+    others = sorted({*range(52)} - {*mouth})
+    np.testing.assert_array_equal(damped[13:17, others], values[13:17, others])
+    np.testing.assert_array_equal(damped[:10], values[:10])
+    # The first silent frame: a quarter of itself and three quarters of the frame before it.
+    expected = 0.75 * values[9, mouth] + 0.25 * 0.1 * values[10, mouth]
+    np.testing.assert_allclose(damped[10, mouth], expected, rtol=1e-5)
+    volume[10:20], volume[3:10] = 1, 0  # seven frames are too few for the first run
+    np.testing.assert_array_equal(damp_mouth(values.copy(), volume, mouth), values)
+
+
+@pytest.mark.parametrize(("step", "sideways"), [("symmetric", True), ("halves", False)])
+def test_left_and_right_are_averaged(step: str, sideways: bool) -> None:
+    values = weights(5)
+    finished = Finishing.of(step, SPACE, 30.0).start(0).whole(values, speech_of(2500).numpy())
+    for left, right, averaged in (("mouthSmileLeft", "mouthSmileRight", True), ("jawLeft", "jawRight", sideways)):
+        pair = [SPACE.index(left), SPACE.index(right)]
+        expected = values[:, pair].mean(1, keepdims=True).repeat(2, 1) if averaged else values[:, pair]
+        np.testing.assert_allclose(finished[:, pair], expected, rtol=1e-6)
+
+
+def test_blinks_follow_numpys_seed() -> None:
+    finished = Finishing.of("blinks", SPACE, 30.0).start(7).whole(weights(20), speech_of(10_500).numpy())
+    np.random.seed(7)  # noqa: NPY002 - what the published code draws from
+    scale, row = np.random.uniform(0.8, 1.0), np.random.randint(0, 4)  # noqa: NPY002
+    lids = finished[:, [8, 9]]
+    assert lids[:7].max() == pytest.approx(scale * (0.956, 0.945, 0.95, 0.953)[row])
+    assert not lids[7:].any()
+
+
+def test_a_parabola_is_left_as_it_is_and_a_stream_leads_away_from_what_was_given() -> None:
+    time = np.arange(20)[:, None] / 20
+    parabola = (0.2 + 0.5 * time * (1 - time)).repeat(52, 1).astype(np.float32)
+    finished = Finishing.of("smooth", SPACE, 30.0).start(0).whole(parabola, speech_of(10_600).numpy())
+    np.testing.assert_allclose(finished[2:-2], parabola[2:-2], atol=1e-6)
+    finish = Finishing.of("smooth", SPACE, 30.0).start(0)
+    one = finish.chunk(np.full((30, 52), 0.8, np.float32), speech_of(16_000).numpy())
+    other = finish.chunk(np.full((30, 52), 0.2, np.float32), speech_of(16_000).numpy())
+    assert one[0, 0] < 0.5  # from rest
+    assert other[0, 0] > 0.5
+    np.testing.assert_allclose(other[10:], 0.2, atol=1e-6)
+
+
+def test_finishing_is_for_arkit(tmp_path: Path) -> None:
+    _, path = author(tmp_path, 0)
+    with pytest.raises(FaceDiffError, match="brows"):
+        imported(path, finish="mouth+brows")
+    with pytest.raises(FaceDiffError, match="finish"):
+        LamAudio2Expression(
+            n_vertices=9, identities=["A"], frame_rate=30.0, audio_encoder=MEL, audio_dim=8, finish="smooth"
+        )

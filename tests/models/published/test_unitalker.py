@@ -1,0 +1,197 @@
+"""UniTalker from its authors' files gives what a reference of PyTorch's own layers gives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facediff.data import collate
+from facediff.errors import FaceDiffError
+from facediff.models import UniTalker, import_checkpoint
+from facediff.models.published.autoregressive import periodic_bias, periodic_positions
+from facediff.models.published.unitalker_checkpoints import DATA
+from facediff.utils.licences import commercial_use
+from tests.fakes.tiny import RATE, SEEN, VERTICES
+from tests.models.published.conftest import MEL, TEXT
+from tests.models.published.test_lam import DIM, Block, speech_of
+from tests.models.published.test_laws import clips, with_assets
+
+ROWS, COMPONENTS, STYLE = 935, 3, 4
+WIDE = {**TEXT, "num_buckets": 8, "max_bucket_distance": 20}
+
+
+class Author(nn.Module):
+    """The published network by the formulas of its report, with its names."""
+
+    def __init__(self, kind: str, decoder: str) -> None:
+        import transformers
+
+        super().__init__()
+        config = getattr(transformers, f"{kind}Config")(**{**WIDE, "model_type": kind.lower()}, mask_time_prob=0.05)
+        self.audio_encoder = getattr(transformers, f"{kind}Model")(config)
+        self.decoder = nn.Module()
+        self.decoder.learnable_style_emb = nn.Embedding(ROWS, STYLE if decoder == "conv" else DIM)
+        self.decoder.audio_feature_map = nn.Linear(8, DIM)
+        self.kind = decoder
+        if decoder == "conv":
+            self.decoder.tcn = nn.Module()
+            self.decoder.tcn.first_net = nn.Module()
+            blocks = [Block(DIM + STYLE, True), Block(DIM, True), Block(DIM, True)]
+            self.decoder.tcn.first_net.conv_layers = nn.Sequential(*blocks)
+        else:
+            self.decoder.PPE = nn.Module()
+            self.decoder.PPE.register_buffer("pe", periodic_positions(3030, DIM, 30)[None])
+            layer = nn.TransformerDecoderLayer(DIM, 4, 2 * DIM, batch_first=True)
+            self.decoder.transformer_decoder = nn.TransformerDecoder(layer, 1)
+        heads = {entry.head: entry.width if entry.layout else COMPONENTS for entry in DATA.values()}
+        self.out_head_dict = nn.ModuleDict({name: nn.Linear(DIM, width) for name, width in heads.items()})
+
+    @torch.inference_mode()
+    def forward(self, speech: Tensor, row: int, key: str) -> Tensor:
+        frames = round(len(speech) / 16_000 * DATA[key].frame_rate)
+        hidden = self.audio_encoder(speech[None]).last_hidden_state.transpose(1, 2)
+        hidden = F.interpolate(hidden, frames, mode="linear", align_corners=True).transpose(1, 2)
+        x = self.decoder.audio_feature_map(hidden)
+        style = self.decoder.learnable_style_emb.weight[row].expand(1, frames, -1)
+        if self.kind == "conv":
+            x = self.decoder.tcn.first_net.conv_layers(torch.cat([x, style], 2).transpose(1, 2)).transpose(1, 2)
+        else:
+            tokens = style + self.decoder.PPE.pe[:, :frames]
+            own = ~torch.eye(frames, dtype=torch.bool)
+            x = self.decoder.transformer_decoder(tokens, x, tgt_mask=periodic_bias(frames, 4, 30), memory_mask=own)
+        return self.out_head_dict[DATA[key].head](x)[0]
+
+
+def author(folder: Path, kind: str = "WavLM", decoder: str = "conv") -> tuple[Author, Path]:
+    torch.manual_seed(5)
+    made, path = Author(kind, decoder).eval(), folder / "UniTalker-B-D0-D7.pt"
+    torch.save(made.state_dict(), path)
+    return made, path
+
+
+def write_release(root: Path, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Neutral faces, mean and components of one data set, as its archive holds them."""
+    entry, generator = DATA[key], np.random.default_rng(1)
+    folder = root / entry.folder
+    folder.mkdir(parents=True)
+    faces = generator.normal(size=(entry.template_row + 1, entry.width)).astype(np.float16)
+    np.save(folder / "id_template.npy", faces)
+    mean, basis = generator.normal(size=entry.width), generator.normal(size=(COMPONENTS + 1, entry.width))
+    pca = {"original_data_mean": mean.astype("f4"), "components_to_data": basis.astype("f4")}
+    np.savez(folder / "pca.npz", **pca, data_components_mean=np.zeros(COMPONENTS + 1))
+    return faces, pca["original_data_mean"], pca["components_to_data"]
+
+
+def imported(path: Path, **options: Any) -> UniTalker:  # noqa: ANN401
+    model = import_checkpoint(path, audio_config=WIDE, **options)
+    assert isinstance(model, UniTalker)
+    return model
+
+
+def first_row(key: str) -> int:
+    return sum(entry.subjects for name, entry in DATA.items() if name < key)
+
+
+@pytest.mark.parametrize("decoder", ["conv", "transformer"])
+def test_parity_of_weights(decoder: str, tmp_path: Path) -> None:
+    reference, path = author(tmp_path, decoder=decoder)
+    speech = speech_of(13_270)
+    for key, channels in (("D3", 52), ("D5", 413), ("D7", 51)):
+        model = imported(path, dataset=key)
+        assert len(model.space.channels) == channels
+        for name, row in ((model.identities[1], first_row(key) + 1), ("common", ROWS - 1)):
+            values = model.animate(speech, identity=name).vertices[..., 0]
+            torch.testing.assert_close(values, reference(speech, row, key), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("key", ["D0", "D2"])
+def test_parity_of_vertices(key: str, tmp_path: Path) -> None:
+    reference, path = author(tmp_path)
+    faces, mean, basis = write_release(tmp_path / "data", key)
+    model, speech, entry = imported(path, dataset=key, data_root=tmp_path / "data"), speech_of(9000), DATA[key]
+    assert commercial_use(model.licences) == "forbidden"
+    coefficients = reference(speech, first_row(key) + 2, key).numpy()
+    face = faces[entry.template_row].astype(np.float32) * np.float32(entry.scale)
+    expected = coefficients @ basis[:COMPONENTS] + mean + face
+    vertices = model.animate(speech, identity=model.identities[2]).vertices.flatten(1)
+    np.testing.assert_allclose(vertices.numpy(), expected, rtol=0, atol=3e-5)
+    with pytest.raises(FaceDiffError, match="data_root"):
+        imported(path, dataset=key)
+    (tmp_path / "data" / entry.folder / "pca.npz").unlink()
+    with pytest.raises(FaceDiffError, match="pca.npz"):
+        imported(path, dataset=key, data_root=tmp_path / "data")
+
+
+@pytest.mark.parametrize("kind", ["WavLM", "Wav2Vec2"])
+def test_long_speech_is_standardised_and_again_in_each_window(kind: str, tmp_path: Path) -> None:
+    """Over 5 s of overlap one window goes over into the next, whose ends are of one window alone."""
+    reference, path = author(tmp_path, kind)
+    speech = speech_of(30 * 16_000) * torch.linspace(0.5, 1.5, 30 * 16_000)
+
+    def heard(piece: Tensor) -> Tensor:
+        level = (piece - piece.mean()) / (piece.var(correction=0) + 1e-7).sqrt()
+        return piece if kind == "WavLM" else level
+
+    pieces = [reference(heard(heard(speech)[a * 16_000 : b * 16_000]), ROWS - 1, "D3") for a, b in ((0, 25), (20, 45))]
+    share = torch.linspace(0, 1, 150)[:, None]
+    shared = (1 - share) * pieces[0][600:] + share * pieces[1][:150]
+    expected = torch.cat([pieces[0][:600], shared, pieces[1][150:]])
+    values = imported(path).animate(speech, identity="common").vertices[..., 0]
+    torch.testing.assert_close(values, expected, rtol=0, atol=1e-5)
+
+
+def test_neutral_values_are_added_to_every_head(tmp_path: Path) -> None:
+    reference, path = author(tmp_path)
+    faces, _, _ = write_release(tmp_path / "data", "D6")
+    file = tmp_path / "data" / "hparams.json"
+    file.write_text(json.dumps({"encoder_config": WIDE, "data_root": ".", "dataset": "D6"}), encoding="utf-8")
+    speech = speech_of(7000)
+    for row in (4, 2):
+        model = import_checkpoint(path, hparams=file, **({} if row == 4 else {"template_row": row}))
+        values = model.animate(speech, identity="common").vertices[..., 0]
+        expected = reference(speech, ROWS - 1, "D6") + torch.from_numpy(faces[row].astype(np.float32))
+        torch.testing.assert_close(values, expected, rtol=0, atol=1e-5)
+    with pytest.raises(FaceDiffError, match="template_row"):
+        import_checkpoint(path, hparams=file, template_row=9)
+
+
+def test_a_file_of_other_speakers_is_asked_about(tmp_path: Path) -> None:
+    made, path = author(tmp_path)
+    state = {**made.state_dict(), "decoder.learnable_style_emb.weight": torch.randn(9, STYLE)}
+    torch.save(state, path)
+    with pytest.raises(FaceDiffError, match="935"):
+        imported(path, dataset="D6")
+    names = [f"S{row}" for row in range(8)]
+    assert imported(path, dataset="D6", identities=names).identities == names
+    with pytest.raises(FaceDiffError, match="D9"):
+        imported(path, dataset="D9")
+
+
+def test_the_loss_counts_vertices_and_their_components() -> None:
+    model = with_assets(
+        UniTalker(
+            **{"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE)},
+            **{"audio_encoder": MEL, "audio_dim": 8, "dim": 8, "style_dim": 4, "components": 4},
+        )
+    )
+    assert isinstance(model, UniTalker)
+    model.eval()
+    basis = torch.linalg.qr(torch.randn(3 * VERTICES, 4, generator=torch.Generator().manual_seed(0)))[0].T * 2
+    mean = torch.full((3 * VERTICES,), 0.1)
+    model.network.attach(mean, basis)
+    codes = torch.randn(1, 3, 4)
+    torch.testing.assert_close(model.network.coefficients(model.network.motion(codes)), codes)
+    batch = collate(clips(9))
+    losses = model.losses(batch)
+    truth = batch.motion.flatten(2)
+    torch.testing.assert_close(losses["reconstruction"], (truth - mean).square().mean())
+    own = (truth - mean) @ basis.T / 4
+    torch.testing.assert_close(losses["components"], own.square().mean())
+    torch.testing.assert_close(losses["loss"], losses["reconstruction"] + 0.01 * losses["components"])
