@@ -40,6 +40,7 @@ def export(
     check_source(source, animations)
 
     from facediff.animation import Animation
+    from facediff.animation.files import has_values
     from facediff.editing.controls import check_controls
     from facediff.export import FORMATS, check_export, write_animations
     from facediff.pipelines.motion import SourceReader
@@ -52,7 +53,7 @@ def export(
         footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
     check_output(files, output.suffix)
     options = replace(files, footer=footer, quiet=quiet)
-    check_export(output, options, len(animations), weights=True)
+    check_export(output, options, len(animations), weights=all(map(has_values, animations)))
     check_controls(controls)
     read = SourceReader(source).read
     finished: list[Animation] = [read(path) for path in animations]
