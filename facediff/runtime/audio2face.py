@@ -64,13 +64,19 @@ class Audio2Face:
         expected = {"input": facts.buffer, "emotion": facts.implicit + len(facts.emotions)}
         ends = {node.name: node.shape for node in session.get_inputs()}
         results = [node.name for node in session.get_outputs()]
-        fits = ends.keys() == expected.keys() and results == ["result"]
-        if not fits or any(len(ends[name]) != 3 or ends[name][1:] != [1, length] for name, length in expected.items()):
+        fits = ends.keys() == expected.keys() and "result" in results
+        # A length that is open has a name in place of a number.
+        if not fits or any(
+            len(shape) != 3
+            or any(isinstance(n, int) and n != own for n, own in zip(shape[1:], (1, expected[name]), strict=True))
+            for name, shape in ends.items()
+        ):
             raise FaceDiffError(
                 f"{folder.network}: takes {quoted(ends)} and gives {quoted(results)}; expected input (B, 1, "
                 f"{expected['input']}) and emotion (B, 1, {expected['emotion']}), and result; {REMEDY}"
             )
         self._batch = 1 if isinstance(ends["input"][0], int) else AT_ONCE
+        self._result = results.index("result")
 
     @classmethod
     def open(cls, folder: str | Path, *, threads: int = 0) -> Audio2Face:
@@ -156,7 +162,7 @@ class Audio2Face:
             rows = slice(first, min(first + self._batch, count))
             windows = np.stack([padded[at : at + facts.buffer] for at in moments[rows]])[:, None]
             inputs = {"input": windows, "emotion": np.ascontiguousarray(emotions[rows][:, None])}
-            (result,) = run_session(self._session, inputs, str(self.folder.network), seconds=len(windows))
+            result = run_session(self._session, inputs, str(self.folder.network), seconds=len(windows))[self._result]
             if result.size != len(windows) * facts.size or result.dtype != np.float32 or not np.isfinite(result).all():
                 raise FaceDiffError(
                     f"{self.folder.network}: gives {result.dtype} {result.shape}; expected {facts.size} finite numbers "

@@ -435,9 +435,9 @@ def _matrix(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str, shape
 
 def _whole(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> npt.NDArray[np.int64]:
     array = arrays.get(name)
-    if array is None or array.dtype.kind not in "iu" or array.ndim != 1:
+    if array is None or array.dtype.kind not in "iu":
         raise FaceDiffError(f"{path}: {name} is missing or no list of whole numbers; {REMEDY}")
-    return array.astype(np.int64)
+    return array.ravel().astype(np.int64)
 
 
 def _names(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> list[str]:

@@ -90,7 +90,8 @@ def check_graph(path: Path, opset: int | None = None, ends: dict[str, list[dict[
 
     Args:
         path: the file.
-        opset: version of the operators; any if None, for models of others, which do not state it elsewhere.
+        opset: version of the operators; any if None, for models of others, which do not state it elsewhere and may name
+            further sets of which they use none.
         ends: inputs and outputs as ``model.json`` describes them; any if None.
 
     Returns:
@@ -128,7 +129,7 @@ class _Reading:
             raise self.refuse("holds functions, expected one graph of plain operators")
         imports = [parse_message(each) for each in _messages(model, 8)]
         found = [(_text(each, 1), integer_field(each, 2)) for each in imports]
-        if [domain for domain, _ in found] != [""] or opset not in (None, found[0][1]):
+        if found != [("", opset)] if opset is not None else [domain for domain, _ in found].count("") != 1:
             version = "" if opset is None else f" of version {quoted(opset)}"
             raise self.refuse(f"has operators of {quoted(found)}, expected ONNX's own{version}")
         graph = parse_message(_single(model, 7))

@@ -245,6 +245,21 @@ def test_open_refuses_a_hostile_folder(tmp_path: Path, named: str, change: Chang
         Audio2Face.open(tmp_path / "model")
 
 
+def test_a_graph_may_name_operators_that_it_does_not_use_and_leave_lengths_open(
+    tmp_path: Path, model: Audio2Face
+) -> None:
+    write_audio2face(tmp_path)
+    network = onnx.load(tmp_path / "network.onnx")
+    network.opset_import.append(onnx.helper.make_opsetid("ai.onnx.ml", 3))
+    network.graph.input[0].type.tensor_type.shape.dim[2].dim_param = "samples"
+    (tmp_path / "network.onnx").write_bytes(network.SerializeToString())
+    np.testing.assert_allclose(Audio2Face.open(tmp_path).infer(SPEECH, 30), model.infer(SPEECH, 30), atol=1e-6)
+    network.graph.node[-1].domain = "ai.onnx.ml"
+    (tmp_path / "network.onnx").write_bytes(network.SerializeToString())
+    with pytest.raises(FaceDiffError, match="operator"):
+        Audio2Face.open(tmp_path)
+
+
 def test_infer_refuses_results_of_another_size(tmp_path: Path) -> None:
     write_audio2face(tmp_path)
     edit(INFO, "params", "num_shapes_tongue", value=2)(tmp_path)
