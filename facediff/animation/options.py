@@ -27,6 +27,7 @@ Scales = str | float | Mapping[str, float]
 FilePath = Path | str
 View = Literal["front", "three_quarter", "side"]
 Up = Literal["y", "z"]
+Tracks = Literal["arkit", "oculus", "vrm"]
 Precision = Literal["32", "bf16"]
 
 # In a union, the first type is that of the command line.
@@ -273,6 +274,7 @@ class ExportOptions(CheckedOptions):
         up: axis that points up in the file (default: y)
         no_speech: omit the sound
         shapes: for .csv and .glb: folder of meshes, .glb with targets, or "puppet" (built in)
+        tracks: for .csv: arkit, or oculus (15 visemes) or vrm (vowels and blinks) as a plain table
         key_tolerance: for weights: leave out keys that a straight line replaces to within so much
         tolerance: for .glb: largest error in mm
         view: for .mp4: camera
@@ -287,6 +289,7 @@ class ExportOptions(CheckedOptions):
     up: Up | None = None
     no_speech: bool = False
     shapes: Annotated[FilePath | None, Option(metavar="SHAPES", reads=True)] = None
+    tracks: Tracks = "arkit"
     key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
     view: View = "front"

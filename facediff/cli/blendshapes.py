@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.animation.options import SourceOptions
+from facediff.animation.options import SourceOptions, Tracks
 from facediff.cli.options import Picture, check_picture_path, check_source
 from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
@@ -30,6 +30,7 @@ def blendshapes(
     region: Annotated[str | None, Option(metavar="NAME")] = None,
     only_arkit: bool = False,
     plain: bool = False,
+    tracks: Tracks = "arkit",
     residual_limit: Annotated[ranges.Strength, Option(metavar="SHARE")] = 0.8,
     key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0,
     csv_rate: Annotated[ranges.FrameRate | None, Option(metavar="F")] = None,
@@ -53,6 +54,7 @@ def blendshapes(
         bounds: limits of weights (default: 0 1)
         region: look at a region of the face only, such as lips
         only_arkit: leave out shapes whose names are not ARKit's
+        tracks: oculus (15 visemes) or vrm (vowels and blinks) in place of the shapes' own weights, as a plain table
         plain: columns time, the set's own names, residuals in mm
         residual_limit: share of the motion that weights may leave before they are refused
         key_tolerance: the .json gets the keys of each curve that a straight line does not replace to within so much
@@ -109,6 +111,8 @@ def blendshapes(
         _ = own.triangles  # refuses an animation without triangles before anything is written
     found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit)
     table = weights if csv_rate is None else weights.at_rate(csv_rate)
+    if tracks != "arkit":
+        table, plain = table.tracks(tracks), True
     table.save(output, plain=plain, key_tolerance=key_tolerance)
     if show is not None:
         from facediff.export.pictures import draw_worst_frame

@@ -17,6 +17,8 @@ from facediff.mesh.mesh import triangle_areas
 from facediff.spaces.arkit import ARKIT, ROTATIONS, absent_from, beyond_arkit, mirror_pairs
 from facediff.spaces.files.tables import live_link_header, timecode
 from facediff.spaces.rigs import LinearRig
+from facediff.spaces.space import Space
+from facediff.spaces.visemes import VisemeSet, visemes
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.plain_files import json_text, write_table
@@ -145,6 +147,22 @@ class Weights:
             frame_rate=frame_rate,
             head=None if self.head is None else np.stack([interpolated(values) for values in self.head.T], axis=1),
         )
+
+    def tracks(self, viseme_set: VisemeSet) -> Weights:
+        """The weights as visemes, ``oculus`` or ``vrm``; see :func:`facediff.spaces.visemes.visemes`.
+
+        Raises:
+            FaceDiffError: if none of the shapes is ARKit's.
+        """
+        columns = [index for index, name in enumerate(self.names) if name in ARKIT]
+        if not columns:
+            raise OptionError.naming(
+                "{shapes}: none of the shapes has a name of ARKit's, from which visemes are computed; rename them"
+            )
+        space = Space("arkit", tuple(self.names[index] for index in columns))
+        values, target = visemes(self.values[:, columns], space, viseme_set)
+        about = {**self.metadata, "tracks": viseme_set}
+        return replace(self, names=target.channels, values=np.asarray(values, np.float64), still=(), metadata=about)
 
     def curves(self, tolerance: float) -> dict[str, tuple[list[float], list[float]]]:
         """Times in seconds and weights of the keys that are enough for each curve by itself, see :func:`key_frames`."""

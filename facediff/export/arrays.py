@@ -67,7 +67,7 @@ class BlendshapeWeights(Format):
     speech = "next to it"
     needs_mesh = False
     needs_shapes = True
-    uses = ("shapes", "key_tolerance")
+    uses = ("shapes", "tracks", "key_tolerance")
     units = "none"
     up_axes = ()
 
@@ -81,7 +81,10 @@ class BlendshapeWeights(Format):
             own_weights(animation).save(path, key_tolerance=options.key_tolerance)
             return
         shapes = read_shapes(Path(options.shapes), animation.template, animation.unit)
-        solve(animation, shapes, SolveOptions()).save(path, key_tolerance=options.key_tolerance)
+        weights = solve(animation, shapes, SolveOptions())
+        if options.tracks != "arkit":
+            weights = weights.tracks(options.tracks)
+        weights.save(path, plain=options.tracks != "arkit", key_tolerance=options.key_tolerance)
 
     def companions(self, path: Path, animation: Animation) -> list[Path]:
         """The .json file."""

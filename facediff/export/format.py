@@ -64,8 +64,8 @@ class Format(ABC):
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
     uses: ClassVar[tuple[str, ...]] = ()
-    """Which of the options ``view``, ``size``, ``tolerance``, ``shapes`` and ``key_tolerance`` the format uses; the
-    command line refuses others."""
+    """Which of the options ``view``, ``size``, ``tolerance``, ``shapes``, ``tracks`` and ``key_tolerance`` it uses;
+    the command line refuses others."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
 

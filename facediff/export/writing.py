@@ -15,7 +15,7 @@ from facediff.export.format import MARK, Format, check_animation, folder_of, spe
 from facediff.export.sequences import RECORD
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
-OPTIONS = ("view", "size", "tolerance", "shapes", "key_tolerance")
+OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance")
 """Options that some formats use."""
 
 

@@ -21,7 +21,9 @@ from pythonosc.osc_packet import OscPacket
 from facediff.errors import FaceDiffError
 from facediff.live.frames import Performance, open_receiver
 from facediff.live.receivers.sending import Outbox
+from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
+from facediff.spaces.visemes import visemes
 from tests.live.conftest import FRAME_RATE, Opened, at_rate, frame, weights_of
 
 SIXTY_ONE = 61
@@ -146,6 +148,14 @@ def test_vmc_names_may_be_arkits_own(opened: Opened, listener: Listener) -> None
     assert [each.params[0] for each in messages(listener.take(2))[2:-1]] == list(ARKIT)
 
 
+def test_vmc_names_may_be_vrms_vowels_and_blinks(opened: Opened, listener: Listener) -> None:
+    opened(f"vmc://127.0.0.1:{listener.port}?names=vrm").send(frame(3))
+    values = {each.params[0]: each.params[1] for each in messages(listener.take(1))[2:-1]}
+    assert list(values) == ["A", "I", "U", "E", "O", "Blink", "Blink_L", "Blink_R"]
+    expected = visemes(weights_of(3)[None], Space("arkit", ARKIT), "vrm")[0][0]
+    np.testing.assert_allclose(list(values.values()), expected, atol=1e-6)
+
+
 def test_plain_osc_has_an_address_for_each_weight(opened: Opened, listener: Listener) -> None:
     opened(f"osc://127.0.0.1:{listener.port}?prefix=/me/face").send(frame(5, dropped=2))
     found = {each.address: each.params for each in messages(listener.take(2))}
@@ -248,7 +258,7 @@ def test_the_usual_ports_of_this_machine(text: str, port: int) -> None:
         ("livelink://127.0.0.1:1/path", "path"),
         ("livelink://127.0.0.1?subject=%C3%BC", "subject"),
         ("livelink://no.such.host.invalid:1", "no.such.host.invalid"),
-        ("vmc?names=vrm", "names"),
+        ("vmc?names=vrn", "names"),
         ("osc?prefix=face", "prefix"),
         ("osc?prefix=/a%00b", "prefix"),
     ],

@@ -12,11 +12,15 @@ import struct
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from facediff.errors import FaceDiffError, choices
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
 from facediff.spaces.arkit import ARKIT, live_link_name
+from facediff.spaces.space import Space
+from facediff.spaces.visemes import SETS, visemes
 
 MOST_BYTES = 1400
 """Of a datagram: more would be split on the way, and lost where one of its parts is lost."""
@@ -75,7 +79,8 @@ class _Osc(UdpReceiver):
         return list(bundles(self.messages(frame)))
 
 
-NAMES = ("perfect_sync", "arkit")
+_SPACE = Space("arkit", ARKIT)
+NAMES = ("perfect_sync", "arkit", "vrm")
 
 
 @receiver.register("vmc")
@@ -83,11 +88,12 @@ class Vmc(_Osc):
     """Avatars by the VMC protocol: VSeeFace, Warudo, VMagicMirror and others; weights of "perfect sync" shapes.
 
     A frame is ``/VMC/Ext/OK 1``, ``/VMC/Ext/T seconds``, a ``/VMC/Ext/Blend/Val name weight`` for each of ARKit's 52
-    shapes, and ``/VMC/Ext/Blend/Apply``, in bundles of at most 1 400 bytes.
+    shapes or each of VRM's vowels and blinks, and ``/VMC/Ext/Blend/Apply``, in bundles of at most 1 400 bytes.
 
     Args:
         address: ``vmc://HOST:PORT``; this machine's port 39539 by default.
-        names: ``perfect_sync`` for JawOpen …, as avatars with perfect sync name their shapes; ``arkit`` for jawOpen ….
+        names: ``perfect_sync`` for JawOpen …, as avatars with perfect sync name their shapes; ``arkit`` for jawOpen …;
+            ``vrm`` for A, I, U, E, O and blinks, which every VRM avatar has.
     """
 
     default_port = 39_539
@@ -96,15 +102,19 @@ class Vmc(_Osc):
         super().__init__(address)
         if names not in NAMES:
             raise FaceDiffError(f"{OPTION} {self.name}: names is {names!r}; {choices(names, NAMES)}")
-        shown = [live_link_name(name) if names == "perfect_sync" else name for name in ARKIT]
+        self._vrm = names == "vrm"
+        arkit = [live_link_name(name) for name in ARKIT] if names == "perfect_sync" else ARKIT
+        shown = SETS["vrm"] if self._vrm else arkit
         # All but the weight, which is the last word.
         self._parts = [message("/VMC/Ext/Blend/Val", name, 0.0)[:-4] for name in shown]
         self._ready, self._apply = message("/VMC/Ext/OK", 1), message("/VMC/Ext/Blend/Apply")
 
     def messages(self, frame: LiveFrame) -> list[bytes]:
         """The messages of a frame, in their order."""
-        weights = self._weights.of(frame).tolist()
-        values = [part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights, strict=True)]
+        weights = self._weights.of(frame)
+        if self._vrm:
+            weights = np.asarray(visemes(weights[None], _SPACE, "vrm")[0][0], np.float32)
+        values = [part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights.tolist(), strict=True)]
         return [self._ready, message("/VMC/Ext/T", float(frame.time)), *values, self._apply]
 
 

@@ -13,7 +13,9 @@ from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
 from facediff.editing.shapes import read_shapes
 from facediff.mesh import read_mesh
+from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
+from facediff.spaces.visemes import visemes
 from facediff.synthetic.arkit import puppet_shapes
 from facediff.synthetic.known_faces import write_puppet_shapes
 
@@ -198,3 +200,18 @@ def test_the_command_counts_frames_and_shapes(
 ) -> None:
     assert main(["blendshapes", str(archive), "-o", str(tmp_path / "w.csv"), "--shapes", str(folder)]) == 0
     assert "w.csv: 12 frames, 52 shapes" in capsys.readouterr().out
+
+
+def test_tracks_of_visemes_from_the_weights(
+    folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    words = [str(archive), "--shapes", str(folder), "--tracks", "vrm"]
+    assert main(["blendshapes", *words, "-o", str(tmp_path / "a.csv"), "--smoothness", "0", "--sparsity", "0"]) == 0
+    table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
+    assert table.dtype.names[:7] == ("time", "A", "I", "U", "E", "O", "Blink")
+    space = Space("arkit", tuple(name for name in known if name in ARKIT))
+    values = np.stack([known[name] for name in space.channels], axis=1)
+    assert table["A"] == pytest.approx(visemes(values, space, "vrm")[0][:, 0], abs=2e-3)
+    assert main(["export", *words, "-o", str(tmp_path / "b.csv")]) == 0
+    assert (tmp_path / "b.csv").read_text().startswith("time,A,I,U,E,O,Blink,Blink_L,Blink_R,")
+    assert main(["export", str(archive), "-o", str(tmp_path / "b.ply"), "--tracks", "vrm"]) == 2
