@@ -289,7 +289,7 @@ model = Kind(
 )
 corpus = Kind(
     "corpus",
-    "facediff.data.puppet facediff.data.biwi facediff.data.vocaset facediff.data.mead3d",
+    "facediff.data.puppet facediff.data.biwi facediff.data.vocaset facediff.data.mead3d facediff.data.parametric",
     "a data set, as a LightningDataModule",
     aliases=False,
 )

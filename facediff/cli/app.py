@@ -96,6 +96,9 @@ COMMANDS = {
     "data pack": Command("facediff.cli.data:pack", "pack a corpus, for object storage and small disks", "packed"),
     "data unpack": Command("facediff.cli.data:unpack", "write the corpus folder that a packed corpus holds", "packed"),
     "data regions": Command("facediff.cli.data:regions", "draw a corpus's lips and upper face on its mesh"),
+    "data import-take": Command(
+        "facediff.cli.data:import_take", "make a recording of Live Link Face a corpus entry", "prepare"
+    ),
     "data import-person": Command(
         "facediff.cli.data:import_person", "make a reconstructed video a corpus entry", "prepare"
     ),

@@ -94,7 +94,8 @@ def check(
 
     Args:
         root: the corpus folder, or a packed corpus: its folder or its address
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, or package.module.Class
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, beat, live_link,
+            flame_clips:LAYOUT, or package.module.Class
         split: count the clips of one way to split the corpus only (3DMEAD: sentence, identity)
         quick: read headers only, and compare files by size
         json: machine-readable: one object
@@ -365,6 +366,44 @@ def import_person(
         progress=not quiet and sys.stderr.isatty(),
     )
     tell(f"{output}: {report.name}", *report.lines(read_manifest(output).get("unit")))
+
+
+# ``facediff data import-take``
+
+
+def import_take(
+    take: Annotated[Path, Option(metavar="TAKE", reads=True)],
+    sound: Annotated[Path, Option(metavar="SOUND", reads=True)],
+    *,
+    name: str,
+    output: OutputFolder,
+    offset: Annotated[ranges.TakeOffset | None, Option(metavar="S")] = None,
+    most_offset: Annotated[ranges.ClipLength, Option(metavar="S")] = 10.0,
+    clip_seconds: Annotated[ranges.ClipLength, Option(metavar="S")] = 8.0,
+) -> None:
+    """Turn a recording of Live Link Face and its sound into a corpus entry.
+
+    Where the motion begins in the sound is found by how the mouth opens when speech is loud, and reported. Any data
+    module of ARKit's shapes takes the entry next to its own speakers (--data.people), `facediff adapt` as --person.
+
+    Args:
+        take: the recording, .csv
+        sound: its sound or its video
+        name: the person's name: letters, digits, dashes
+        output: folder to make
+        offset: seconds of SOUND before the motion begins (default: found)
+        most_offset: largest offset to look for, either way
+        clip_seconds: approximate length of a clip
+    """
+    for argument, path in (("TAKE", take), ("SOUND", sound)):
+        if not path.is_file():
+            raise FaceDiffError(f"{argument} {path}: no such file")
+    from facediff.data.person import import_take as import_recording
+
+    report = import_recording(
+        take, sound, name=name, output=output, offset=offset, most_offset=most_offset, clip_seconds=clip_seconds
+    )
+    tell(f"{output}: {report.name}", *report.lines())
 
 
 # ``facediff data regions``

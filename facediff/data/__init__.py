@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from facediff.data.corpus import Corpus as Corpus
     from facediff.data.datamodule import SpeechMotionDataModule as SpeechMotionDataModule
     from facediff.data.mead3d import Mead3D as Mead3D
+    from facediff.data.parametric import Beat as Beat
+    from facediff.data.parametric import FlameClips as FlameClips
+    from facediff.data.parametric import LiveLink as LiveLink
     from facediff.data.puppet import Puppet as Puppet
     from facediff.data.puppet import PuppetMask as PuppetMask
     from facediff.data.vocaset import Vocaset as Vocaset
@@ -27,6 +30,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "corpus": "Clip Corpus",
         "datamodule": "SpeechMotionDataModule",
         "mead3d": "Mead3D",
+        "parametric": "Beat FlameClips LiveLink",
         "puppet": "Puppet PuppetMask",
         "vocaset": "Vocaset",
     },

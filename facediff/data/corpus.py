@@ -21,6 +21,7 @@ from torch import Tensor
 
 from facediff.data.manifest import LONGEST
 from facediff.data.manifest import read_manifest as read_manifest
+from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
 from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage
 from facediff.errors import FaceDiffError
@@ -137,7 +138,11 @@ class Corpus:
                 raise FaceDiffError(
                     f"{folder}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl"
                 )
-        self._storages: dict[Path, ClipStorage] = {folder: ClipFolder(folder, n_vertices) for folder in people}
+        # An imported speaker in channels is a recording as it came, in whatever order its file has.
+        self._storages: dict[Path, ClipStorage] = {
+            folder: ClipFolder(folder, n_vertices) if space.is_vertices else RecordingFolder(folder, space, frame_rate)
+            for folder in people
+        }
         own = ClipFolder(root, n_vertices) if space.is_vertices else ChannelFolder(root, space)
         self._storages[root] = storage or own
         stored = stored_frame_rate or frame_rate

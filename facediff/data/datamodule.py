@@ -325,10 +325,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The corpus on disk."""
         if not self.root.is_dir():
             raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
-        if not self.space.is_vertices and (self.packed is not None or self.people):
+        if not self.space.is_vertices and self.packed is not None:
             raise FaceDiffError(
-                "data.root: packed corpora and imported speakers hold vertices, and this data module reads channels; "
-                "give the corpus's folder, without data.people"
+                "data.root: packed corpora hold vertices, and this data module reads channels; give the corpus's folder"
             )
         return Corpus(
             self.root,

@@ -25,6 +25,7 @@ from facediff.data.check.layouts import (
     read_record,
 )
 from facediff.data.check.packed import check_packed, examine_packed
+from facediff.data.check.recordings import check_recordings, parametric_module, refuse_layout
 from facediff.data.check.report import FEW, CheckReport, Findings, counted, few, number
 from facediff.data.check.shared import (
     check_account,
@@ -101,6 +102,12 @@ def check(
     report = CheckReport(source, quick)
     manifest = read_record(root, MANIFEST, report.findings)
     state = read_record(root, STATE, report.findings)
+    refuse_layout(corpus)
+    module = parametric_module(root, corpus, manifest) if packed is None else None
+    if module is not None:
+        check_recordings(report, root, module, corpus)
+        report.sort()
+        return report
     folder = list_folder(root, MOTION_FOLDERS) if packed is None else list_packed(packed)
     recorded = manifest.get("corpus", state.get("corpus") if packed is None else packed.record.corpus)
     view = identify(report, folder, recorded, corpus, split, manifest)

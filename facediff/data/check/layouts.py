@@ -273,7 +273,7 @@ def facexhubert_names(names: Sequence[str]) -> list[str]:
 
 
 def _known() -> list[Module]:
-    """Every data module that can be instantiated and names its corpus, facediff's own first."""
+    """Every data module of vertices that can be instantiated and names its corpus, facediff's own first."""
     from facediff import registry
     from facediff.data import SpeechMotionDataModule
 
@@ -285,7 +285,8 @@ def _known() -> list[Module]:
             yield from below(child)
 
     modules = dict.fromkeys(below(SpeechMotionDataModule))
-    concrete = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
+    named = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
+    concrete = [m for m in named if m.space.is_vertices]
     return sorted(concrete, key=lambda module: not module.__module__.startswith("facediff."))
 
 

@@ -78,6 +78,7 @@ class CheckReport:
     frame_rate: float | None = None  # motion frames a second that models see; None if unknown, as the next two
     stored_frame_rate: float | None = None  # motion frames a second on disk
     n_vertices: int | None = None
+    points: str = "vertices"  # what n_vertices counts
     findings: Findings = field(default_factory=Findings)  # errors first, then warnings, then notes
     # one row a split: way, split, expected, present, missing, frames, seconds, missing_clips
     splits: list[dict[str, Any]] = field(default_factory=list)
@@ -152,7 +153,7 @@ def text(report: CheckReport) -> str:
         blocks.append(_splits(report))
     if report.subjects:
         blocks.append(_subjects(report))
-    if report.corpus is not None:
+    if report.corpus is not None and report.points == "vertices":
         blocks.append(_shared_files(report))
     if report.truth:
         columns = ["measure", "value", "people", "source"]
@@ -175,7 +176,9 @@ def _heading(report: CheckReport) -> str:
     if report.stored_frame_rate != report.frame_rate:
         rate += f" ({report.stored_frame_rate:g} on disk)"
     read = "headers only" if report.quick else "all files"
-    return f"{report.root}: {report.corpus}{module}\n{number(report.n_vertices or 0)} vertices, {rate}; {read} read"
+    return (
+        f"{report.root}: {report.corpus}{module}\n{number(report.n_vertices or 0)} {report.points}, {rate}; {read} read"
+    )
 
 
 def _splits(report: CheckReport) -> str:

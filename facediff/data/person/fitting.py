@@ -307,12 +307,12 @@ def read_template(path: Path, target: TargetCorpus) -> TemplateFile:
     return TemplateFile(path, vertices)
 
 
-def loudness(speech: Speech, frames: int, frame_rate: float) -> Array:
-    """Root-mean-square loudness around every frame (T,), averaged over 0.2 s."""
+def loudness(speech: Speech, frames: int, frame_rate: float, smoothing: float = SMOOTHING) -> Array:
+    """Root-mean-square loudness around every frame (T,), averaged over 0.2 s or other seconds."""
     energy = np.concatenate([[0.0], np.cumsum(np.square(speech, dtype=np.float64))])
     middle = (np.arange(frames) + 0.5) / frame_rate
     low, high = (
-        np.clip(((middle + side * SMOOTHING / 2) * SAMPLE_RATE).round().astype(int), 0, len(speech)) for side in (-1, 1)
+        np.clip(((middle + side * smoothing / 2) * SAMPLE_RATE).round().astype(int), 0, len(speech)) for side in (-1, 1)
     )
     return np.sqrt((energy[high] - energy[low]) / np.maximum(high - low, 1))
 

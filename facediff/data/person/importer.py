@@ -91,7 +91,7 @@ def import_person(
     output = output.expanduser().absolute()
     if not NAME.fullmatch(name):
         raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
-    _check_output(output)
+    check_output(output)
     target = read_target_corpus(corpus, name=name, frame_rate=corpus_frame_rate)
     speech = read_speech(audio)
     if float(np.abs(speech).max()) < SILENCE:
@@ -166,7 +166,7 @@ def _fit(
     return FittedSpeaker(stabilised, neutral, place, best.scale, residual, compared)
 
 
-def _check_output(path: Path) -> None:
+def check_output(path: Path) -> None:
     """Refuse, before any work is done, a folder that is not empty or cannot be made."""
     if path.exists() and not path.is_dir():
         raise FaceDiffError(f"{path}: is a file; expected the name of a new folder")

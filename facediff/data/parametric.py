@@ -1,0 +1,195 @@
+"""Corpora in parameters as distributed or recorded: BEAT, takes of Live Link Face, clips of FLAME coefficients.
+
+Nothing is prepared: the files are read as they lie in their folders, each with a sound file of the same name.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+from facediff import registry
+from facediff.data.corpus import Clip, read_clip_table
+from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.data.person.importer import splits
+from facediff.data.recordings import USUAL_SUFFIXES, RecordingFolder
+from facediff.errors import FaceDiffError
+from facediff.spaces import Space, layout
+from facediff.spaces.layouts import LAYOUTS
+from facediff.utils.licences import Commercial
+
+
+class ParametricDataModule(SpeechMotionDataModule):
+    """Recordings in parameters below a folder.
+
+    ``clips.csv`` decides which split a clip belongs to, by its column ``split`` (train, val, test_a); without it, the
+    last 15 % of each speaker's clips by name are for the test and the 10 % before them for validation.
+
+    Args:
+        root: the folder.
+        extra_identities: speakers of the folder to train on; all that it has if None.
+        options: those of every data module.
+    """
+
+    unit = "m"
+    mesh_files: ClassVar[tuple[str, ...]] = ()
+    identities: list[str] = []  # noqa: RUF012 - of a class, as those of all corpora; those of a folder are found in it
+    suffixes: ClassVar[tuple[str, ...]] = USUAL_SUFFIXES
+    layout_name: str | None = None
+
+    def __init__(self, *, root: str, extra_identities: list[str] | None = None, **options: Any) -> None:  # noqa: ANN401
+        speakers = extra_identities or self.speakers_in(Path(root).expanduser())
+        super().__init__(root=root, extra_identities=speakers, **options)
+
+    @classmethod
+    def speakers_in(cls, root: Path) -> list[str]:
+        """The speakers of a folder by the names of its files, sorted; none if there is no such folder."""
+        recordings = RecordingFolder(root, layout("arkit"), cls.frame_rate, suffixes=cls.suffixes)
+        clips = (cls.parse_name(name) for name in (recordings.names() if root.is_dir() else []))
+        return sorted({clip.identity for clip in clips if clip is not None})
+
+    def channel_folder(self) -> RecordingFolder:
+        """The recordings."""
+        return RecordingFolder(self.root, self.space, self.frame_rate, suffixes=self.suffixes, layout=self.layout_name)
+
+    @cached_property
+    def _splits(self) -> dict[str, str]:
+        listed = {name: row["split"] for name, row in read_clip_table(self.root).items() if row.get("split")}
+        clips = [clip for clip in self.corpus.clips.values() if clip.root == self.root]
+        result: dict[str, str] = {}
+        for speaker in {clip.identity for clip in clips}:
+            own = sorted(clip.name for clip in clips if clip.identity == speaker)
+            result |= dict(zip(own, splits(len(own)), strict=True))
+        result |= {name: split for name, split in listed.items() if name in result}
+        for name, split in result.items():
+            if split not in ("train", "val", "test", "test_a", "none"):
+                raise FaceDiffError(
+                    f"{self.root / 'clips.csv'}: split of {name} is {split!r}; expected train, val, test_a or none"
+                )
+        return {name: "test_a" if split == "test" else split for name, split in result.items()}
+
+    def split_of(self, clip: Clip) -> str | None:
+        """By ``clips.csv``, or by the order of each speaker's clips."""
+        split = self._splits[clip.name]
+        return None if split == "none" else split
+
+
+@registry.corpus.register("BEAT")
+class Beat(ParametricDataModule):
+    """BEAT (Liu et al. 2022): ARKit's weights without tongueOut of people who speak and converse, with emotions.
+
+    Files are named ``speaker_name_type_start_end.json`` and ``.wav`` as distributed, in any folders below the root; 60
+    frames a second become 30. The emotion, by the number of the recording, is what style references share.
+
+    Args:
+        root: the folder.
+        conversations: use recordings of conversations (types 1, 3, 5, 7) as well as those of speeches (0, 2, 4, 6).
+        options: those of every data module.
+    """
+
+    corpus_name: ClassVar[str] = "beat"
+    frame_rate: ClassVar[float] = 30.0
+    suffixes: ClassVar[tuple[str, ...]] = (".json",)
+    space: Space = layout("arkit_51")
+    n_vertices = len(layout("arkit_51").channels)
+    reference_attributes: ClassVar[tuple[str, ...]] = ("emotion",)
+    licence: ClassVar[str] = "BEAT's terms"
+    languages: ClassVar[tuple[str, ...]] = ("en", "zh", "es", "ja")
+    commercial_use: ClassVar[Commercial] = "unknown"
+    licence_source: ClassVar[str] = "pantomatrix.github.io/BEAT"
+    obtain: ClassVar[str] = "BEAT is distributed at pantomatrix.github.io/BEAT; put its .json and .wav files into it."
+
+    def __init__(self, *, root: str, conversations: bool = False, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(root=root, **options)
+        self.conversations = conversations
+
+    @classmethod
+    def parse_name(cls, name: str) -> Clip | None:
+        """``26_reamey_0_103_103``: speaker, name, type, first and last number of what is said."""
+        match = re.fullmatch(r"(\d{1,2}_[a-z]+)_([0-7])_(\d{1,3})_(\d{1,3})", name)
+        if match is None:
+            return None
+        kind, number = int(match[2]), int(match[3])
+        form = "conversation" if kind % 2 else "speech"
+        return Clip(name, match[1], f"{match[2]}_{match[3]}_{match[4]}", {"emotion": emotion_of(number), "form": form})
+
+    def split_of(self, clip: Clip) -> str | None:
+        """As in every folder of recordings, conversations aside."""
+        if clip.attributes["form"] == "conversation" and not self.conversations:
+            return None
+        return super().split_of(clip)
+
+
+EMOTIONS = (
+    (64, "neutral"),
+    (72, "happiness"),
+    (80, "anger"),
+    (86, "sadness"),
+    (94, "contempt"),
+    (102, "surprise"),
+    (110, "fear"),
+    (118, "disgust"),
+)
+
+
+def emotion_of(number: int) -> str:
+    """The emotion of a recording by its first number.
+
+    Example:
+        >>> emotion_of(64), emotion_of(103)
+        ('neutral', 'fear')
+    """
+    return next((emotion for last, emotion in EMOTIONS if number <= last), "neutral")
+
+
+@registry.corpus.register("LiveLink")
+class LiveLink(ParametricDataModule):
+    """Takes of Live Link Face: ARKit's 52 weights, head and eyes, as ``facediff data import-take`` writes them.
+
+    Or recordings of one's own, in step with their sound: ``speaker_sentence.csv`` with ``speaker_sentence.wav``.
+
+    Args:
+        root: the folder.
+        options: those of every data module.
+    """
+
+    corpus_name: ClassVar[str] = "live_link"
+    frame_rate: ClassVar[float] = 30.0
+    suffixes: ClassVar[tuple[str, ...]] = (".csv",)
+    space: Space = layout("live_link")
+    n_vertices = len(layout("live_link").channels)
+    licence: ClassVar[str] = "of whoever recorded it"
+
+    def __init__(self, *, root: str, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(root=root, **options)
+
+
+@registry.corpus.register("FlameClips")
+class FlameClips(ParametricDataModule):
+    """Clips of FLAME coefficients: ``speaker_sentence.npz`` or ``.npy`` with ``speaker_sentence.wav``.
+
+    Args:
+        root: the folder.
+        layout: name of the files' layout, such as flame_diffposetalk; an array does not say it.
+        version: of FLAME: coefficients of 2020 and 2023 cannot be exchanged, and checkpoints keep it.
+        options: those of every data module.
+    """
+
+    corpus_name: ClassVar[str] = "flame_clips"
+    frame_rate: ClassVar[float] = 25.0
+    suffixes: ClassVar[tuple[str, ...]] = (".npz", ".npy")
+    space: Space = layout("flame_diffposetalk")
+    n_vertices = len(layout("flame_diffposetalk").channels)
+    licence: ClassVar[str] = "of whoever recorded it, and FLAME's"
+
+    def __init__(self, *, root: str, layout: str, version: str = "", **options: Any) -> None:  # noqa: ANN401
+        flame = [name for name, entry in LAYOUTS.items() if entry.space.kind == "flame"]
+        if layout not in flame:
+            raise FaceDiffError(f"data.layout: is {layout!r}; expected one of {', '.join(flame)}")
+        self.space = replace(LAYOUTS[layout].space, version=version)
+        self.layout_name = layout
+        self.n_vertices = len(self.space.channels)
+        super().__init__(root=root, **options)

@@ -1,0 +1,238 @@
+"""A person from a phone: a recording of Live Link Face and its sound as a corpus entry, in step with each other."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.manifest import FORMAT
+from facediff.data.person.fitting import loudness
+from facediff.data.person.importer import MIN_SECONDS, NAME, SILENCE, EntryClip, check_output, cut_points, splits
+from facediff.data.prepare.runner import MANIFEST, version, write_speech
+from facediff.errors import FaceDiffError
+from facediff.spaces.files import ParameterClip, even, read_parameters
+from facediff.spaces.files.tables import write_live_link
+from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech
+from facediff.utils import ranges
+from facediff.utils.checksums import describe_files
+from facediff.utils.files import put_in_place, scratch_folder
+from facediff.utils.plain_files import write_json, write_rows
+
+Array = npt.NDArray[np.float64]
+Speech = npt.NDArray[np.float32]
+
+STEPS = 200.0
+"""Times a second at which loudness and the mouth's opening are compared."""
+LEAD = 0.012
+"""Seconds by which a mouth opens before it is heard: the mean of 26 speakers of the built-in corpus, whose sound and
+motion are in step, with 24 to 60 s of each (standard deviation 0.008)."""
+SMOOTHING = 0.05
+"""Seconds over which loudness is averaged."""
+LEAST_SECONDS = 1.0
+"""Of both that must overlap for an offset to be considered."""
+SURE = 0.3
+"""Correlation below which an offset may be chance; with speech in step it is 0.55 to 0.7."""
+FOLDER = "recordings"
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Where the motion's beginning lies in the sound.
+
+    Attributes:
+        seconds: of the sound before the motion begins; negative where the motion begins first.
+        correlation: of loudness and the mouth's opening there; at most 1.
+        found: whether it was found, or stated by the user.
+    """
+
+    seconds: float
+    correlation: float
+    found: bool
+
+
+@dataclass(frozen=True)
+class TakeReport:
+    """What an import found and did, for users and for the manifest."""
+
+    name: str
+    frame_rate: float
+    frames: int
+    dropped: int
+    offset: Offset
+    clips: int
+    seconds: float
+    warnings: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The report, a line each."""
+        origin = "found by the mouth's opening and the loudness" if self.offset.found else "as stated"
+        before = "the sound begins first" if self.offset.seconds >= 0 else "the motion begins first"
+        return [
+            f"{self.frames} frames at {self.frame_rate:g} a second, {self.dropped} of them dropped and interpolated",
+            f"offset {self.offset.seconds:+.3f} s ({before}), {origin}; correlation {self.offset.correlation:.2f}",
+            f"{self.clips} clips, {self.seconds:.1f} s",
+            *(f"warning: {warning}" for warning in self.warnings),
+        ]
+
+
+def mouth_opening(clip: ParameterClip) -> Array:
+    """How far the mouth is open (T,): the jaw's opening without what the lips close of it, as ARKit has mouthClose."""
+    jaw, close = (clip.values[:, clip.space.index(name)].astype(np.float64) for name in ("jawOpen", "mouthClose"))
+    return np.asarray(jaw - close)
+
+
+def find_offset(opening: Array, frame_rate: float, speech: Speech, most_seconds: float) -> Offset:
+    """Find where motion begins in its sound by the cross-correlation of the mouth's opening with loudness.
+
+    Both are compared two hundred times a second, each stretch of overlap with its own mean and deviation; a parabola
+    through the best three gives the fraction of a step. A mouth opens before it is heard, by
+    :data:`LEAD`, which is taken off.
+
+    Args:
+        opening: (T,) of the mouth.
+        frame_rate: frames a second.
+        speech: (S,) at 16 kHz.
+        most_seconds: largest offset to consider, either way.
+    """
+    steps = int(len(opening) / frame_rate * STEPS)
+    mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / frame_rate, opening)
+    loud = loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING)
+    furthest = round(most_seconds * STEPS)
+    lags = np.arange(-furthest, furthest + 1)
+    scores = np.array([_correlation(loud, mouth, int(lag)) for lag in lags])
+    best = int(scores.argmax())
+    shift = 0.0
+    if 0 < best < len(scores) - 1 and np.isfinite(scores[best - 1 : best + 2]).all():
+        before, here, after = scores[best - 1 : best + 2]
+        curve = before - 2 * here + after
+        shift = 0.5 * (before - after) / curve if curve < 0 else 0.0
+    return Offset(float(lags[best] + shift + 0.5) / STEPS - LEAD, float(max(scores[best], -1.0)), found=True)
+
+
+def _correlation(loud: Array, mouth: Array, lag: int) -> float:
+    """Pearson's correlation of what overlaps where the motion begins ``lag`` steps into the sound."""
+    first, last = max(0, -lag), min(len(mouth), len(loud) - lag)
+    if last - first < LEAST_SECONDS * STEPS:
+        return -np.inf
+    a, b = loud[first + lag : last + lag], mouth[first:last]
+    a, b = a - a.mean(), b - b.mean()
+    scale = float(np.sqrt(np.square(a).sum() * np.square(b).sum()))
+    return float((a * b).sum() / scale) if scale > 0 else 0.0
+
+
+@ranges.checked
+def import_take(
+    take: Path,
+    sound: Path,
+    *,
+    name: str,
+    output: Path,
+    offset: ranges.TakeOffset | None = None,
+    most_offset: ranges.ClipLength = 10.0,
+    clip_seconds: ranges.ClipLength = 8.0,
+) -> TakeReport:
+    """Turn a recording of Live Link Face and its sound into a corpus entry.
+
+    Args:
+        take: the recording (.csv).
+        sound: its sound, or the video.
+        name: the person's name, without underscore.
+        output: folder to make.
+        offset: seconds of the sound before the motion begins; found if None.
+        most_offset: largest offset to look for, either way.
+        clip_seconds: approximate length of the clips.
+
+    Raises:
+        FaceDiffError: for anything that is wrong with files or arguments; nothing is left behind then.
+    """
+    output = output.expanduser().absolute()
+    if not NAME.fullmatch(name):
+        raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
+    check_output(output)
+    recorded = read_parameters(take)
+    if recorded.layout != "live_link":
+        raise FaceDiffError(f"{take}: is no recording of Live Link Face; expected its .csv with a timecode")
+    speech = read_speech(sound)
+    if float(np.abs(speech).max(initial=0.0)) < SILENCE:
+        raise FaceDiffError(f"{sound}: holds only silence; expected the sound of the take")
+    clip = even(recorded)
+    warnings = []
+    if offset is None:
+        best = find_offset(mouth_opening(clip), clip.frame_rate, speech, most_offset)
+        if best.correlation < SURE:
+            warnings.append(
+                f"mouth and loudness go together with {best.correlation:.2f} only (usual: 0.5 and more): look at the "
+                f"result, or state the offset with --offset"
+            )
+    else:
+        best = Offset(offset, _at(clip, speech, offset), found=False)
+    # Frames whose time lies in the sound; the sound begins with the first of them.
+    times = best.seconds + np.arange(len(clip.values)) / clip.frame_rate
+    inside = np.flatnonzero((times >= 0) & (times <= len(speech) / SAMPLE_RATE - 1 / clip.frame_rate))
+    if len(inside) < MIN_SECONDS * clip.frame_rate:
+        raise FaceDiffError(
+            f"{take} and {sound}: overlap by {len(inside) / clip.frame_rate:.2f} s; expected {MIN_SECONDS:g} s at "
+            f"least, and better a minute; check that they are one take"
+        )
+    clip = replace(clip, values=clip.values[inside])
+    speech = speech[round(float(times[inside[0]]) * SAMPLE_RATE) :]
+    speech = fit_length(speech, round(len(inside) / clip.frame_rate * SAMPLE_RATE))
+    turning = {*clip.space.head, *clip.space.eyes}
+    beyond = [i for i in range(len(clip.space.channels)) if i not in turning and clip.values[:, i].max() > 1]
+    if beyond:
+        names = ", ".join(clip.space.channels[i] for i in beyond)
+        warnings.append(f"weights above 1, kept as recorded: {names}")
+    if not clip.values[:, list(clip.space.head)].any():
+        warnings.append("the head does not move: head rotation was probably switched off in the app")
+    cuts = cut_points(loudness(speech, len(clip.values), clip.frame_rate), clip_seconds * clip.frame_rate)
+    width = max(2, len(str(len(cuts))))
+    entries = [
+        EntryClip(f"{name}_s{i:0{width}d}", split, *cut)
+        for i, (cut, split) in enumerate(zip(cuts, splits(len(cuts)), strict=True), start=1)
+    ]
+    seconds = len(clip.values) / clip.frame_rate
+    report = TakeReport(
+        name, clip.frame_rate, len(clip.values), recorded.dropped, best, len(entries), seconds, tuple(warnings)
+    )
+    with scratch_folder(output) as scratch:
+        entry = scratch / output.name
+        _write(entry, clip, speech, entries, report)
+        put_in_place(entry, output, replace=False)
+    return report
+
+
+def _at(clip: ParameterClip, speech: Speech, offset: float) -> float:
+    """The correlation at a stated offset."""
+    steps = int(len(clip.values) / clip.frame_rate * STEPS)
+    opening = mouth_opening(clip)
+    mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / clip.frame_rate, opening)
+    loud = loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING)
+    return max(_correlation(loud, mouth, round((offset + LEAD) * STEPS - 0.5)), -1.0)
+
+
+def _write(folder: Path, clip: ParameterClip, speech: Speech, entries: list[EntryClip], report: TakeReport) -> None:
+    (folder / FOLDER).mkdir(parents=True)
+    # 16-bit sound ends at full scale: a recording that goes beyond is turned down as a whole.
+    speech = speech / max(1.0, float(np.abs(speech).max(initial=0.0)))
+    for entry in entries:
+        part = replace(clip, name=entry.name, values=clip.values[entry.start : entry.stop], start=0.0)
+        write_live_link(folder / FOLDER / f"{entry.name}.csv", part)
+        first, stop = (round(frame / clip.frame_rate * SAMPLE_RATE) for frame in (entry.start, entry.stop))
+        write_speech(folder / "wav" / f"{entry.name}.wav", speech[first:stop])
+    rows = [
+        {"clip": entry.name, "subject": report.name, "sentence": entry.name.rpartition("_")[2], "split": entry.split}
+        for entry in entries
+    ]
+    write_rows(folder / "clips.csv", rows, line_end="\n")
+    about = {
+        "facediff": version(),
+        "format": FORMAT,
+        "corpus": "person",
+        "person": report.name,
+        "layout": "live_link",
+        "report": asdict(report),
+    }
+    write_json(folder / MANIFEST, {**about, "files": describe_files(folder, workers=2)})

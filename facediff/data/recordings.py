@@ -1,0 +1,105 @@
+"""Folders of recordings in parameters, read as they are: each a file of values and a sound file of the same name."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.storage import ChannelFolder
+from facediff.errors import FaceDiffError
+from facediff.spaces import Space
+from facediff.spaces.files import ParameterClip, even, read_parameters
+from facediff.spaces.operations import at_times, permuted
+from facediff.speech.audio import read_stretch
+from facediff.utils.arrays import ArrayStore
+from facediff.utils.files import cache_dir
+from facediff.utils.limits import LIMITS, quoted
+
+USUAL_SUFFIXES = (".csv", ".json")
+
+
+class RecordingFolder(ChannelFolder):
+    """Recordings anywhere below a folder: ``<clip>.csv`` with ``<clip>.wav`` next to it or in ``wav/``.
+
+    Values come in the order of the corpus's space and at its frame rate; both are kept in the cache, since a text of
+    some megabytes is slow to read.
+
+    Args:
+        root: the folder.
+        space: the space that is returned.
+        frame_rate: frames a second that are returned.
+        suffixes: of the files with values.
+        layout: of arrays, which do not say theirs.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        space: Space,
+        frame_rate: float,
+        *,
+        suffixes: tuple[str, ...] = USUAL_SUFFIXES,
+        layout: str | None = None,
+    ) -> None:
+        super().__init__(root, space)
+        self.frame_rate, self.suffixes, self.layout = frame_rate, suffixes, layout
+        self._store = ArrayStore(cache_dir() / "recordings")
+
+    @cached_property
+    def files(self) -> dict[str, tuple[Path, Path]]:
+        """The files with values and speech of each recording, by name, sorted."""
+        sounds = {path.stem: path for path in (self.root / "wav").glob("*.wav")}
+        files: dict[str, tuple[Path, Path]] = {}
+        for number, path in enumerate(sorted(self.root.rglob("*"))):
+            LIMITS.check("entries", number, self.root)
+            if path.suffix.lower() not in self.suffixes or not path.is_file():
+                continue
+            sound = path.with_suffix(".wav")
+            sound = sound if sound.is_file() else sounds.get(path.stem, sound)
+            if not sound.is_file():
+                continue
+            if not path.stem.isprintable():
+                raise FaceDiffError(
+                    f"{self.root}: has a file {quoted(path.name)}; rename it, its name cannot be printed"
+                )
+            if path.stem in files:
+                raise FaceDiffError(f"{path}: is named as {files[path.stem][0]} is; rename one of them")
+            files[path.stem] = (path, sound)
+        return files
+
+    def names(self) -> list[str]:
+        """The recordings that have values and speech, sorted."""
+        return sorted(self.files)
+
+    def path_of(self, name: str) -> Path:
+        """The file with a recording's values."""
+        return self.files[name][0]
+
+    def recording(self, name: str) -> ParameterClip:
+        """A recording as its file has it."""
+        return read_parameters(self.path_of(name), layout=self.layout)
+
+    def values(self, name: str) -> npt.NDArray[np.floating]:
+        """A recording's values in the corpus's space and at its frame rate; what was dropped is interpolated."""
+        path = self.path_of(name)
+        facts = path.stat()
+        parts = (path.resolve(), facts.st_size, facts.st_mtime_ns, self.space.state(), self.frame_rate, self.layout)
+        key = ArrayStore.key(*parts)
+        stored = self._store.get(key)
+        if stored is not None:
+            return stored
+        clip = even(self.recording(name))
+        values, _ = permuted(clip.values, clip.space, self.space)
+        # BEAT's first frame lies 1/60 s after the sound's beginning; a timecode begins at the time of day.
+        start = clip.start if path.suffix.lower() == ".json" else 0.0
+        times = start + np.arange(len(values)) / clip.frame_rate
+        new_times = np.arange(int(times[-1] * self.frame_rate + 1e-6) + 1) / self.frame_rate
+        resampled = at_times(values, self.space, times, new_times).astype(np.float32)
+        return self._store.put(key, resampled)
+
+    def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
+        """Samples of the recording's sound file; see :func:`~facediff.speech.audio.read_stretch`."""
+        return read_stretch(self.files[name][1], first, length, store)
