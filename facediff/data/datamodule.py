@@ -352,7 +352,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         mesh = self.mesh_corpus
         if mesh is None:
             return None
-        bare = replace(assets, templates=dict(mesh.templates), references={}, space=VERTICES)
+        # A speaker who was imported in channels has no face of their own: the mean one is shown.
+        mean = torch.stack([*mesh.templates.values()]).mean(0)
+        templates = {**dict.fromkeys(map(person_name, self.people), mean), **mesh.templates}
+        bare = replace(assets, templates=templates, references={}, space=VERTICES)
         return Rig(self._with_mesh(bare, mesh), self.deltas())
 
     @property

@@ -17,7 +17,7 @@ from torch import Tensor
 from facediff import registry
 from facediff import synthetic as puppet
 from facediff.data.corpus import Clip, Corpus
-from facediff.data.datamodule import Count, SpeechMotionDataModule
+from facediff.data.datamodule import Count, SpeechMotionDataModule, person_name
 from facediff.data.manifest import read_manifest
 from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, ClipStorage
 from facediff.errors import FaceDiffError
@@ -312,7 +312,8 @@ class Puppet(SpeechMotionDataModule):
         return {
             name: torch.from_numpy(np.array(open_vertices(file, self.edition.n_vertices)[1:], np.float32))
             for name, file in files.items()
-            if self.stores_reference(name)
+            # An imported speaker has no shapes: the mean of all others' moves their face.
+            if self.stores_reference(name) and (file.is_file() or name not in map(person_name, self.people))
         }
 
     def eyelid_pairs(self) -> Tensor | None:

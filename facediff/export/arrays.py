@@ -78,10 +78,10 @@ class BlendshapeWeights(Format):
 
         (animation,) = animations
         if options.shapes is None:  # checked by check_export
-            own_weights(animation).save(path, key_tolerance=options.key_tolerance)
-            return
-        shapes = read_shapes(Path(options.shapes), animation.template, animation.unit)
-        weights = solve(animation, shapes, SolveOptions())
+            weights = own_weights(animation)
+        else:
+            shapes = read_shapes(Path(options.shapes), animation.template, animation.unit)
+            weights = solve(animation, shapes, SolveOptions())
         if options.tracks != "arkit":
             weights = weights.tracks(options.tracks)
         weights.save(path, plain=options.tracks != "arkit", key_tolerance=options.key_tolerance)

@@ -21,7 +21,7 @@ from facediff.utils.plain_files import read_table
 SUFFIXES = (".csv", ".json", ".npy", ".npz")
 
 
-def read_parameters(path: Path, *, layout: str | None = None, frame_rate: float | None = None) -> ParameterClip:
+def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: float | None = None) -> ParameterClip:
     """Read a recording in parameters.
 
     Args:
@@ -32,6 +32,7 @@ def read_parameters(path: Path, *, layout: str | None = None, frame_rate: float 
     Raises:
         FaceDiffError: if it is none of these, or something in it is wrong.
     """
+    path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(SUFFIXES)}')
@@ -46,7 +47,7 @@ def read_parameters(path: Path, *, layout: str | None = None, frame_rate: float 
     return read_live_link(path) if is_live_link else read_audio2face(path)
 
 
-def write_parameters(path: Path, clip: ParameterClip, *, layout: str = "") -> None:
+def write_parameters(path: str | Path, clip: ParameterClip, *, layout: str = "") -> None:
     """Write a recording in parameters; it appears whole or not at all.
 
     Args:
@@ -54,6 +55,7 @@ def write_parameters(path: Path, clip: ParameterClip, *, layout: str = "") -> No
         clip: the recording.
         layout: of a ``.npy`` or ``.npz``, the clip's own if empty; ``audio2face`` for that table.
     """
+    path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".csv":
         (write_audio2face if layout == "audio2face" else write_live_link)(path, clip)
