@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
+from facediff.animation.options import LicenceOptions
 from facediff.cli.options import Output
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.models.published.import_options import ImportOptions
 from facediff.utils.option import Option
+
+MOST_IDENTITIES = 16
+"""Identities that are printed one by one."""
 
 MOST_NAMED = 4
 """Tensors of one part of a model that are named one by one where they are not needed."""
@@ -19,8 +23,10 @@ MOST_NAMED = 4
 def import_checkpoint(
     files: Annotated[list[Path], Option(metavar="FILE", reads=True)],
     *,
-    output: Output,
+    output: Output = Path("model.ckpt"),
+    doctor: bool = False,
     facts: ImportOptions,
+    licence: LicenceOptions,
 ) -> None:
     """Make a model of a published method's checkpoint, as its authors distribute it.
 
@@ -34,7 +40,9 @@ def import_checkpoint(
     Args:
         files: the checkpoint; both of a method with two stages; of VOCA the checkpoint and DeepSpeech's graph
         output: checkpoint to write (.ckpt)
+        doctor: write nothing, and print how the files differ from what is expected: names, shapes, hashes of files
         facts: what the checkpoint does not hold
+        licence: which licences are accepted
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
@@ -42,27 +50,48 @@ def import_checkpoint(
         # A checkpoint of TensorFlow is named by what its files' names begin with, too.
         if not path.is_file() and not path.with_name(f"{path.name}.index").is_file():
             raise FaceDiffError(f"{path}: no such file; expected the checkpoint of a published method")
+    if doctor:
+        from facediff.models.published.doctor import examine
+
+        for line in examine(files, facts):
+            tell(line)
+        return
     from facediff.models.published.importing import import_files, save_model
+    from facediff.utils.licences import require_cleared
 
     imported = import_files(files, facts)
+    if licence.commercial_only:
+        require_cleared(", ".join(map(str, files)), imported.model.licences)
     save_model(imported.model, output)
     model = imported.model
     count = sum(parameter.numel() for parameter in model.parameters())
     tell(
-        f"{output}: {type(model).__name__} of {imported.dataset}, {model.n_vertices} vertices, {model.frame_rate:g} "
-        f"frames a second, identities {', '.join(model.identities)}, {count / 1e6:.1f} M parameters from "
+        f"{output}: {type(model).__name__} of {imported.dataset}, {model.n_vertices} "
+        f"{'vertices' if model.space.is_vertices else 'channels'}, {model.frame_rate:g} "
+        f"frames a second, identities {few(model.identities)}, {count / 1e6:.1f} M parameters from "
         f"{imported.used} tensors"
     )
     for names, why in gathered(imported.ignored):
         tell(f"not needed: {names} ({why})")
-    for licence in model.licences:
-        tell(f"licence: {licence}")
+    for label in model.licences:
+        tell(f"licence: {label}")
     for note in imported.notes:
         tell(f"note: {note}")
     if model.animates:
         tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")
     else:
         tell(f"next: train what hears speech on it, with --model.prior={output}")
+
+
+def few(names: Sequence[str]) -> str:
+    """Names, of many the first and the last.
+
+    >>> few(["a", "b"]), few([str(number) for number in range(141)])
+    ('a, b', '0, 1, … 140 (141)')
+    """
+    return (
+        ", ".join(names) if len(names) <= MOST_IDENTITIES else f"{names[0]}, {names[1]}, … {names[-1]} ({len(names)})"
+    )
 
 
 def gathered(ignored: Mapping[str, str]) -> list[tuple[str, str]]:

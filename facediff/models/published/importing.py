@@ -95,9 +95,7 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     weights = read_weights([path for path in files if path.suffix != GRAPH])
     method = recognise(weights)
     options, unused = options.with_hparams()
-    own = None if method.faces is None else method.faces(weights, options)
-    graphs = [path for path in files if path.suffix == GRAPH]
-    facts = facts_of(weights, method, options, graphs) if own is None else own_facts(own, method, options)
+    facts, own = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
     converted = method.convert(weights, facts)
     ignore = options.all_model_options().get("ignore", ())
     for prefix in [ignore] if isinstance(ignore, str) else ignore:
@@ -114,6 +112,20 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     model.adopt(assets)
     label(model, method, facts.dataset, () if own is None else own.licences)
     return Imported(model.eval(), facts.dataset, len(weights.renamed), weights.ignored, [*weights.notes, *notes])
+
+
+def facts_and_faces(
+    weights: AuthorsWeights, method: Recogniser, options: ImportOptions, graphs: Sequence[Path]
+) -> tuple[CheckpointFacts, FaceFacts | None]:
+    """What is known of a checkpoint, and the faces of a method that has its own.
+
+    Raises:
+        FaceDiffError: if something does not follow from the tensors and the options, or contradicts them.
+    """
+    if method.faces is None:
+        return facts_of(weights, method, options, graphs), None
+    own = method.faces(weights, options)
+    return own_facts(own, method, options), own
 
 
 GRAPH, META = ".pb", ".meta"
@@ -532,10 +544,7 @@ def build(
         FaceDiffError: if a tensor is missing or of another shape.
     """
     model: AnimationModel = registry.model.get(method.method)(
-        n_vertices=facts.n_vertices,
-        identities=facts.identities,
-        frame_rate=facts.frame_rate,
-        **({} if facts.space.is_vertices else {"space": facts.space}),
+        **facts.sizes(),
         **options,
     )
     own = model.state_dict()

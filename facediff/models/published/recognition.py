@@ -319,10 +319,19 @@ class CheckpointFacts:
     frame_rate: float
     identities: list[str]
     n_vertices: int
+    space: Space = VERTICES
     audio_config: Mapping[str, Any] | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     graph: Path | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    def sizes(self) -> dict[str, Any]:
+        """The options of a model that follow from its data."""
+        space = {} if self.space.is_vertices else {"space": self.space}
+        return {
+            **{"n_vertices": self.n_vertices, "identities": self.identities, "frame_rate": self.frame_rate},
+            **space,
+        }
 
 
 @dataclass(frozen=True)
