@@ -96,3 +96,16 @@ def test_flame_rig_is_flame_without_rotations(tmp_path: Path) -> None:
     rig, values = flame_rig(flame), RNG.normal(size=(4, 100))
     space = parametric("flame", ["expression 100"])
     assert np.allclose(rig.decode(values), decode_flame(flame, values, space))
+
+
+def test_jaw_of_a_linear_flame_is_its_tangent(tmp_path: Path) -> None:
+    flame = Flame.read(write_flame(tmp_path / "model.npz", form="npz"))
+    rig = flame_rig(flame, jaw=True)
+    values = np.zeros((2, len(rig.names)))
+    values[0, rig.names.index("jaw_x")], values[1, rig.names.index("expression_3")] = 0.02, 0.5
+    expression = np.zeros((2, 100))
+    expression[1, 3] = 0.5
+    exact = flame.vertices(np.zeros(0), expression, np.array([[0.02, 0, 0], [0, 0, 0]]))
+    moved = np.abs(exact - flame.template).max()
+    np.testing.assert_allclose(rig.decode(values), exact, atol=0.02 * moved)
+    np.testing.assert_allclose(rig.decode(values)[1], exact[1], atol=1e-12)

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -546,7 +547,7 @@ def faces_of(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
     else:
         path = Path(given)
         content = open_array(path) if path.suffix == ".npy" else read_arrays(path, ("shape",))["shape"]
-        shapes = {path.stem: torch.as_tensor(content).float()}
+        shapes = {path.stem: torch.tensor(np.asarray(content)).float()}
     rows = {name: value[0] if value.dim() == 2 else value for name, value in shapes.items()}
     if not rows or any(row.shape != (count,) for row in rows.values()):
         raise OptionError.naming(f"{{templates}}: expected {count} coefficients of FLAME's shape for every speaker")

@@ -39,7 +39,8 @@ class ImportOptions:
         templates: neutral faces by speaker (templates.pkl), of DiffPoseTalk a speaker's shape (.npy, or an .npz with
             shape); in Python also arrays by name, (V, 3) or (3V,), or (S,) of shapes
         regions: folder with lve.txt and fdd.txt, the vertices of lips and upper face
-        mesh: the data set's mesh, for triangles, so that faces can be drawn
+        mesh: the data set's mesh, for triangles, so that faces can be drawn; of a method in FLAME's parameters the
+            FLAME model, generic_model.pkl or ARTalk's FLAME_with_eye.pt
         audio_config: config.json of an audio encoder of unusual size; in Python also its content
         statistics: means and deviations of DiffPoseTalk's training motion (stats_train.npz), without which nothing has
             a scale; in Python also the arrays by name

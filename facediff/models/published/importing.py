@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -268,7 +268,7 @@ def parametric_facts(weights: AuthorsWeights, method: Recogniser, options: Impor
         FaceDiffError: if the tensors have another number of channels or identities, or an option is for vertices.
     """
     for name in ("dataset", "templates", "regions", "mesh"):
-        if getattr(options, name) is not None:
+        if getattr(options, name) is not None and (name, layout(method.layout).kind) != ("mesh", "flame"):
             raise OptionError.naming(
                 f"{{{name}}}: is for methods that animate vertices, and {method.method} animates channels; omit it"
             )
@@ -340,7 +340,22 @@ def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[s
         regions=regions,
         space=faces.space,
     )
-    return assets, list(faces.notes)
+    return with_flame(assets, options.mesh), list(faces.notes)
+
+
+def with_flame(assets: Assets, mesh: Path | None) -> Assets:
+    """Assets in FLAME's parameters with the user's FLAME model as rig, so that they can be drawn.
+
+    Raises:
+        FaceDiffError: if the file is no FLAME model.
+    """
+    if mesh is None or assets.space.kind != "flame":
+        return assets
+    from facediff.data.batch import Rig
+    from facediff.mesh.flame import Flame
+    from facediff.spaces.rigs import flame_rig
+
+    return replace(assets, rig=Rig.of(flame_rig(Flame.read(Path(mesh)), jaw=True), assets))
 
 
 def read_triangles(mesh: Path | None, count: int) -> Tensor | None:
@@ -458,7 +473,7 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
     from facediff.data.corpus import as_template
 
     if not facts.space.is_vertices:
-        return parametric_assets(facts), []
+        return with_flame(parametric_assets(facts), options.mesh), []
     templates, regions, mesh = options.templates, options.regions, options.mesh
     count, notes = facts.n_vertices, []
     if templates is None:
