@@ -23,7 +23,9 @@ Indices = npt.NDArray[np.int64]
 REACH, SOURCE_REACH = 0.34, 0.5  # How far from a lid's edge the skin follows it, as a share of the eye's width
 EVENED = 0.2  # Towards the corners heights vanish: this share of the mean height keeps their ratios defined
 SHUT = 0.03  # Lids that are nearer at rest than this share of the eye's width are shut, and have no way to go
-SHUTS = 0.06  # Source's lids that leave less than this share of their opening shut the target's eye
+CORNER = 0.6  # An eye's corner reaches to where the opening is this share of its height
+MORE = 1.5  # No part of an eye is left open by more than so many times what the whole of it is
+SHUTS = 0.08  # Source's lids that leave less than this share of their opening shut the target's eye
 LAP, ROUGH = 0.03, 0.12
 """Shut, the upper lid goes beyond the lower one by these shares of the opening and of a triangle's edge."""
 GRID = 72  # Points of the eyeball's depth across an eye's window
@@ -133,6 +135,11 @@ class EyeLids:
         # What is left of the opening is exactly the source's share, and never less than none: lids do not pass.
         left = own[:, 1] + moves[:, 0, :, 1] - moves[:, 1, :, 1]
         left = (left + EVENED * left.mean(axis=1, keepdims=True)) / (own[:, 1] + least[0])
+        # In the corners, where there is hardly an opening, the share of the whole eye says more than their own, and
+        # nowhere is much more left than there: a rim that is read a little wrong would leave a hole.
+        whole = np.maximum(left @ own[:, 1] / own[:, 1].sum(), 0.0)[:, None]
+        open_here = np.clip(own[:, 1] / (CORNER * own[:, 1].max()), 0.0, 1.0)
+        left = np.minimum(open_here * left + (1.0 - open_here) * whole, MORE * whole)
         # Edges are read to a few hundredths of the opening: what is nearly shut is shut.
         left = np.maximum(left - SHUTS, 0.0) / (1.0 - SHUTS)
         # Shut, the upper edge lies a little over the lower one, so that no gap shows between coarse edges.

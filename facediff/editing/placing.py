@@ -211,7 +211,9 @@ def _face_of(surface: Surface, features: Features) -> tuple[Array, Array]:
     points = np.einsum("nk,nkd->nd", shares, surface.vertices[corners])
     normals = np.einsum("nk,nkd->nd", shares, surface.normals[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return points, normals
+    # Through the holes of eyes whose balls are pieces of their own, the back of the head is seen from within.
+    front = normals[:, 2] > 0
+    return points[front], normals[front]
 
 
 def _candidates_for(
