@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
@@ -18,6 +19,8 @@ from facediff.utils.files import atomic
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_files import read_table, write_table
 
+Values = npt.NDArray[np.floating]
+
 DAY = 24 * 3600
 COUNT = "blendshapecount"
 REMEDY = "expected a table as Live Link Face or Audio2Face writes it"
@@ -26,6 +29,12 @@ SIXTIETHS = 60
 USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
 NEAR_RATE = 0.01
 """Share by which the rate of a table's rows may differ from a usual one and still be it."""
+_MIRRORED = np.array([not name.endswith("Pitch") for name in ROTATIONS])
+"""Of the app's rotations, those that turn the other way than about an axis of a right-handed face that looks along +z.
+
+In its recordings, eyeLookOutLeft and eyeLookInRight come with negative yaws, eyeLookDown with positive pitches, and the
+eyes' rolls are the products of both: a mirrored frame, in which yaw and roll change their signs. Heads were not seen
+to move in these recordings; they are taken to be in the same frame."""
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,2}(?:\.\d{1,9})?)")
 
 
@@ -76,7 +85,8 @@ def read_live_link(path: Path) -> ParameterClip:
     """Read a recording of Live Link Face.
 
     Columns are matched by name, whatever their case; a recording without rotations of head and eyes has them declared
-    as absent. Rotations are radians. The rate comes from the timecode; where its steps are longer, rows were dropped,
+    as absent. Rotations are radians about the axes of a right-handed face that looks along +z: yaw to its left, pitch
+    down. The rate comes from the timecode; where its steps are longer, rows were dropped,
     which :func:`~facediff.spaces.files.clips.even` interpolates.
 
     Args:
@@ -110,10 +120,18 @@ def read_live_link(path: Path) -> ParameterClip:
             )
         times.append(seconds)
         values.append(_numbers(path, number, [*row, *("0" for _ in missing)], columns, len(header)))
-    return _timed(path, np.array(times), np.array(values), missing)
+    return _timed(path, np.array(times), _mirrored(np.array(values)), missing)
 
 
-def _timed(path: Path, clock: Array, values: Array, missing: list[str]) -> ParameterClip:
+def _mirrored(values: Values) -> Values:
+    """Values (T, 61) with the rotations of a mirrored frame, either way."""
+    if len(values):
+        turns = values[:, len(ARKIT) :]
+        turns[:, _MIRRORED] = 0.0 - turns[:, _MIRRORED]  # and not −0
+    return values
+
+
+def _timed(path: Path, clock: Array, values: Values, missing: list[str]) -> ParameterClip:
     if len(clock) < 2:
         raise FaceDiffError(f"{path}: holds {len(clock)} rows; expected two at least, for their rate; record it again")
     # Past midnight the clock begins again.
@@ -142,7 +160,7 @@ def write_live_link(path: Path, clip: ParameterClip) -> None:
     Raises:
         FaceDiffError: if the clip is in another space.
     """
-    values = permuted(clip.values, clip.space, layout("live_link"))[0]
+    values = _mirrored(permuted(clip.values, clip.space, layout("live_link"))[0])
     times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
     count = str(len(ARKIT) + len(ROTATIONS))
     rows = (

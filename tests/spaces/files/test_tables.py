@@ -13,6 +13,7 @@ from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files import ParameterClip, even, read_parameters, write_parameters
 from facediff.spaces.files.tables import seconds_of, timecode
+from facediff.spaces.rotations import convert, matrices
 
 # The first rows of a real take have such steps: two sixtieths less a thousandth now and then.
 CODES = ("13:13:04:31.652", "13:13:04:33.651", "13:13:04:35.651", "13:13:04:41.650", "13:13:04:43.650")
@@ -34,13 +35,37 @@ def test_read_live_link_takes_the_rate_from_the_timecode(tmp_path: Path, count: 
     clip = read_parameters(write_take(tmp_path / "take.csv", count=count))
     assert clip.frame_rate == 30.0
     assert clip.dropped == 2
-    assert np.array_equal(clip.values, VALUES.astype(np.float32))
+    assert np.array_equal(clip.values[:, :52], VALUES[:, :52].astype(np.float32))
+    # Yaw and roll turn the other way in the app's mirrored frame.
+    assert np.array_equal(clip.values[:, 52:], (VALUES[:, 52:] * np.tile([-1, 1, -1], 3)).astype(np.float32))
     assert clip.values.max() > 1
     assert clip.space == layout("live_link")
     whole = even(clip)
     assert len(whole.values) == 7
-    assert np.abs(whole.values[2] - VALUES[2]).max() < 0.002
+    assert np.abs(whole.values[2, :52] - VALUES[2, :52]).max() < 0.002
     assert np.abs(whole.values[3, :52] - (2 * VALUES[2] + VALUES[3])[:52] / 3).max() < 0.002
+
+
+def test_read_live_link_has_the_eyes_of_a_right_handed_face(tmp_path: Path) -> None:
+    """A row of a real take: the eyes look to the face's left and up."""
+    names = [*map(live_link_name, ARKIT), *ROTATIONS]
+    shown = {
+        "EyeLookOutLeft": 0.1079,
+        "EyeLookInRight": 0.2143,
+        "EyeLookUpLeft": 0.3423,
+        "LeftEyeYaw": -0.1294,
+        "LeftEyePitch": -0.1497,
+        "LeftEyeRoll": 0.0195,
+    }
+    row = ",".join(str(shown.get(name, 0.0)) for name in names)
+    lines = ["Timecode,BlendShapeCount," + ",".join(names), *(f"12:28:00:{k:02d}.068,61,{row}" for k in (1, 3))]
+    (tmp_path / "take.csv").write_text("\n".join(lines))
+    clip = read_parameters(tmp_path / "take.csv")
+    turn = next(turn for turn in clip.space.rotations if turn.joint == "left_eye")
+    quaternion = convert(clip.values[:1, list(turn.channels)], turn.form, "quaternion")
+    looks = matrices(quaternion)[0] @ [0, 0, 1]
+    assert looks[0] > 0.1  # +x is the face's left
+    assert looks[1] > 0.1
 
 
 def test_live_link_written_and_read_again_is_the_same(tmp_path: Path) -> None:
