@@ -30,6 +30,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.render import Renderer
 from facediff.render.panels import heat_colours
+from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.tiny import Tiny
 from tests.fakes.wandb_run import OfflineRun
 
@@ -383,3 +384,14 @@ def test_first_of_each_identity_comes_before_any_second() -> None:
 
 def test_length_has_a_readable_unit() -> None:
     assert [length(0.0051, "m"), length(0.0051, "mm"), length(2, "unit")] == ["5.1 mm", "0.0051 mm", "2 unit"]
+
+
+def test_preview_of_channels_draws_what_the_rig_makes_of_them(
+    make_model: MakeModel, make_trainer: MakeTrainer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = TinyChannels(root=str(write_channels(tmp_path / "channels")), batch_size=4)
+    preview = SamplingPreview(**{**SMALL, "clips": 1, "seconds": 0.2})
+    trainer = make_trainer(callbacks=[preview], logger=CSVLogger(tmp_path))
+    trainer.fit(make_model(n_vertices=6, space=CHANNELS), data)
+    assert list(tmp_path.rglob("*.mp4"))
+    assert "no previews" not in capsys.readouterr().out
