@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -152,3 +154,16 @@ def test_the_command_writes_vertices_and_weights(
 def test_options_without_a_meaning_are_refused(model: Audio2FaceAnimator, options: dict[str, Any], named: str) -> None:
     with pytest.raises(FaceDiffError, match=named):
         model.animate((SPEECH, 16_000), **options)
+
+
+def test_it_needs_neither_pytorch_nor_scipy(folder: Path, content: dict[str, Any], tmp_path: Path) -> None:
+    program = """
+import sys
+import numpy as np
+import facediff
+speech = np.random.default_rng(0).normal(size=3000).astype(np.float32)
+facediff.load(sys.argv[1]).animate((speech, 16_000)).save(sys.argv[2])
+print([name for name in ("torch", "scipy", "lightning") if name in sys.modules])
+"""
+    words = [sys.executable, "-c", program, str(folder), str(tmp_path / "face.csv")]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "[]\n"  # noqa: S603
