@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 import torch
 
 from facediff import synthetic as puppet
@@ -11,6 +12,8 @@ from facediff.data import Puppet
 from facediff.data.batch import Rig
 from facediff.data.puppet import FirstEdition, SecondEdition
 from facediff.errors import FaceDiffError
+from facediff.spaces import layout
+from facediff.spaces.files import ParameterClip, write_parameters
 from facediff.synthetic.corpus import generate
 from facediff.synthetic.second_edition import generate_second
 
@@ -54,6 +57,26 @@ def test_channels_are_the_truth_of_the_vertices(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion[:, 54:57, 0], np.deg2rad(head[:, [1, 0, 2]] * [1, 1, -1]), atol=1e-6)
     np.testing.assert_allclose(motion[:, 57:59, 0], np.deg2rad(gaze * [1, -1]), atol=1e-6)
     assert torch.equal(motion[:, 57:60], motion[:, 60:63])
+    # Somebody imported from a phone is read in the corpus's channels, and has the mean face.
+    person = tmp_path / "ann"
+    person.mkdir()
+    values = np.random.default_rng(0).random((60, 61)).astype(np.float32)
+    write_parameters(person / "Ann_s01.csv", ParameterClip("Ann_s01", values, layout("live_link"), 25.0))
+    soundfile.write(person / "Ann_s01.wav", np.zeros(38_400), 16_000)
+    (person / "clips.csv").write_text("clip,split\nAnn_s01,train\n")
+    (person / "manifest.json").write_text('{"person": "Ann", "layout": "live_link"}')
+    joined = Puppet(root=str(tmp_path / "second"), motion="arkit", people=[str(person)])
+    own = joined.corpus.read_motion(joined.corpus.clips["Ann_s01"])
+    for name in ("jawOpen", "HeadYaw", "RightEyePitch"):
+        np.testing.assert_allclose(
+            own[:, joined.space.index(name), 0], values[:, layout("live_link").index(name)], atol=1e-6
+        )
+    assert not own[:, joined.space.index("tongueUp")].any()
+    shown = joined.assets().rig
+    assert shown is not None
+    mean = torch.stack([face for name, face in shown.mesh.templates.items() if name != "Ann"]).mean(0)
+    torch.testing.assert_close(shown.mesh.templates["Ann"], mean)
+    assert "Ann" not in shown.deltas
 
 
 def test_the_first_edition_has_no_channels() -> None:
