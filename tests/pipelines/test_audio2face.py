@@ -161,7 +161,7 @@ def test_it_needs_neither_pytorch_nor_scipy(folder: Path, content: dict[str, Any
 import sys
 import numpy as np
 import facediff
-speech = np.random.default_rng(0).normal(size=3000).astype(np.float32)
+speech = np.random.default_rng(0).normal(size=8000).astype(np.float32)
 facediff.load(sys.argv[1]).animate((speech, 16_000)).save(sys.argv[2])
 print([name for name in ("torch", "scipy", "lightning") if name in sys.modules])
 """
