@@ -84,13 +84,13 @@ def compared(
     pairs = [(weights.authors_name(name), f"{shapes[name]}, expected {own[name]}") for name in differing]
     yield from listing("other shape", pairs)
     extra = [(weights.authors_name(name), str(shapes[name])) for name in shapes if name not in own]
-    left = [(name, str(tuple(weights.tensors[name].shape))) for name in weights.left()]
-    yield from listing("of no use", [*extra, *left])
+    idle = [(name, str(tuple(weights.tensors[name].shape))) for name in weights.left()]
+    yield from listing("of no use", [*extra, *idle])
     floats = {name: value for name, value in weights.tensors.items() if value.is_floating_point()}
     unsound = [name for name, value in floats.items() if not value.isfinite().all()]
     yield from listing("not finite", [(name, "") for name in unsound])
     yield from listing("not needed", list(weights.ignored.items()))
-    fits = not (pairs or extra or left or unsound or own.keys() - shapes.keys())
+    fits = not (pairs or extra or idle or unsound or own.keys() - shapes.keys())
     yield f"{len(own)} tensors are expected: {'all fit' if fits else 'they do not fit, see above'}"
 
 

@@ -323,7 +323,6 @@ class CheckpointFacts:
     audio_config: Mapping[str, Any] | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     graph: Path | None = None
-    space: Space = VERTICES
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def sizes(self) -> dict[str, Any]:
