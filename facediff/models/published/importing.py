@@ -523,7 +523,8 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
 def parametric_assets(facts: CheckpointFacts) -> Assets:
     """Faces at rest, whose channels are all 0, and the regions by the channels' names."""
     rest = torch.zeros(facts.n_vertices, 1)
-    regions = {name: torch.tensor(facts.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
+    named = {name: torch.tensor(facts.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
+    regions = {name: channels if len(channels) else torch.arange(len(rest)) for name, channels in named.items()}
     return Assets(
         corpus=facts.dataset,
         synthetic=False,

@@ -12,10 +12,15 @@ from scipy.signal import savgol_coeffs
 from torch import Tensor
 
 from facediff.data import Reference
+from facediff.mesh.flame import Flame
 from facediff.models import import_checkpoint
 from facediff.models.published.artalk import ARTalk, smoothed
 from facediff.models.published.artalk_codec import BitCodec
+from facediff.pipelines.animator import Animator
+from facediff.spaces import layout
+from facediff.spaces.rigs import decode_flame
 from tests.fakes import published_parameters as author
+from tests.fakes.flame import write_flame
 from tests.fakes.published import AUDIO_CONFIG
 
 
@@ -111,3 +116,19 @@ def test_stream_equals_the_file_bit_for_bit(pieces: list[int], model: ARTalk) ->
     assert sum(part.shape[1] for part in parts) == 16  # two chunks but for half of a filter
     parts.append(stream.finish())
     assert torch.equal(torch.cat(parts, 1)[0], whole)
+
+
+def test_imported_with_flame_animates_to_parameters_and_vertices(state: dict[str, Tensor], tmp_path: Path) -> None:
+    torch.save(state, tmp_path / "ARTalk_wav2vec.pt")
+    flame = write_flame(tmp_path / "flame.npz", form="npz")
+    options: dict[str, Any] = {"codec_heads": 2, "audio_config": AUDIO_CONFIG, "mesh": flame}
+    imported = import_checkpoint(tmp_path / "ARTalk_wav2vec.pt", **options)
+    audio = speech(12)
+    raw = imported.animate(audio, identity="0").vertices[..., 0].numpy()
+    finished = Animator(imported).animate(audio.numpy(), 16_000, identity="0", voice_gate="off")
+    assert finished.values is not None
+    assert finished.space == layout("flame_artalk")
+    np.testing.assert_allclose(finished.values, raw, atol=1e-5)
+    exact = decode_flame(Flame.read(flame), raw, layout("flame_artalk"))
+    assert finished.vertices.shape == exact.shape
+    assert any("MIT" in str(licence) for licence in imported.licences)
