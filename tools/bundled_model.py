@@ -6,10 +6,12 @@ The recipe, where flite is installed, on one core of an AMD EPYC in about 40 min
         --model.motion_space.eyelids_weight=20
     $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 1200 -o puppet.ckpt
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json
-    $ python tools/bundled_model.py puppet.ckpt
+    $ facediff test --ckpt_path puppet.ckpt
+    $ python tools/bundled_model.py puppet.ckpt --scores runs/test/puppet/test_scores.csv
 
 The folder has graphs in 16 bits, the faces of the ten written-down speakers, and for each of the six whom the model was
-trained on a style for each mood: the mean of the styles of their training clips.
+trained on a style for each mood: the mean of the styles of their training clips. Its model card is that of
+`facediff publish`, with how this folder is used.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +27,7 @@ import torch
 
 from facediff.cli.generation_metrics import corpus_of_checkpoint
 from facediff.data import Reference
-from facediff.models import load_model
+from facediff.models import AnimationModel, load_model
 from facediff.models.inference import Style
 from facediff.models.styles import vector_of
 from facediff.pipelines.export_model import export_model
@@ -33,6 +36,23 @@ from facediff.utils.checksums import sha256
 from facediff.utils.hub import BUNDLED
 from facediff.utils.plain_files import write_json
 
+USE = """## How to use it
+
+It comes with facediff and is taken where no model is named:
+
+```bash
+pip install facediff
+facediff animate speech.wav -o speech.html
+```
+
+```python
+import facediff
+
+facediff.load().animate("speech.wav", identity="F1", style="F1_lively").save("speech.glb")
+```
+
+"""
+"""How the folder is used, in place of how a model folder is."""
 MOODS = {"flat": "calm", "neutral": "neutral", "lively": "lively"}
 """Words for the corpus's moods."""
 
@@ -42,6 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--data-root", type=Path, help="folder of the corpus (default: that of the training)")
+    parser.add_argument("--scores", type=Path, help="test_scores.csv of the checkpoint, for the model card")
     parser.add_argument("--output", type=Path, default=BUNDLED)
     given = parser.parse_args(arguments)
     model = load_model(given.checkpoint)
@@ -63,11 +84,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "generation_metrics": json.loads(scores.read_text()) if scores.is_file() else None,
     }
     write_json(made / "provenance.json", provenance)
+    (made / "README.md").write_text(card(model, given.scores), encoding="utf-8")
     if given.output.is_dir():
         shutil.rmtree(given.output)
     made.rename(given.output)
     size = sum(path.stat().st_size for path in given.output.iterdir())
     print(f"wrote {given.output}: {size / 1e6:.1f} MB")
+
+
+def card(model: AnimationModel, scores: Path | None) -> str:
+    """The model card of `facediff publish`, without what it says of a model folder's own files."""
+    with tempfile.TemporaryDirectory() as folder:
+        published = model.save_pretrained(Path(folder) / "puppet", license="apache-2.0", name="puppet", scores=scores)
+        text = (published / "README.md").read_text(encoding="utf-8")
+    start, end = text.index("## How to use it"), text.index("## Licences")
+    return text[:start] + USE + text[end : text.index("## Files")].rstrip() + "\n"
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from facediff.models.speaker_encoders import mean_and_deviation
 
 MEMORY = 0.999
 """Share of what is known that stays after a training step: the last 8 000 clips of steps of eight count."""
-RIDGE = 0.3
+RIDGE = 0.03
 """Penalty of the map, as a share of the statistics' variance."""
 USUAL = 3.0
 """Standard deviations up to which a statistic counts; rooms and voices that nobody trained with lie beyond."""
