@@ -7,7 +7,7 @@ The recipe, where flite is installed, on one core of an AMD EPYC in about 40 min
     $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 1200 -o puppet.ckpt
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json
     $ facediff test --ckpt_path puppet.ckpt
-    $ python tools/bundled_model.py puppet.ckpt --scores runs/test/puppet/test_scores.csv
+    $ python tools/bundled_model.py puppet.ckpt --scores runs/test/version_0/test_scores.csv
 
 The folder has graphs in 16 bits, the faces of the ten written-down speakers, and for each of the six whom the model was
 trained on a style for each mood: the mean of the styles of their training clips. Its model card is that of

@@ -145,7 +145,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
             "features": torch.zeros(batch, frames, dim),
             "mask": mask,
             "identity": torch.zeros(batch, dtype=torch.long),
-            "style": torch.zeros(batch, style),
+            "style": torch.ones(batch, style),  # the last asks for what the speech says, so that its map is made
             "state": torch.zeros(batch, frames, state),
             "step": torch.zeros(batch, dtype=torch.long),
             "before": torch.zeros(batch, frames, kept),
