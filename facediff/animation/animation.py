@@ -301,7 +301,7 @@ class Animation:
         carry: bool = False,
         smoothness: float = 0.02,
         symmetry: float = 0.0,
-        sparsity: float = 0.02,
+        sparsity: float = 0.003,
         bounds: tuple[float, float] = (0.0, 1.0),
         region: str | None = None,
         residual_limit: float = 0.8,

@@ -25,7 +25,7 @@ def blendshapes(
     carry: bool = False,
     smoothness: Annotated[ranges.Strength, Option(metavar="S")] = 0.02,
     symmetry: Annotated[ranges.Strength, Option(metavar="S")] = 0.0,
-    sparsity: Annotated[ranges.Strength, Option(metavar="S")] = 0.02,
+    sparsity: Annotated[ranges.Strength, Option(metavar="S")] = 0.003,
     bounds: Annotated[tuple[ranges.Bound, ranges.Bound], Option(metavar=("LO", "HI"))] = (0.0, 1.0),
     region: Annotated[str | None, Option(metavar="NAME")] = None,
     only_arkit: bool = False,
@@ -53,7 +53,7 @@ def blendshapes(
         sparsity: cost of weights, which keeps shapes at 0 that would cancel one another; 0 is off
         bounds: limits of weights (default: 0 1)
         region: look at a region of the face only, such as lips
-        only_arkit: leave out shapes whose names are not ARKit's
+        only_arkit: leave out shapes whose names are not ARKit's (for the table of Live Link they always are)
         tracks: oculus (15 visemes) or vrm (vowels and blinks) in place of the shapes' own weights, as a plain table
         plain: columns time, the set's own names, residuals in mm
         residual_limit: share of the motion that weights may leave before they are refused
@@ -109,7 +109,8 @@ def blendshapes(
     own = SourceReader(source).read(animation)
     if show is not None:
         _ = own.triangles  # refuses an animation without triangles before anything is written
-    found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit)
+    # Shapes without a column would take motion that the table then lacks, such as mouthOpen that of jawOpen.
+    found, weights = solve_weights(own, shapes, options, carry=carry, only_arkit=only_arkit or not plain)
     table = weights if csv_rate is None else weights.at_rate(csv_rate)
     if tracks != "arkit":
         table, plain = table.tracks(tracks), True

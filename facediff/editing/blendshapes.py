@@ -59,7 +59,7 @@ class SolveOptions:
 
     smoothness: ranges.Strength = 0.02
     symmetry: ranges.Strength = 0.0
-    sparsity: ranges.Strength = 0.02
+    sparsity: ranges.Strength = 0.003
     ridge: ranges.Strength = 1e-6
     lower: ranges.Bound = 0.0
     upper: ranges.Bound = 1.0

@@ -67,6 +67,9 @@ class ShapeSet:
         return replace(self, names=tuple(self.names[index] for index in kept), deltas=self.deltas[kept])
 
 
+KEPT = "not ARKit's, kept as channels of their own"
+"""How the note on names that are not ARKit's begins."""
+
 BUILT_IN = "puppet"
 """What users give in place of a folder or file for the shapes of the built-in face."""
 
@@ -165,7 +168,7 @@ def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -
     if not np.isfinite(shape_set.deltas).all():
         raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it again")
     if shape_set.extra:
-        notes.append(f"not ARKit's, kept as channels of their own: {', '.join(shape_set.extra)}")
+        notes.append(f"{KEPT}: {', '.join(shape_set.extra)}")
     if shape_set.still:
         notes.append(f"move no vertex, so that their weights stay 0: {', '.join(shape_set.still)}")
     return replace(shape_set, notes=tuple(notes))

@@ -75,12 +75,14 @@ class BlendshapeWeights(Format):
         """Solve for the weights and write them, with a .json file that says how well they fit."""
         from facediff.editing.blendshapes import SolveOptions, own_weights, solve
         from facediff.editing.shapes import read_shapes
+        from facediff.spaces.arkit import ARKIT
 
         (animation,) = animations
         if options.shapes is None:  # checked by check_export
             weights = own_weights(animation)
         else:
-            shapes = read_shapes(Path(options.shapes), animation.template, animation.unit)
+            # Only those with a column: others would take motion that the table then lacks
+            shapes = read_shapes(Path(options.shapes), animation.template, animation.unit).only(ARKIT)
             weights = solve(animation, shapes, SolveOptions())
         if options.tracks != "arkit":
             weights = weights.tracks(options.tracks)

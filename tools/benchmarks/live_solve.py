@@ -68,14 +68,18 @@ def dense_shapes() -> ShapeSet:
     return ShapeSet(ARKIT, dense(rest), np.stack([dense(shapes[name] - rest) for name in ARKIT]))
 
 
-def some_motion(shapes: ShapeSet, frames: int) -> Animation:
-    """Each shape comes and goes a few times; a third of them works at a time."""
+def some_weights(frames: int) -> np.ndarray:
+    """Weights (T, 52): each shape comes and goes a few times; a third of them works at a time."""
     random = np.random.default_rng(1)
     at = np.arange(frames)[:, None] / FRAME_RATE
     waves = np.sin(2 * np.pi * (at * random.uniform(0.3, 2.0, len(ARKIT)) + random.uniform(size=len(ARKIT))))
-    weights = np.clip(1.5 * waves - 0.7, 0.0, 1.0)
-    offsets = np.einsum("tk,kvc->tvc", weights, shapes.deltas)
-    offsets += 0.001 * NOISE_MM * random.normal(size=offsets.shape)
+    return np.clip(1.5 * waves - 0.7, 0.0, 1.0)
+
+
+def some_motion(shapes: ShapeSet, frames: int, noise_mm: float = NOISE_MM) -> Animation:
+    """The motion of :func:`some_weights` with noise."""
+    offsets = np.einsum("tk,kvc->tvc", some_weights(frames), shapes.deltas)
+    offsets += 0.001 * noise_mm * np.random.default_rng(2).normal(size=offsets.shape)
     rest = shapes.neutral.astype(np.float32)
     return Animation("motion", rest + offsets.astype(np.float32), rest, FRAME_RATE)
 

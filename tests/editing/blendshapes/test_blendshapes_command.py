@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -200,6 +201,24 @@ def test_the_command_counts_frames_and_shapes(
 ) -> None:
     assert main(["blendshapes", str(archive), "-o", str(tmp_path / "w.csv"), "--shapes", str(folder)]) == 0
     assert "w.csv: 12 frames, 52 shapes" in capsys.readouterr().out
+
+
+def test_shapes_without_a_column_take_no_motion_from_those_of_the_table(
+    folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "mine"
+    shutil.copytree(folder, mine)
+    for name in ("mouthOpen", "viseme_aa"):  # as avatars have them: the jaw once more
+        shutil.copy(folder / "jawOpen.obj", mine / f"{name}.obj")
+    words = [str(archive), "--shapes", str(mine), "--smoothness", "0", "--sparsity", "0"]
+    assert main(["blendshapes", *words, "-o", str(tmp_path / "a.csv")]) == 0
+    assert "left out" in capsys.readouterr().out
+    assert main(["export", *words[:3], "-o", str(tmp_path / "b.csv")]) == 0
+    for table, within in (("a.csv", 2e-3), ("b.csv", 0.1)):
+        jaw = [float(row["JawOpen"]) for row in rows(tmp_path / table)[:12]]
+        assert jaw == pytest.approx(known["jawOpen"], abs=within)
+    assert main(["blendshapes", *words, "-o", str(tmp_path / "p.csv"), "--plain"]) == 0
+    assert "viseme_aa" in rows(tmp_path / "p.csv")[0]
 
 
 def test_tracks_of_visemes_from_the_weights(
