@@ -110,6 +110,11 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
     suffix = path.suffix
     if not suffix:
         raise FaceDiffError(f"{path}: has no suffix, which chooses the format; add one, such as {path.name}.glb")
+    if suffix.lower() == ".fbx":
+        raise FaceDiffError(
+            f"{path}: Blender writes .fbx; write {path.stem}.glb, then `blender --background --python glb_to_fbx.py -- "
+            f"{path.stem}.glb {path.name}` with the script docs/tools/glb_to_fbx.py of facediff's source"
+        )
     if suffix not in FORMATS:
         raise FaceDiffError(f'{path}: there is no format "{suffix}": {choices(suffix.lower(), FORMATS)}')
     if n_animations < 1:
