@@ -37,6 +37,7 @@ def retarget(
     show: Picture = None,
     accept_poor: bool = False,
     add_to_mesh: bool = False,
+    bare_face: bool = False,
     host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[ranges.Port, Option(metavar="N")] = 0,
     open: bool = False,  # noqa: A002 - the option's name
@@ -58,6 +59,8 @@ def retarget(
         show: picture of both faces at the widest mouth, a full blink and raised brows
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
+            (default for a .glb from a .glb that has textures, skins or targets)
+        bare_face: write the animated surface alone, without what else the target .glb has
         host: address at which the page of --pick is served; by default nobody but this machine reaches it
         port: its port; 0 for any free one
         open: open the page of --pick in the browser
@@ -67,6 +70,7 @@ def retarget(
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
     if add_to_mesh and (output.suffix != ".glb" or target_mesh.suffix.lower() != ".glb" or output == target_mesh):
         raise FaceDiffError(f"--add-to-mesh: expected two different .glb, not {target_mesh} and {output}; name them so")
+    refuse_idle("has no effect with --bare-face", add_to_mesh=add_to_mesh and bare_face)
     check_source(source, [animation])
     for option, file in (("--target-mesh", target_mesh), ("--landmarks", landmarks)):
         if file is not None and not file.is_file():
@@ -82,9 +86,13 @@ def retarget(
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.pictures import draw_correspondence
+    from facediff.mesh.glb import wears_more
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
+    dressed = not add_to_mesh and not bare_face and output.suffix == ".glb" and wears_more(target_mesh)
+    if dressed and output.exists() and output.samefile(target_mesh):
+        raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
     own = SourceReader(source).read(animation)
     if pick:
         pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
@@ -100,7 +108,9 @@ def retarget(
 
     made, found = transfer(own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge)
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
-    if add_to_mesh:
+    if dressed:
+        notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
+    if add_to_mesh or dressed:
         from facediff.export.glb_added import add_to_glb
 
         add_to_glb(output, target_mesh, made, ExportOptions().tolerance)

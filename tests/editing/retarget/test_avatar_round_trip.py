@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from facediff.animation import Animation
+from facediff.animation import Animation, write_archive
+from facediff.cli.app import main
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import Glb
+from facediff.mesh.glb import Glb, wears_more
 from facediff.mesh.glb_scene import placed_parts
 from tests.fakes.avatar import AvatarPart, avatar_parts, normals_of, write_avatar
 from tests.fakes.glb_targets import pack
@@ -169,6 +170,27 @@ def test_vertices_and_normals_move_as_the_animation_has_it(
             assert np.mean(cosine > np.cos(np.deg2rad(8))) > 0.95
             if frame == 4:
                 assert np.mean(stays < np.cos(np.deg2rad(8))) > 0.1
+
+
+def test_the_command_writes_into_the_avatar_unless_the_bare_face_is_asked_for(
+    tmp_path: Path, parts: dict[str, AvatarPart], capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "avatar.glb"
+    write_avatar(source, parts)
+    write_archive(tmp_path / "talk.npz", talk(source, parts))
+    words = ["retarget", str(tmp_path / "talk.npz"), "--target-mesh", str(source), "--accept-poor"]
+    assert main([*words, "-o", str(tmp_path / "out.glb")]) == 0
+    assert "--bare-face" in capsys.readouterr().out
+    kept, had = (opened(path).content for path in (tmp_path / "out.glb", source))
+    assert [kept["images"], kept["materials"], kept["skins"][0]["joints"]] == [
+        had["images"],
+        had["materials"],
+        had["skins"][0]["joints"],
+    ]
+    assert main([*words, "-o", str(tmp_path / "bare.glb"), "--bare-face"]) == 0
+    assert not opened(tmp_path / "bare.glb").entries("skins")
+    assert main([*words, "-o", str(source)]) == 2
+    assert not wears_more(tmp_path / "talk.npz")
 
 
 def test_a_mesh_shown_twice_moves_where_it_should(tmp_path: Path, parts: dict[str, AvatarPart]) -> None:
