@@ -52,10 +52,18 @@ SMOOTH = 5
 """Steps over which levels are averaged."""
 
 FLAT = 7.0
-"""Decibels within which the level of steady noise stays. Speech changes by more, but for drawn out vowels."""
+"""Decibels within which the level of steady noise stays for :data:`SHORT` steps if it is far below the speech."""
 
-SHORT, LONG = 25, 60
-"""Steps for which the level must stay so: 0.25 s if the noise is far below the speech, 0.6 s if it is as loud."""
+SHORT = 25
+"""Steps of 10 ms for which it does."""
+
+AS_LOUD = ((60, 3.0), (100, 5.0))
+"""Steps, and decibels within which noise stays for so long that is as loud as the speech. Words in one breath stay within
+7 dB for 60 steps in one clip of fifty and so in one clip of four hundred (built-in corpus, four synthesisers). White and
+pink noise stay within 3 dB, noise whose spectrum falls with 1/f² within 5."""
+
+LONG = AS_LOUD[-1][0]
+"""Steps that are remembered for it."""
 
 CLEARLY = 10.0
 """Decibels that make noise clearly softer than speech."""
@@ -218,9 +226,12 @@ class _EnergyListener(Listener):
         self._levels.append(level)
         self._loudest = max(level, self._loudest - FADING / 100, QUIETEST)
         latest = list(self._levels)
-        for length, stretches in ((SHORT, self._short), (LONG, self._long)):
+        for length, flat, stretches in (
+            (SHORT, FLAT, self._short),
+            *((length, flat, self._long) for length, flat in AS_LOUD),
+        ):
             some = [max(each, QUIETEST - 20) for each in latest[-length:]]
-            if len(some) == length and max(some) - min(some) < FLAT:
+            if len(some) == length and max(some) - min(some) < flat:
                 steady = sum(some) / length
                 while stretches and stretches[-1][1] >= steady:
                     stretches.pop()

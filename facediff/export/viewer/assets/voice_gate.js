@@ -2,7 +2,9 @@
 
 const GATE_HOP = 160; // samples of a step of 10 ms
 const QUIETEST_LEVEL = -65, SILENT_LEVEL = -120, LOUDEST_ABOVE = 40, FADING = 3;
-const SMOOTH_STEPS = 5, FLAT = 7, SHORT_STEPS = 25, LONG_STEPS = 60, CLEARLY = 10, NOISE_MEMORY = 500, HYSTERESIS = 3;
+const SMOOTH_STEPS = 5, LONG_STEPS = 100, CLEARLY = 10, NOISE_MEMORY = 500, HYSTERESIS = 3;
+/** Steps, decibels and which list: noise far below the speech, and noise as loud as it. */
+const STEADY = [[25, 7, 0], [60, 3, 1], [LONG_STEPS, 5, 1]];
 /** 150 Hz to 5 kHz at 16 kHz, in second-order sections: b0, b1, b2, a1, a2. */
 const SPEECH_BAND = [
   [0.3979518861810659, 0.7959037723621318, 0.3979518861810659, 0.44530146335179394, 0.21624043303098522],
@@ -63,16 +65,16 @@ class EnergyListener {
     this.waiting.push(Math.max(level, decibels(power))); // a step that is loud by itself is loud
     this.levels = [...this.levels.slice(1 - LONG_STEPS), level];
     this.loudest = Math.max(level, this.loudest - FADING / 100, QUIETEST_LEVEL);
-    [SHORT_STEPS, LONG_STEPS].forEach((length, which) => {
+    for (const [length, flat, which] of STEADY) {
       const stretches = this.stretches[which];
       const some = this.levels.slice(-length).map((each) => Math.max(each, QUIETEST_LEVEL - 20));
-      if (some.length === length && Math.max(...some) - Math.min(...some) < FLAT) {
+      if (some.length === length && Math.max(...some) - Math.min(...some) < flat) {
         const steady = some.reduce((sum, each) => sum + each, 0) / length;
         while (stretches.length && stretches.at(-1)[1] >= steady) stretches.pop();
         stretches.push([this.step, steady]);
       }
       while (stretches.length && stretches[0][0] < this.step - NOISE_MEMORY) stretches.shift();
-    });
+    }
   }
 
   decide() {
