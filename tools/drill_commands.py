@@ -222,10 +222,11 @@ DRILLS = [
         "data import-person",
         "person.npy --audio person.wav --name Target --frame-rate 30 --corpus persons --quiet -o entry",
     ),
+    Drill("data import-take", "take.csv person.wav --name Target --offset 0 -o entry"),
 ]
 """One or several for each command that writes, except ``fit``, which has a drill of its own."""
 
-WRITES_NOTHING = ("components", "data check")
+WRITES_NOTHING = ("components", "check-install", "data check")
 FIT = "fit"
 
 
@@ -360,6 +361,7 @@ def write_inputs(folder: Path, run: object) -> None:
     person.write_auxiliary(folder / "persons")
     person.write_speech(folder / "person.wav", person.FRAMES / person.RATE)
     np.save(folder / "person.npy", person.person().seen.astype(np.float32))
+    person.write_take(folder / "take.csv", person.FRAMES / person.RATE)
 
 
 def write_obj(path: Path, vertices: object, faces: object) -> None:

@@ -461,6 +461,7 @@ class ExportKeywords(TypedDict, total=False):
     up: Up | None
     no_speech: bool
     shapes: FilePath | None
+    tracks: Tracks
     key_tolerance: float
     tolerance: float
     view: View

@@ -157,3 +157,14 @@ def write_speech(path: Path, seconds: float, *, rate: int = 44100) -> Path:
     tone = 0.4 * loud(time) * np.sin(2 * np.pi * 180 * time)
     soundfile.write(path, np.stack([tone, tone], -1), rate)
     return path
+
+
+def write_take(path: Path, seconds: float) -> None:
+    """A recording of Live Link Face whose jaw opens three times a second."""
+    from facediff.spaces.files import ParameterClip, write_parameters
+    from facediff.spaces.layouts import layout
+
+    space = layout("arkit")
+    values = np.zeros((round(seconds * RATE), len(space.channels)), np.float32)
+    values[:, space.channels.index("jawOpen")] = 0.3 + 0.2 * np.sin(np.arange(len(values)) * 2 * np.pi * 3 / RATE)
+    write_parameters(path, ParameterClip("take", values, space, RATE))

@@ -23,6 +23,7 @@ import facediff.callbacks
 import facediff.callbacks.checkpoints
 from facediff import registry
 from facediff.data import SpeechMotionDataModule
+from facediff.data.parametric import FlameClips
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.samplers import NoiseProcess
@@ -231,7 +232,8 @@ def test_wild_arguments_of_a_corpus(
             next(iter(data.predict_dataloader()))
             data.assets()
 
-    assert draw(made, lambda **options: made(**{"root": str(tiny_root), **options}), use, "data", values) == []
+    needed = {"root": str(tiny_root), **({"layout": "flame_artalk"} if made is FlameClips else {})}
+    assert draw(made, lambda **options: made(**{**needed, **options}), use, "data", values) == []
 
 
 @WILD

@@ -103,7 +103,7 @@ def test_identities_are_hidden_by_their_share_in_training_only(
 ) -> None:
     model = known(make_model(identity_dropout=share), tiny)
     seen: list[Tensor] = []
-    monkeypatch.setattr(model.network, "conditions", lambda _, identity, style: seen.append(identity))
+    monkeypatch.setattr(model.network, "conditions", lambda _, identity, style, animated: seen.append(identity))
     many = replace(batch, identity=torch.arange(4000) % 2)
     torch.manual_seed(0)
     model.conditions(many)

@@ -90,7 +90,9 @@ BASES: dict[str, str] = {
     "data regions": "WORLD/corpus --corpus tests.fakes.tiny.Tiny --size 64 -o out.png",
     "data import-person": "WORLD/motion.npy --audio WORLD/person.wav --name P --corpus WORLD/people --frame-rate 30 "
     "-o person --quiet",
+    "data import-take": "WORLD/take.csv WORLD/person.wav --name P --offset 0 -o take",
     "components": "",
+    "check-install": "",
     "demo": "-o demo",
     **{f"data prepare {corpus}": "WORLD/empty raw_out --workers 1 --quiet" for corpus in CORPORA},
 }
@@ -111,7 +113,7 @@ def build_world(folder: Path) -> Path:
     from tests.fakes.benchmark import write_benchmark
     from tests.fakes.clicks import clicks
     from tests.fakes.exported import write_exported
-    from tests.fakes.person import person, write_auxiliary, write_speech
+    from tests.fakes.person import person, write_auxiliary, write_speech, write_take
     from tests.fakes.published import write_author_files
     from tests.fakes.study import SCORES, as_file, small_study, write_study
     from tests.fakes.tiny import write_tiny
@@ -136,6 +138,7 @@ def build_world(folder: Path) -> Path:
     write_auxiliary(folder / "people")
     np.save(folder / "motion.npy", person().seen[:90].astype(np.float32))
     write_speech(folder / "person.wav", 3)
+    write_take(folder / "take.csv", 3)
     (folder / "run").mkdir()
     (folder / "run" / "metrics.csv").write_text("epoch,step,train/loss\n0,0,1.0\n1,1,0.5\n2,2,0.3\n")
     study = small_study(clips=3)

@@ -436,6 +436,8 @@ def test_model_that_cannot_be_exported_is_refused(tiny: Tiny, tmp_path: Path) ->
         graphs = AnimationModel.graphs
 
     made = Deaf.__new__(Deaf)
+    torch.nn.Module.__init__(made)
+    made._assets = tiny.assets()
     with pytest.raises(FaceDiffError, match="Deaf"):
         export_model(made, tmp_path / "out")
     assert not (tmp_path / "out").exists()

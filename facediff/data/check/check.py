@@ -76,7 +76,7 @@ def check(
     Args:
         root: the folder; or a packed corpus, its folder or its address.
         corpus: name of the corpus (``biwi``), or import path of its data module; found out if None.
-        split: only the totals of this way to split the corpus (3DMEAD: ``sentence``, ``identity``).
+        split: only the totals of this way to split the corpus (3DMEAD: ``sentence``, ``identity``, ``both``).
         quick: read headers only: no NaN, no comparison with templates, no copies; files are compared by size.
         workers: clips at a time; if None, as many as processors where there is much to read, or all of a cluster.
         scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.

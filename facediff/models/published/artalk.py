@@ -112,7 +112,7 @@ class ARTalk(ParametricModel):
         num_layers: Layers = 12,
         num_heads: Heads = 12,
         feed_forward_dim: Width | None = None,
-        scales: Sequence[int] = (1, 5, 25, 50, 100),
+        scales: Annotated[Sequence[Annotated[int, Range(1, 10_000)]], Range(items=(2, 16))] = (1, 5, 25, 50, 100),
         code_dim: Width = 32,
         codec_dim: Width = 512,
         codec_layers: Layers = 8,

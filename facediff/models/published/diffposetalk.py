@@ -136,7 +136,7 @@ class DiffPoseTalk(ParametricModel):
         guidance_form: Literal["published", "corrected"] = "published",
         audio_scale: Annotated[float, Range(0, 100)] = 1.15,
         style_scale: Annotated[float, Range(0, 100)] = 3.0,
-        threshold: Sequence[float] | None = None,
+        threshold: Annotated[Sequence[Annotated[float, Range(0, 1e6)]], Range(items=(3, 3))] | None = None,
         velocity_weight: Weight = 5.0,
         smoothness_weight: Weight = 0.5,
         head_weight: Weight = 0.05,

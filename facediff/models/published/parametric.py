@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +15,7 @@ from facediff.models.inference import Style
 from facediff.models.person_styles import PersonStyles
 from facediff.models.published.base import NO_STYLE, Alignment, PublishedModel
 from facediff.speech.frame_clock import FrameClock
+from facediff.utils.ranges import Range
 
 DEAD = 0.01
 """Channels whose deviation is a smaller share than this of the largest are divided by that share of it: a channel that
@@ -42,7 +43,7 @@ class ParametricModel(PublishedModel):
         *,
         head: bool = True,
         jaw: Literal["x", "all"] = "x",
-        shape_dim: int = 0,
+        shape_dim: Annotated[int, Range(0, 1000)] = 0,
         alignment: Alignment = "interpolated",
         unseen_identity: IdentityPolicy = "style_only",
         **options: Any,  # noqa: ANN401

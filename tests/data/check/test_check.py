@@ -224,7 +224,7 @@ def test_3dmead_has_totals_of_both_ways_to_split_it(fakes: Path) -> None:
     report = check(fakes / "mead", MEAD)
     assert report.findings == [f for f in report.findings if f.kind == "region_unusual"]
     sizes = small.MEAD_FRAMES
-    of = {way: {} for way in ("sentence", "identity")}
+    of = {way: {} for way in ("sentence", "identity", "both")}
     for (way, split), row in rows(report).items():
         of[way][split] = row[3]
     train_a = sizes["M003_001_0_0"] + sizes["M003_024_1_2"]
@@ -238,6 +238,11 @@ def test_3dmead_has_totals_of_both_ways_to_split_it(fakes: Path) -> None:
         "train": sum(n for name, n in sizes.items() if name[:4] in ("M003", "W009")),
         "val": sizes["M032_001_0_0"],
         "test_b": sizes["W040_030_7_2"],
+    }
+    assert of["both"] == {
+        **{split: of["sentence"][split] for split in ("train", "val", "test_a")},
+        "test_b": sizes["W040_030_7_2"],
+        "none": sizes["M032_001_0_0"],
     }
     only = check(fakes / "mead", MEAD, split="identity")
     assert {row["way"] for row in only.splits} == {"identity"}
