@@ -60,7 +60,7 @@ SHORT = 25
 AS_LOUD = ((60, 3.0), (100, 5.0))
 """Steps, and decibels within which noise stays for so long that is as loud as the speech.
 
-Words in one breath stay within 7 dB for 60 steps in one clip of fifty, and so in one clip of four hundred (built-in corpus,
+Words in one breath stay within 7 dB for 60 steps in one clip of fifty, and so in one of four hundred (built-in corpus,
 four synthesisers). White and pink noise stay within 3 dB, noise whose spectrum falls with 1/f² within 5.
 """
 
