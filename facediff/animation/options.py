@@ -334,6 +334,39 @@ class AnimationOptions(
     checkpoint: FilePath
     quiet: bool = True
 
+    def words(self) -> list[str]:
+        """The options that change a take, as on the command line, but for keys over time and what metadata name.
+
+        Example:
+            >>> AnimationOptions(checkpoint="puppet.ckpt", blinks=True, acting="prosody", seed=3).words()
+            ['--blinks', '17', '--acting', 'prosody']
+        """
+        words = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name in NAMED_ELSEWHERE or value == field.default:
+                continue
+            if isinstance(value, Mapping):
+                value = ",".join(f"{name}={share:.15g}" for name, share in value.items())
+            elif isinstance(value, float):
+                value = f"{value:.15g}"
+            words += [f"--{field.name.replace('_', '-')}", *([] if value is True else [str(value)])]
+        return words
+
+
+NAMED_ELSEWHERE = (
+    "checkpoint",
+    "identity",
+    "style",
+    "seed",
+    "samples",
+    "direction",
+    "quiet",
+    "device",
+    "commercial_only",
+)
+"""Options of a take that its metadata name by themselves, that its page asks for, or that change nothing in it."""
+
 
 def option_texts(options: type) -> dict[str, str]:
     """The help text of every option of a dataclass, from its docstring and those of the groups that it extends."""

@@ -39,7 +39,9 @@ FORMATS: Mapping[str, Format] = _Formats()
 """Format by suffix (``".glb"``): the built-in ones and those that installed packages have added."""
 
 
-def write_animations(path: Path, animations: Sequence[Animation], options: ExportOptions | None = None) -> list[Path]:
+def write_animations(
+    path: Path, animations: Sequence[Animation], options: ExportOptions | None = None, *, into: Path | None = None
+) -> list[Path]:
     """Write animations in the format that the suffix chooses; either all files appear, each complete, or none.
 
     Args:
@@ -48,6 +50,7 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
             ``hello_obj/``).
         animations: at least one.
         options: what the user chose; the defaults if None.
+        into: the .glb of the animations' mesh, to whose copy each is added; surfaces alone are written if None.
 
     Returns:
         The written files and folders: first the animations, then what was written next to them.
@@ -77,7 +80,12 @@ def write_animations(path: Path, animations: Sequence[Animation], options: Expor
         try:
             for target, group, speech_file in zip(targets, groups, speech_files, strict=True):
                 staged = hidden / target.name
-                form.write(staged, group, replace(options, speech_file=speech_file))
+                if into is None:
+                    form.write(staged, group, replace(options, speech_file=speech_file))
+                else:
+                    from facediff.export.glb_added import add_to_glb
+
+                    add_to_glb(staged, into, group[0], options.tolerance)
                 if speech_file is not None and (wav := speech_wav(group[0])) is not None:
                     ((folder_of(staged) if form.is_folder else hidden) / speech_file).write_bytes(wav)
         except FaceDiffError as error:

@@ -7,6 +7,7 @@ which takes speech from samples to finished animations and files. Subclasses gen
 
 from __future__ import annotations
 
+import json
 import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -229,9 +230,14 @@ class AnimationPipeline(ABC):
             the files, and the first animation.
         """
         from facediff.export import write_animations
+        from facediff.mesh.glb import wears_more
 
+        into = None
+        if output.suffix == ".glb" and self.options.target_mesh is not None and export.output_unit is None:
+            target = Path(self.options.target_mesh)
+            into = target if wears_more(target) else None  # else its textures, skins and targets would be lost
         with self.animations(speech, name, output, seed=seed) as animations:
-            return write_animations(output, animations, export), animations[0]
+            return write_animations(output, animations, export, into=into), animations[0]
 
     @contextmanager
     def animations(
@@ -363,6 +369,8 @@ class AnimationPipeline(ABC):
             metadata["denoised"] = "yes"
         if self.direction is not None:
             metadata["direction"] = self.direction.text()
+        if words := options.words():
+            metadata["options"] = json.dumps(words, ensure_ascii=False)
         for option in ("expressivity", "guidance"):
             if (scales := getattr(options, option)) is not None:
                 metadata[option] = scales_text(scales)

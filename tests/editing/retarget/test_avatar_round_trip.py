@@ -11,6 +11,7 @@ import pytest
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
+from facediff.export import write_animations
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb, wears_more
@@ -190,6 +191,8 @@ def test_the_command_writes_into_the_avatar_unless_the_bare_face_is_asked_for(
     assert main([*words, "-o", str(tmp_path / "bare.glb"), "--bare-face"]) == 0
     assert not opened(tmp_path / "bare.glb").entries("skins")
     assert main([*words, "-o", str(source)]) == 2
+    write_animations(tmp_path / "into.glb", [talk(source, parts)], into=source)
+    assert opened(tmp_path / "into.glb").content["images"] == had["images"]
     assert not wears_more(tmp_path / "talk.npz")
 
 

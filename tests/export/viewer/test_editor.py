@@ -41,11 +41,14 @@ KEYS = Direction(
 )
 
 
+TAKE = {"options": json.dumps(["--blinks", "12", "--eyes", "my eyes.json"])}
+
+
 def directed(keys: Direction = KEYS, **changes: object) -> Animation:
     """The face of clicks, with two regions, made with keys."""
     regions = {"lips": np.arange(4, 8), LOW: np.arange(8, 12)}
     made = clicks()
-    return replace(made, regions=regions, metadata={**made.metadata, METADATA: keys.text()}, **changes)  # type: ignore[arg-type]
+    return replace(made, regions=regions, metadata={**made.metadata, **TAKE, METADATA: keys.text()}, **changes)  # type: ignore[arg-type]
 
 
 def keys_in(page: Page) -> Direction:
@@ -157,7 +160,7 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
     assert read_direction(saved).rows() == wanted.rows()
     command = page.evaluate("document.getElementById('command').textContent")
     assert "--identity nobody" in command
-    assert "--direction clicks_keys.json" in command
+    assert "--blinks 12 --eyes 'my eyes.json' --direction clicks_keys.json" in command
     for _ in range(12):
         press(page, "z", 2)
     assert page.evaluate("facediff.direction") == before

@@ -3,6 +3,19 @@
 /** A word as a shell takes it. */
 const quoted = (word) => (/^[\w./:=,+@-]+$/.test(word) ? word : `'${word.replaceAll("'", `'\\''`)}'`);
 
+/** The options of a take, from its metadata; a file from elsewhere may hold anything, but no output and no other model. */
+const optionWords = (text) => {
+  let words = [];
+  try {
+    words = JSON.parse(text ?? "[]");
+  } catch {
+    return [];
+  }
+  const strings = Array.isArray(words) ? words.filter((word) => typeof word === "string") : [];
+  const known = strings.every((word) => !word.startsWith("-") || /^--(?!output|checkpoint|yes)[a-z-]+$|^-[\d.]+$/.test(word));
+  return known ? strings.map(quoted) : [];
+};
+
 class Editor {
   constructor(player) {
     this.player = player;
@@ -233,6 +246,7 @@ class Editor {
     for (const name of directed ? ["identity", "seed"] : ["identity", "style", "seed"]) {
       if (/^[\w.-]+$/.test(metadata[name] ?? "")) words.push(`--${name}`, metadata[name]); // not "zoe (not trained on)"
     }
+    words.push(...optionWords(metadata.options));
     words.push("--direction", quoted(this.fileOf(this.number)), "-o", "take.html");
     find("command").textContent = words.join(" ");
   }
