@@ -54,6 +54,7 @@ def demo(
     check_export(output / "truth_and_prediction.mp4", ExportOptions())
     from facediff.models.audio_distillation import DistillationOptions
     from facediff.models.checkpoint import read_checkpoint
+    from facediff.utils.files import scratch_folder
 
     started = time.monotonic()
 
@@ -68,10 +69,13 @@ def demo(
     logger = [f"--trainer.logger.save_dir={output}", "--trainer.logger.name=training"]
     fitted = run_cli("fit", ["--config", CONFIG, *logger, *options])
     checkpoint = output / "puppet.ckpt"
-    fitted.trainer.save_checkpoint(checkpoint)
-    if not fast:
-        report("adapting the audio encoder to other voices and rooms")
-        write_distilled(checkpoint, read_checkpoint(checkpoint), fitted.datamodule, checkpoint, DistillationOptions())
+    # The name stands for the finished model: a demo that is killed while it adapts leaves no other under it.
+    with scratch_folder(checkpoint) as hidden:
+        trained = checkpoint if fast else hidden / checkpoint.name
+        fitted.trainer.save_checkpoint(trained)
+        if not fast:
+            report("adapting the audio encoder to other voices and rooms")
+            write_distilled(trained, read_checkpoint(trained), fitted.datamodule, checkpoint, DistillationOptions())
     report("scoring sentences that were not in training")
     where = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={output}"]
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])
