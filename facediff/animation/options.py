@@ -355,15 +355,8 @@ class AnimationOptions(
 
 
 NAMED_ELSEWHERE = (
-    "checkpoint",
-    "identity",
-    "style",
-    "seed",
-    "samples",
-    "direction",
-    "quiet",
-    "device",
-    "commercial_only",
+    *("checkpoint", "identity", "style", "seed", "expressivity", "guidance", "direction"),
+    *("samples", "quiet", "device", "commercial_only"),
 )
 """Options of a take that its metadata name by themselves, that its page asks for, or that change nothing in it."""
 

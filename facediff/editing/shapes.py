@@ -63,7 +63,10 @@ class ShapeSet:
         """The set without all other names; refused if nothing would be left."""
         kept = [index for index, name in enumerate(self.names) if name in names]
         if not kept:
-            raise FaceDiffError(f"shapes: none is named as one of {', '.join(names[:4])} …; name them so")
+            raise FaceDiffError(
+                f"shapes: {', '.join(self.names[:4])}{' …' if len(self.names) > 4 else ''} are none of "
+                f"{', '.join(names[:4])} …, which the table has columns for; name them so, or write a plain table"
+            )
         return replace(self, names=tuple(self.names[index] for index in kept), deltas=self.deltas[kept])
 
 

@@ -243,8 +243,8 @@ class Editor {
     const { metadata } = this.facts.animations[this.number];
     const words = ["facediff", "animate", "SPEECH.wav", "--checkpoint", quoted(metadata.checkpoint ?? "CHECKPOINT")];
     const directed = this.direction.of("style").length > 0; // then the style of the take is not one for all of it
-    for (const name of directed ? ["identity", "seed"] : ["identity", "style", "seed"]) {
-      if (/^[\w.-]+$/.test(metadata[name] ?? "")) words.push(`--${name}`, metadata[name]); // not "zoe (not trained on)"
+    for (const name of ["identity", ...(directed ? [] : ["style"]), "seed", "expressivity", "guidance"]) {
+      if (/^[\w.=,-]+$/.test(metadata[name] ?? "")) words.push(`--${name}`, metadata[name]); // not "zoe (not trained on)"
     }
     words.push(...optionWords(metadata.options));
     words.push("--direction", quoted(this.fileOf(this.number)), "-o", "take.html");
