@@ -30,6 +30,7 @@ from facediff.models.layers import Heads, Layers, Share, Width, exporting, inter
 from facediff.models.published.autoregressive import DecoderLayer, Period, decoder_sizes, periodic_bias
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
 from facediff.models.published.faceformer import LAYER_NAMES
+from facediff.models.published.lam_finishing import read_steps
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
 from facediff.spaces import Space
@@ -114,7 +115,7 @@ class EmoTalk(DirectModel):
         if not level < levels:
             raise ArgumentError({"level": level}, f"there are {levels} levels, counted from 0")
         self.level = level
-        self.finish = read_finish(finish, self.space)
+        self.finish = read_steps(finish, FINISHING, self.space)
         self.emotion_encoder = Wav2Vec2Encoder(dim=None, source=emotion_source, config=emotion_config, edges=False)
         self.network = EmoTalkNetwork(
             widths=(self.audio_width, self.emotion_encoder.width),
@@ -271,20 +272,6 @@ class EmoTalkNetwork(nn.Module):
 
 
 # What the demonstration does with the weights.
-
-
-def read_finish(text: str, space: Space) -> frozenset[str]:
-    """Steps by their names, joined by ``+``.
-
-    Raises:
-        ArgumentError: if there is no such step, or the motion is not of ARKit's channels.
-    """
-    steps = frozenset(filter(None, text.split("+")))
-    if odd := sorted(steps - set(FINISHING)):
-        raise ArgumentError({"finish": text}, f"there is no step {odd[0]}; choose from {', '.join(FINISHING)}")
-    if steps and space.kind != "arkit":
-        raise ArgumentError({"finish": text}, "is for the channels of ARKit; leave it out")
-    return steps
 
 
 def finished(

@@ -8,7 +8,7 @@ averaged, and eyes blink at random. Random numbers are those of NumPy's old gene
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,6 +40,25 @@ BLINKS = np.array(
 """The published courses of a lid over seven frames."""
 
 
+def read_steps(text: str, known: Sequence[str], space: Space) -> frozenset[str]:
+    """Steps after a network by their names, joined by ``+``.
+
+    Args:
+        text: what was asked for; nothing if empty.
+        known: the method's steps.
+        space: of the motion.
+
+    Raises:
+        ArgumentError: if there is no such step, or the motion is not of ARKit's channels.
+    """
+    steps = frozenset(filter(None, text.split("+")))
+    if odd := sorted(steps - set(known)):
+        raise ArgumentError({"finish": text}, f"there is no step {odd[0]}; choose from {', '.join(known)}")
+    if steps and space.kind != "arkit":
+        raise ArgumentError({"finish": text}, "is for the channels of ARKit; leave it out")
+    return steps
+
+
 @dataclass(frozen=True)
 class Finishing:
     """Which steps are done, with the channels that they need.
@@ -56,17 +75,8 @@ class Finishing:
 
     @classmethod
     def of(cls, text: str, space: Space, frame_rate: float) -> Finishing:
-        """Steps by their names, joined by ``+``.
-
-        Raises:
-            ArgumentError: if there is no such step, or the motion is not of ARKit's channels.
-        """
-        steps = frozenset(filter(None, text.split("+")))
-        if odd := sorted(steps - set(STEPS)):
-            raise ArgumentError({"finish": text}, f"there is no step {odd[0]}; choose from {', '.join(STEPS)}")
-        if steps and space.kind != "arkit":
-            raise ArgumentError({"finish": text}, "is for the channels of ARKit; leave it out")
-        return cls(steps, space, frame_rate)
+        """Steps by their names, as :func:`read_steps` takes them."""
+        return cls(read_steps(text, STEPS, space), space, frame_rate)
 
     def start(self, seed: int) -> Finish:
         """Finish one recording."""
