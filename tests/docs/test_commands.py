@@ -33,7 +33,7 @@ PLACES = re.compile(r"\b(FIGURE|CHECKPOINT|FOLDER|SWEEP|TEAM)\b|…|\$\{?\w+|<")
 MODULES = {"tutorial_research.md": "my_method", "losses.md": "my_losses", "own_data.md": "multiface"}
 """The file that a page has its first block of Python saved as."""
 
-TRIED_QUICKLY = ("tutorial_research.md", "losses.md", "own_data.md", "packed.md", "overrides.md", "examples")
+TRIED_QUICKLY = ("tutorial_research.md", "losses.md", "own_data.md", "packed.md", "examples")
 """Pages whose trainings are parsed in the quick suite; all others are with ``pytest -m slow``."""
 
 
