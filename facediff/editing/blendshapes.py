@@ -14,9 +14,12 @@ from facediff.editing.bounded import Problem, minimise, minimise_sparse
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.mesh import triangle_areas
-from facediff.spaces.arkit import ARKIT, ROTATIONS, absent_from, beyond_arkit, mirror_pairs
-from facediff.spaces.files.tables import live_link_header, timecode
+from facediff.spaces.arkit import ARKIT, absent_from, beyond_arkit, mirror_pairs
+from facediff.spaces.files.clips import ParameterClip
+from facediff.spaces.files.tables import gaze, live_link_header, live_link_rows
+from facediff.spaces.layouts import layout
 from facediff.spaces.rigs import LinearRig
+from facediff.spaces.rotations import convert
 from facediff.spaces.space import Space
 from facediff.spaces.visemes import VisemeSet, visemes
 from facediff.utils import ranges
@@ -89,6 +92,8 @@ class Weights:
         still: names whose shape moves no vertex, and whose weight therefore says nothing.
         metadata: the animation's, and how the weights were solved for.
         head: (T, 3) rotation of the head that the weights leave out, axis-angle in radians; None if it does not move.
+        eyes: (T, 6) yaw, pitch and roll of the left and the right eye, radians as
+            :func:`facediff.spaces.files.tables.gaze` has them; None if only weights say where the eyes look.
     """
 
     names: tuple[str, ...]
@@ -100,6 +105,7 @@ class Weights:
     still: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
     head: Array | None = None
+    eyes: Array | None = None
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -139,13 +145,17 @@ class Weights:
         def interpolated(values: Array) -> Array:
             return np.interp(new_times, old_times, values).astype(np.float64)
 
+        def columns(values: Array | None) -> Array | None:
+            return None if values is None else np.stack([interpolated(column) for column in values.T], axis=1)
+
         return replace(
             self,
             values=np.stack([interpolated(values) for values in self.values.T], axis=1),
             residual_rms_mm=interpolated(self.residual_rms_mm),
             residual_max_mm=interpolated(self.residual_max_mm),
             frame_rate=frame_rate,
-            head=None if self.head is None else np.stack([interpolated(values) for values in self.head.T], axis=1),
+            head=columns(self.head),
+            eyes=columns(self.eyes),
         )
 
     def tracks(self, viseme_set: VisemeSet) -> Weights:
@@ -207,6 +217,8 @@ def own_weights(animation: Animation) -> Weights:
     if values is None:
         raise FaceDiffError(f"{animation.name}: has no weights of its own; give shapes to solve for them")
     face, frames = list(space.face), len(values)
+    turns = {turn.joint: convert(values[:, list(turn.channels)], turn.form, "euler") for turn in space.rotations}
+    eyes = [turns[joint] for joint in ("left_eye", "right_eye") if joint in turns]
     return Weights(
         names=tuple(space.channels[channel] for channel in face),
         values=np.asarray(values[:, face], np.float64),
@@ -216,6 +228,7 @@ def own_weights(animation: Animation) -> Weights:
         frame_rate=animation.frame_rate,
         metadata={**animation.metadata, "weights": "those of the model; nothing was solved for"},
         head=None if animation.head is None else animation.head[:, :3],
+        eyes=np.concatenate(eyes, axis=1) if len(eyes) == 2 else None,
     )
 
 
@@ -451,19 +464,16 @@ def _residuals(animation: Animation, moving: Moving, values: Array) -> tuple[Arr
 # Weights as CSV, with a JSON file next to the table for what a table cannot say.
 
 FORMAT = "facediff blendshape weights 1"
-HEAD_COLUMNS = (
-    "head in shares of 180 degrees: yaw and roll to its own left and pitch upwards are positive; the eyes were not "
-    "solved for, their columns are 0 and say nothing"
-)
 SURELY_SIXTIETHS = 31 / 60  # A table with a row at this time is read as one of sixtieths
 
 
 def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:
     """Write a table as Epic's app Live Link Face records it, and ``<name>.json`` next to it.
 
-    A row for each frame: timecode, number of values (61), ARKit's 52 names in order, rotations of head and eyes. Names
-    without a shape and all rotations are 0; the JSON file declares them, and holds the frame rate and each frame's
-    residual. Both files appear whole or not at all.
+    A row for each frame: timecode, number of values (61), ARKit's 52 names in order, rotations of head and eyes, as
+    :func:`facediff.spaces.files.read_parameters` reads them. Names without a shape are 0, and so are rotations of a
+    head that does not move and of eyes without ``eyeLook`` shapes; the JSON file declares them, and holds the frame
+    rate and each frame's residual. Both files appear whole or not at all.
 
     A table that ends before frame number 31 of a second gets one more row there, which holds the last frame: Unreal
     Engine's importer takes a table for one of 30 frames a second unless it finds a greater number than 30.
@@ -481,38 +491,34 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
         )
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
     held = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
-    shown, rotations = (
-        np.concatenate([rows, rows[-1:]])[: len(held)] for rows in (weights.values, live_link_rotations(weights))
+    values, absent = live_link_values(weights)
+    values = np.concatenate([values, values[-1:]])[: len(held)]
+    rows = live_link_rows(
+        ParameterClip(path.stem, values, layout("live_link"), weights.frame_rate, np.array(held), layout="live_link")
     )
-    rows = (
-        [
-            timecode(seconds),
-            str(len(ARKIT) + len(ROTATIONS)),
-            *(f"{values[column[name]]:.8f}" if name in column else "0.00000000" for name in ARKIT),
-            *(f"{value:.8f}" for value in turned),
-        ]
-        for seconds, values, turned in zip(held, shown, rotations, strict=True)
-    )
-    said = "head and eyes were not solved for: their columns are 0 and say nothing"
     more: dict[str, object] = {
-        "rotations": said if weights.head is None else HEAD_COLUMNS,
+        "rotations": "radians, as Live Link Face records them: yaw and roll to the face's right and pitch down are "
+        "positive; columns of rotations_absent are 0 and say nothing",
+        "rotations_absent": absent,
         "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
         "rows_held": len(held) - len(times),
     }
     _write_both(path, live_link_header(), rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
 
 
-def live_link_rotations(weights: Weights) -> Array:
-    """The rotations of a table's rows (T, 9): those of the head as shares of 180 degrees; the eyes' are 0.
-
-    Epic's plug-in for ARKit fills these columns with yaw, pitch and roll in degrees over 180; yaw and roll are positive
-    to the face's own left, pitch upwards.
-    """
-    rotations = np.zeros((len(weights.values), len(ROTATIONS)))
-    if weights.head is not None:
-        pitch, yaw, roll = np.rad2deg(weights.head).T
-        rotations[:, :3] = np.stack([yaw, -pitch, -roll], axis=1) / 180
-    return rotations
+def live_link_values(weights: Weights) -> tuple[npt.NDArray[np.float32], list[str]]:
+    """Values (T, 61) in the layout ``live_link``, and which of ``head`` and ``eyes`` they know nothing about."""
+    column = {name: index for index, name in enumerate(weights.names)}
+    looks = [name for name in column if name.startswith("eyeLook") and name not in weights.still]
+    zero = np.zeros(len(weights.values))
+    shapes = [weights.values[:, column[name]] if name in column else zero for name in ARKIT]
+    head = np.zeros((len(zero), 3)) if weights.head is None else convert(weights.head, "axis_angle", "euler")
+    eyes = gaze(weights.names, weights.values) if weights.eyes is None else weights.eyes
+    absent = [
+        *(["head"] if weights.head is None else []),
+        *(["eyes"] if weights.eyes is None and not looks else []),
+    ]
+    return np.concatenate([np.stack(shapes, axis=1), head, eyes], axis=1).astype(np.float32), absent
 
 
 def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from facediff.editing.controlled import apply_controls
 from facediff.editing.direction import Direction, Key
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
+from facediff.spaces.files import read_parameters
+from facediff.spaces.rotations import convert
 from tests.fakes.clicks import clicks
 from tests.fakes.glb_reader import Reader
 
@@ -79,12 +82,19 @@ def test_table_has_its_angles_and_weights_without_it(turned: Animation, tmp_path
     weights, plain = (solve(each, shapes, SolveOptions()) for each in (turned, clicks()))
     np.testing.assert_allclose(weights.values, plain.values, atol=1e-4)
     write_live_link(tmp_path / "w.csv", weights)
+    clip = read_parameters(tmp_path / "w.csv")
+    turn = next(turn for turn in clip.space.rotations if turn.joint == "head")
+    axis_angle = convert(clip.values[:, list(turn.channels)], turn.form, "axis_angle")
+    np.testing.assert_allclose(axis_angle, weights.head, atol=1e-6)
     with (tmp_path / "w.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    expected = {"HeadPitch": -8.0, "HeadYaw": -12.0, "HeadRoll": -5.0}
-    assert {name: 180 * float(rows[60][name]) for name in expected} == pytest.approx(expected, abs=1e-4)
-    assert {float(rows[0][name]) for name in expected} == {0.0}
-    assert {float(row["LeftEyeYaw"]) for row in rows} == {0.0}
+        row = list(csv.DictReader(stream))[60]
+    # The app's columns are radians, mirrored: yaw and roll have the other sign.
+    assert turned.head is not None
+    yaw, pitch, roll = Rotation.from_rotvec(turned.head[60, :3]).as_euler("YXZ")
+    assert [float(row[f"Head{axis}"]) for axis in ("Yaw", "Pitch", "Roll")] == pytest.approx(
+        [-yaw, pitch, -roll], abs=1e-6
+    )
+    assert json.loads((tmp_path / "w.json").read_text())["rotations_absent"] == ["eyes"]
     faster = weights.at_rate(60.0)
     assert faster.head is not None
     assert len(faster.head) == len(faster.values)

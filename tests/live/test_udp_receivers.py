@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pylivelinkface import FaceBlendShape, PyLiveLinkFace
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_message import OscMessage
@@ -75,7 +76,19 @@ def test_a_public_decoder_reads_each_weight_under_its_name(opened: Opened, liste
     for name, weight in zip(ARKIT, weights_of(3), strict=True):
         shape = FaceBlendShape[name[0].upper() + name[1:]]
         assert face.get_blendshape(shape) == pytest.approx(weight, abs=1e-7), name
-    assert [face.get_blendshape(shape) for shape in FaceBlendShape if shape.value >= len(ARKIT)] == [0.0] * 9
+    rotations = [face.get_blendshape(shape) for shape in FaceBlendShape if shape.value >= len(ARKIT)]
+    assert rotations == pytest.approx([0.0] * 3 + mirrored_gaze(weights_of(3)), abs=1e-6)
+
+
+def mirrored_gaze(weights: NDArray[np.floating]) -> list[float]:
+    """Yaw to the right, pitch down and roll of both eyes, radians."""
+    look = dict(zip(ARKIT, weights.tolist(), strict=True))
+    turns = []
+    for side, outwards in (("Left", -1), ("Right", 1)):
+        yaw = outwards * 0.60 * (look[f"eyeLookOut{side}"] - look[f"eyeLookIn{side}"])
+        pitch = 0.61 * look[f"eyeLookDown{side}"] - 0.44 * look[f"eyeLookUp{side}"]
+        turns += [yaw, pitch, yaw * pitch]
+    return turns
 
 
 def test_the_fields_of_a_live_link_datagram(opened: Opened, listener: Listener, performance: Performance) -> None:

@@ -12,7 +12,7 @@ frame number            4           of the timecode: frames since midnight
 part of a frame         4           float from 0 to below 1
 frame rate              4 + 4       numerator and denominator
 count                   1           61
-values                  61 × 4      floats: 52 weights from 0 to 1, yaw, pitch and roll of head and eyes
+values                  61 × 4      floats: 52 weights from 0 to 1, yaw, pitch and roll of head and eyes in radians
 ======================  ==========  ===================================================================
 """
 
@@ -23,11 +23,14 @@ import time
 import uuid
 from fractions import Fraction
 
+import numpy as np
+
 from facediff.errors import FaceDiffError
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
-from facediff.spaces.arkit import ARKIT, ROTATIONS, left_first
+from facediff.spaces.arkit import ARKIT, left_first
+from facediff.spaces.files.tables import gaze, mirrored
 
 VERSION = 6
 LONGEST_NAME = 64
@@ -42,7 +45,8 @@ class LiveLink(UdpReceiver):
     """Unreal Engine's Live Link Face: weights of ARKit's shapes by UDP.
 
     The timecode begins at the time of day at which the first frame is sent and goes on with the numbers of the frames:
-    where frames were dropped, numbers are missing. Rotations of head and eyes are 0.
+    where frames were dropped, numbers are missing. Rotations of the eyes follow the weights of the ``eyeLook`` shapes
+    as in the app's recordings; those of the head are 0, since live frames do not say how the head is turned.
 
     Args:
         address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
@@ -79,7 +83,9 @@ class LiveLink(UdpReceiver):
         if self._first is None:
             self._first = int(seconds_of_day() * self._rate) - frame.index
         number = (self._first + frame.index) % int(DAY * self._rate)
-        values = [*self._weights.of(frame).tolist(), *(0.0 for _ in ROTATIONS)]
+        weights = self._weights.of(frame)
+        rotations = mirrored(np.concatenate([np.zeros(3), gaze(ORDER, weights[None])[0]]))
+        values = [*weights.tolist(), *rotations.tolist()]
         rate = self._rate.numerator, self._rate.denominator
         return [self._head + struct.pack(f">ifiiB{len(values)}f", number, 0.0, *rate, len(values), *values)]
 

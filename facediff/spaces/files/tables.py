@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -35,6 +36,8 @@ _MIRRORED = np.array([not name.endswith("Pitch") for name in ROTATIONS])
 In its recordings, eyeLookOutLeft and eyeLookInRight come with negative yaws, eyeLookDown with positive pitches, and the
 eyes' rolls are the products of both: a mirrored frame, in which yaw and roll change their signs. Heads were not seen
 to move in these recordings; they are taken to be in the same frame."""
+LOOK = {"sideways": 0.60, "down": 0.61, "up": 0.44}
+"""Radians by which the app turns an eye at a weight of 1 of its ``eyeLook`` shapes, as its recordings have them."""
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,2}(?:\.\d{1,9})?)")
 
 
@@ -81,6 +84,30 @@ def rate_of(times: Array) -> float:
     return nearest if abs(measured / nearest - 1) < NEAR_RATE else round(measured, 3)
 
 
+def gaze(names: Sequence[str], weights: Values) -> Array:
+    """Rotations of the left and the right eye (T, 6) that weights of ``eyeLook`` shapes stand for.
+
+    Args:
+        names: K names of the weights.
+        weights: (T, K).
+
+    Returns:
+        Yaw to the face's left, pitch down and roll of each eye, in radians about the axes of a right-handed face. The
+        roll is the product of both, as in the app's recordings; without any of the shapes, an eye looks ahead.
+    """
+    none = np.zeros(len(weights))
+
+    def weight(name: str) -> Array:
+        return np.asarray(weights[:, names.index(name)], np.float64) if name in names else none
+
+    columns: list[Array] = []
+    for side, outwards in (("Left", 1.0), ("Right", -1.0)):
+        yaw = outwards * LOOK["sideways"] * (weight(f"eyeLookOut{side}") - weight(f"eyeLookIn{side}"))
+        pitch = LOOK["down"] * weight(f"eyeLookDown{side}") - LOOK["up"] * weight(f"eyeLookUp{side}")
+        columns += [yaw, pitch, yaw * pitch]
+    return np.stack(columns, axis=1)
+
+
 def read_live_link(path: Path) -> ParameterClip:
     """Read a recording of Live Link Face.
 
@@ -120,15 +147,22 @@ def read_live_link(path: Path) -> ParameterClip:
             )
         times.append(seconds)
         values.append(_numbers(path, number, [*row, *("0" for _ in missing)], columns, len(header)))
-    return _timed(path, np.array(times), _mirrored(np.array(values)), missing)
+    return _timed(path, np.array(times), _with_mirrored(np.array(values)), missing)
 
 
-def _mirrored(values: Values) -> Values:
-    """Values (T, 61) with the rotations of a mirrored frame, either way."""
-    if len(values):
-        turns = values[:, len(ARKIT) :]
-        turns[:, _MIRRORED] = 0.0 - turns[:, _MIRRORED]  # and not −0
-    return values
+def mirrored(rotations: Values) -> Values:
+    """Rotations (..., 9) of head and eyes in the app's mirrored frame, of those about a right-handed face's axes.
+
+    Radians both; the function is its own inverse.
+    """
+    return np.where(_MIRRORED, 0.0 - rotations, rotations)  # and not −0
+
+
+def _with_mirrored(values: Values) -> Values:
+    """Values (T, 61) with the rotations of the other frame."""
+    return (
+        np.concatenate([values[:, : len(ARKIT)], mirrored(values[:, len(ARKIT) :])], axis=1) if len(values) else values
+    )
 
 
 def _timed(path: Path, clock: Array, values: Values, missing: list[str]) -> ParameterClip:
@@ -160,15 +194,17 @@ def write_live_link(path: Path, clip: ParameterClip) -> None:
     Raises:
         FaceDiffError: if the clip is in another space.
     """
-    values = _mirrored(permuted(clip.values, clip.space, layout("live_link"))[0])
+    with atomic(path) as temporary:
+        write_table(temporary, [live_link_header(), *live_link_rows(clip)])
+
+
+def live_link_rows(clip: ParameterClip) -> Iterator[list[str]]:
+    """The rows of a recording's table, below :func:`live_link_header`; :func:`read_live_link` is the inverse."""
+    values = _with_mirrored(permuted(clip.values, clip.space, layout("live_link"))[0])
     times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
     count = str(len(ARKIT) + len(ROTATIONS))
-    rows = (
-        [timecode(clip.start + float(seconds)), count, *map(shortest, row)]
-        for seconds, row in zip(times, values, strict=True)
-    )
-    with atomic(path) as temporary:
-        write_table(temporary, [live_link_header(), *rows])
+    for seconds, row in zip(times, values, strict=True):
+        yield [timecode(clip.start + float(seconds)), count, *map(shortest, row)]
 
 
 PREFIX = "blendShapes."

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from facediff.editing.blendshapes import Weights, write_live_link, write_weights
+from facediff.editing.blendshapes import Weights, live_link_values, write_live_link, write_weights
 from facediff.errors import FaceDiffError
+from facediff.spaces.arkit import ARKIT
+from facediff.spaces.files import read_parameters
 from facediff.spaces.files.tables import timecode
 
 
@@ -36,18 +39,48 @@ def test_a_table_for_live_link(tmp_path: Path, weights: Weights) -> None:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 70
     assert all(row["BlendShapeCount"] == "61" and len(row) == 63 and None not in row for row in rows)
-    assert [float(row["JawOpen"]) for row in rows] == pytest.approx(weights.values[:, 0], abs=1e-8)
-    assert [float(row["EyeBlinkLeft"]) for row in rows] == pytest.approx(weights.values[:, 2], abs=1e-8)
+    assert [float(row["JawOpen"]) for row in rows] == pytest.approx(weights.values[:, 0], abs=1e-7)
+    assert [float(row["EyeBlinkLeft"]) for row in rows] == pytest.approx(weights.values[:, 2], abs=1e-7)
     # What has no shape is zero, and said to be absent.
     about = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert len(about["absent"]) == 49
     for name in about["absent"]:
-        assert {row[name[0].upper() + name[1:]] for row in rows} == {"0.00000000"}
+        assert {row[name[0].upper() + name[1:]] for row in rows} == {"0.0"}
     assert {float(row[column]) for row in rows for column in row if "Yaw" in column or "Roll" in column[-4:]} == {0.0}
     assert about["not_in_table"] == ["mine"]
     assert about["still"] == ["tongueOut"]
     assert about["residual_rms_mm"] == pytest.approx(weights.residual_rms_mm, abs=1e-6)
     assert about["frame_rate"] == 30.0
+
+
+def test_a_table_reads_as_it_was_written(tmp_path: Path) -> None:
+    """Weights, a head's turn and the eyes' own rotations, through the reader of recordings."""
+    rng = np.random.default_rng(1)
+    values = rng.uniform(0, 1, (70, len(ARKIT)))
+    head = rng.normal(0, 0.3, (70, 3))
+    weights = Weights(ARKIT, values, np.zeros(70), np.zeros(70), 1.0, 25.0, head=head, eyes=rng.normal(0, 0.2, (70, 6)))
+    write_live_link(tmp_path / "a.csv", weights)
+    clip = read_parameters(tmp_path / "a.csv")
+    assert clip.frame_rate == 25.0
+    assert np.array_equal(clip.values, live_link_values(weights)[0])
+    assert np.array_equal(clip.values[:, : len(ARKIT)], values.astype(np.float32))
+    assert clip.values[:, 55:] == pytest.approx(weights.eyes, abs=1e-7)
+    matrices = Rotation.from_rotvec(head).as_matrix()
+    assert Rotation.from_euler("YXZ", clip.values[:, 52:55]).as_matrix() == pytest.approx(matrices, abs=1e-6)
+
+
+def test_eyes_turn_as_their_weights_say(tmp_path: Path, weights: Weights) -> None:
+    """Eye columns against a row of a real take, whose eyes look down, and to the left and up by signs."""
+    looking = replace(weights, names=("jawOpen", "eyeLookDownLeft", "eyeLookOutLeft", "eyeLookInRight"), still=())
+    looking.values[0, 1:] = 0.4569, 0.0, 0.0
+    looking.values[1, 1:] = 0.0, 0.2, 0.2
+    write_live_link(tmp_path / "a.csv", looking)
+    with (tmp_path / "a.csv").open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert float(rows[0]["LeftEyePitch"]) == pytest.approx(0.2796, abs=0.005)
+    assert float(rows[0]["LeftEyeYaw"]) == 0.0
+    assert float(rows[1]["LeftEyeYaw"]) == float(rows[1]["RightEyeYaw"]) == pytest.approx(-0.12, abs=1e-6)
+    assert json.loads((tmp_path / "a.json").read_text())["rotations_absent"] == ["head"]
 
 
 def test_a_plain_table(tmp_path: Path, weights: Weights) -> None:
