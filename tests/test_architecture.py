@@ -50,7 +50,7 @@ ALLOWED: dict[str, set[str]] = {
     "live": {"spaces", "version", "runtime", "animation", "speech", "editing", "export", "mesh", *BASE},
     "reporting": BASE,
     "evaluation": {"spaces", "reporting", "speech", "data", "metrics", "mesh", "render", *BASE},
-    "benchmark": {"version", "evaluation", "reporting", "metrics", *BASE},
+    "benchmark": {"version", "evaluation", "reporting", "speech", "metrics", "synthetic", *BASE},
     "study": {"version", "reporting", "animation", "speech", "data", "evaluation", "mesh", "render", *BASE},
     "pipelines": {
         "spaces",
@@ -58,6 +58,7 @@ ALLOWED: dict[str, set[str]] = {
         "runtime",
         "models",
         "speech",
+        "synthetic",
         "data",
         "editing",
         "export",

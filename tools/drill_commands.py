@@ -191,6 +191,12 @@ DRILLS = [
         pieces=True,
     ),
     Drill(
+        "benchmark referee",
+        "--languages en --voices 1 --sentences 1 -o out",
+        "--languages de --voices 1 --sentences 1 -o out",
+        pieces=True,
+    ),
+    Drill(
         "generation-metrics",
         f"model.ckpt --corpus {TINY} --data-root corpus --samples 2 --references 1 --max-clips 1 --quiet --json a.json",
         f"model.ckpt --corpus {TINY} --data-root corpus --samples 3 --references 1 --max-clips 1 --quiet --json a.json",

@@ -75,6 +75,11 @@ COMMANDS = {
     "benchmark report": Command(
         "facediff.cli.benchmark:report", "write the tables of benchmarks again", "train,figures"
     ),
+    "benchmark referee": Command(
+        "facediff.cli.referee:referee",
+        "compare models of any kind on one face, by what phonemes ask of it",
+        "train,puppet",
+    ),
     "generation-metrics": Command(
         "facediff.cli.generation_metrics:generation_metrics",
         "diversity, liveliness and calibration of a model's samples",

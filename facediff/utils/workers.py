@@ -148,6 +148,19 @@ def process_pool(work: Callable[[Any], Any] | None, workers: int) -> ProcessPool
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(work,))
 
 
+def in_own_process(work: Callable[[Task], Result], task: Task) -> Result | WorkerDied:
+    """Do one task in a process that does nothing else, so that memory and crashes are its own.
+
+    Where processes cannot be started, this process does it.
+    """
+    if not _can_start():
+        return work(task)
+    suspects: deque[Task] = deque()
+    for _, result in _together(process_pool(work, 1), _do, deque([task]), 1, suspects):
+        return result
+    return WorkerDied()
+
+
 def _can_start() -> bool:
     """Whether processes start at all; found out without work, since handing much to one that dies would block."""
     with process_pool(None, 1) as pool:

@@ -36,6 +36,7 @@ EXTRAS = {
     "evaluate p t": "train",
     "benchmark plan -o bench": "train,figures",
     "benchmark report bench": "train,figures",
+    "benchmark referee": "train,puppet",
     "generation-metrics c.ckpt": "train",
     "figure error p t -o f.png": "figures",
     "figure lips p t -o f.png": "figures",

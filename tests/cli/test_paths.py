@@ -44,7 +44,7 @@ NO_PATHS = {
         "voice_gate",
         "guidance",
     ),
-    *("host", "identities", "option"),
+    *("host", "identities", "layout", "option"),
     *("microphone", "sound", "to"),
     *("identity", "kind", "labels", "languages", "license", "push"),
     *(

@@ -74,6 +74,7 @@ BASES: dict[str, str] = {
     "--quiet",
     "evaluate": "WORLD/ours WORLD/corpus --bootstrap 10 --workers 1 --quiet",
     "benchmark": "WORLD/plan.yaml -o benchmarks --dry-run",
+    "benchmark referee": "--languages en --voices 1 --sentences 1 -o referee",
     "benchmark report": "WORLD/benchmark --bootstrap 20 -o reports",
     "figure frames": f"{DRAWN} --times 0.1",
     "figure heatmap": DRAWN,

@@ -19,6 +19,7 @@ from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech
 from facediff.utils import ranges
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import put_in_place, scratch_folder
+from facediff.utils.lags import correlations, lagged_correlation, peak
 from facediff.utils.plain_files import write_json, write_rows
 
 Array = npt.NDArray[np.float64]
@@ -100,27 +101,8 @@ def find_offset(opening: Array, frame_rate: float, speech: Speech, most_seconds:
     steps = int(len(opening) / frame_rate * STEPS)
     mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / frame_rate, opening)
     loud = loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING)
-    furthest = round(most_seconds * STEPS)
-    lags = np.arange(-furthest, furthest + 1)
-    scores = np.array([_correlation(loud, mouth, int(lag)) for lag in lags])
-    best = int(scores.argmax())
-    shift = 0.0
-    if 0 < best < len(scores) - 1 and np.isfinite(scores[best - 1 : best + 2]).all():
-        before, here, after = scores[best - 1 : best + 2]
-        curve = before - 2 * here + after
-        shift = 0.5 * (before - after) / curve if curve < 0 else 0.0
-    return Offset(float(lags[best] + shift + 0.5) / STEPS - LEAD, float(max(scores[best], -1.0)), found=True)
-
-
-def _correlation(loud: Array, mouth: Array, lag: int) -> float:
-    """Pearson's correlation of what overlaps where the motion begins ``lag`` steps into the sound."""
-    first, last = max(0, -lag), min(len(mouth), len(loud) - lag)
-    if last - first < LEAST_SECONDS * STEPS:
-        return -np.inf
-    a, b = loud[first + lag : last + lag], mouth[first:last]
-    a, b = a - a.mean(), b - b.mean()
-    scale = float(np.sqrt(np.square(a).sum() * np.square(b).sum()))
-    return float((a * b).sum() / scale) if scale > 0 else 0.0
+    scores = correlations(loud, mouth, round(most_seconds * STEPS), round(LEAST_SECONDS * STEPS))
+    return Offset((peak(scores) + 0.5) / STEPS - LEAD, float(max(scores.max(), -1.0)), found=True)
 
 
 @ranges.checked
@@ -210,7 +192,8 @@ def _at(clip: ParameterClip, speech: Speech, offset: float) -> float:
     opening = mouth_opening(clip)
     mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / clip.frame_rate, opening)
     loud = loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING)
-    return max(_correlation(loud, mouth, round((offset + LEAD) * STEPS - 0.5)), -1.0)
+    lag = round((offset + LEAD) * STEPS - 0.5)
+    return max(lagged_correlation(loud, mouth, lag, round(LEAST_SECONDS * STEPS)), -1.0)
 
 
 def _write(folder: Path, clip: ParameterClip, speech: Speech, entries: list[EntryClip], report: TakeReport) -> None:

@@ -1,0 +1,360 @@
+"""The referee: models on one face, scored by what speech with known phonemes asks of any face.
+
+No recording of a person decides: closures and the mouth's opening follow from the phonemes, and what cannot follow from
+speech (blinks, head) is reported as it is. Faults are planted in every model's motion, which the scores that are for
+them must see. From top to bottom: the scores, the faults, what is reported of a model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from facediff.metrics import (
+    BilabialClosureRate,
+    BlinkRate,
+    DifferenceRatio,
+    FrameStep,
+    LipOpeningCorrelation,
+    MotionLiveliness,
+    SequenceMetric,
+)
+from facediff.metrics.mouth import opening
+from facediff.speech.phonemes import TimedPhoneme, closures
+from facediff.synthetic.spoken_set import LANGUAGES, ClipMotion, OpenFace, SpokenClip, open_face, reference
+from facediff.utils.lags import correlations, peak
+
+Array = npt.NDArray[np.float64]
+
+Ideal = Literal["higher", "lower", "zero", "one"]
+"""Which way is better: larger, smaller, nearer to 0 or nearer to 1."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """A column.
+
+    Attributes:
+        title: in tables.
+        ideal: which way is better; None where nothing is better or worse.
+        digits: decimals.
+        meaning: what it is.
+    """
+
+    title: str
+    ideal: Ideal | None
+    digits: int
+    meaning: str
+
+    def badness(self, value: float) -> float:
+        """How bad a value is: smaller is better."""
+        match self.ideal:
+            case "higher":
+                return -value
+            case "zero":
+                return abs(value)
+            case "one":
+                return abs(math.log(value)) if value > 0 else math.inf
+            case _:
+                return value
+
+
+FURTHEST, OVERLAP = 0.4, 1.0
+"""Seconds of delay that are looked at, either way, and seconds that must overlap."""
+
+SCORES = {
+    "closures": Score("closures", "higher", 2, "share of p, b and m in which the lips meet in at least one frame"),
+    "gap": Score("gap, mm", "lower", 2, "opening of the lips in p, b and m at its smallest, beyond that at rest; mean"),
+    "correlation": Score("opening", "higher", 2, "correlation of the mouth's opening with the reference's"),
+    "lag": Score("lag, ms", "zero", 0, "how late the opening is, by cross-correlation; negative is early"),
+    "lips": Score("lips", "one", 2, "how much the lips move, as a share of the reference (standard deviation)"),
+    "jitter": Score("jitter", "one", 2, "second over first differences of the lips in time, over the reference's"),
+    "step": Score("step", "one", 2, "how far the lips go from frame to frame, over the reference's"),
+    "upper_face": Score("brows, lids", "one", 2, "how much the upper face moves, as a share of the reference"),
+    "blinks": Score("blinks/min", None, 0, "blinks a minute"),
+    "head": Score("head, °", None, 1, "root mean square of the head's turn about its mean"),
+}
+
+
+@dataclass
+class Tally:
+    """Adds up what one motion of every clip scores.
+
+    Args:
+        frame_rate: of the motion.
+        jaw: the channel that opens the jaw, of motion that is channels; None for points of the open face.
+    """
+
+    frame_rate: float
+    jaw: int | None = None
+
+    def __post_init__(self) -> None:
+        face = self.face = open_face()
+        lips, lids = ([(int(a), int(b)) for a, b in pairs] for pairs in (face.lip_pairs, face.lid_pairs))
+        self._pair = torch.from_numpy(face.lip_pairs)
+        # Of channels only the jaw is known: what is read of lips and lids is then left out, and said to be.
+        opened: list[tuple[int, int]] = [(0, 1)]
+        self._openings: dict[str, SequenceMetric] = {"correlation": LipOpeningCorrelation(opened)}
+        self._faces: dict[str, SequenceMetric] = {}
+        self._closures: dict[str, BilabialClosureRate] = {}
+        if self.jaw is None:
+            of_lips, of_brows = (index.tolist() for index in (face.lips, face.upper_face))
+            self._faces = {
+                "lips": MotionLiveliness(of_lips),
+                "jitter": DifferenceRatio(of_lips),
+                "step": FrameStep(of_lips),
+                "upper_face": MotionLiveliness(of_brows),
+                "blinks": BlinkRate(lids, frames_per_second=self.frame_rate),
+            }
+            self._closures = {name: BilabialClosureRate(lips, count="closures") for name in ("", *LANGUAGES)}
+        else:
+            self._openings["jitter"] = DifferenceRatio([1])
+        self._gaps: list[float] = []
+        self._lags: list[Array] = []
+        self._turns: list[Array] = []
+
+    def add(self, clip: SpokenClip, motion: ClipMotion, truth: ClipMotion) -> None:
+        """Score one clip."""
+        frames = min(len(motion.points), len(truth.points))
+        points, true = motion.points[:frames], truth.points[:frames]
+        mouth, true_mouth = self.opening(points), self.opening(true, None)
+        pair, true_pair = (as_pair(series) for series in (mouth, true_mouth))
+        for metric in self._openings.values():
+            metric.update(pair, true_pair)
+        predicted, spoken = torch.from_numpy(points), torch.from_numpy(true)
+        for metric in self._faces.values():
+            metric.update(predicted, spoken)
+        timed = [TimedPhoneme(p.start, p.end, p.ipa) for p in clip.phonemes]
+        closed = [(start, end) for start, end in closures(timed, self.frame_rate) if end <= frames]
+        if self._closures and closed:
+            for name in ("", clip.language):
+                self._closures[name].update(predicted, spoken, closures=closed)
+            resting = float(self.opening(self.face.rest[None])[0])
+            self._gaps += [1000 * float(mouth[start:end].min() - resting) for start, end in closed]
+        furthest, least = round(FURTHEST * self.frame_rate), round(OVERLAP * self.frame_rate)
+        self._lags.append(correlations(mouth, true_mouth, furthest, least))
+        if motion.head is not None:
+            self._turns.append(np.rad2deg(motion.head - motion.head.mean(0)))
+
+    def opening(self, points: Array, jaw: int | None = -1) -> Array:
+        """How far the mouth is open in every frame (T,): in metres on the face, else the jaw's channel."""
+        channel = self.jaw if jaw == -1 else jaw
+        if channel is not None:
+            return np.asarray(points[:, channel, 0])
+        return np.asarray(opening(torch.from_numpy(points), None, self._pair).numpy())
+
+    def scores(self) -> dict[str, float]:
+        """All scores that there are."""
+        values: dict[str, float] = {}
+        for name, metric in {**self._openings, **self._faces}.items():
+            _note(values, name, metric)
+        for name, rate in self._closures.items():
+            if int(rate.counts[1]):
+                _note(values, f"closures_{name}" if name else "closures", rate)
+        if self._gaps:
+            values["gap"] = float(np.mean(self._gaps))
+        usable = [scores for scores in self._lags if np.isfinite(scores).all() and scores.any()]
+        if usable:
+            values["lag"] = 1000 * peak(np.mean(usable, axis=0)) / self.frame_rate
+        if self._turns:
+            values["head"] = float(np.sqrt(np.square(np.concatenate(self._turns)).sum(1).mean()))
+        return values
+
+
+def _note(values: dict[str, float], name: str, metric: SequenceMetric) -> None:
+    """A score, where it has a value: what never moves has no ratio of differences."""
+    try:
+        value = float(metric.compute())
+    except ValueError:
+        return
+    if math.isfinite(value):
+        values[name] = value
+
+
+def as_pair(series: Array) -> torch.Tensor:
+    """A series of openings as two points (T, 2, 3) that are so far apart."""
+    pair = np.zeros((len(series), 2, 3))
+    pair[:, 1, 1] = series
+    return torch.from_numpy(pair)
+
+
+# Faults.
+
+DELAY, MUTED, JITTER = 0.08, 0.2, 0.5
+"""Seconds of delay; share that is left of the lips' motion; noise, as a share of each point's own deviation."""
+
+CLOSES, FOLLOWS, LIVELY, SHIVERS = 0.5, 0.1, 2.0, 1.6
+"""Closures and correlation below which, and motion and jitter of the lips above which, a model has the fault already: a
+mouth that does not follow its speech loses nothing by another sentence."""
+
+Fault = Callable[[ClipMotion, ClipMotion, float, OpenFace], Array]
+"""Spoils the points of a clip; it is handed the clip, another sentence, the frame rate and the face."""
+
+
+def delayed(motion: ClipMotion, _other: ClipMotion, frame_rate: float, _face: OpenFace) -> Array:
+    """Everything comes later."""
+    times = np.maximum(np.arange(len(motion.points)) - DELAY * frame_rate, 0)
+    before = times.astype(np.int64)
+    after, share = np.minimum(before + 1, len(times) - 1), (times - before)[:, None, None]
+    return np.asarray((1 - share) * motion.points[before] + share * motion.points[after])
+
+
+def muted(motion: ClipMotion, _other: ClipMotion, _frame_rate: float, face: OpenFace) -> Array:
+    """Lips stay nearly as they are at rest; of channels, all of them do."""
+    points = motion.points.copy()
+    if points.shape[1:] != face.rest.shape:
+        return np.asarray(MUTED * points)
+    places = np.union1d(face.lips, face.lip_pairs)
+    points[:, places] = face.rest[places] + MUTED * (points[:, places] - face.rest[places])
+    return points
+
+
+def trembling(motion: ClipMotion, _other: ClipMotion, _frame_rate: float, _face: OpenFace) -> Array:
+    """The face shakes from frame to frame, the more a place moves."""
+    noise = np.random.default_rng(len(motion.points)).normal(size=(len(motion.points), 1, 1))
+    return np.asarray(motion.points + JITTER * noise * motion.points.std(axis=0))
+
+
+def wrong_sentence(motion: ClipMotion, other: ClipMotion, _frame_rate: float, _face: OpenFace) -> Array:
+    """Motion for what another sentence says; its last frame is held if it is shorter."""
+    return np.asarray(other.points[np.minimum(np.arange(len(motion.points)), len(other.points) - 1)])
+
+
+@dataclass(frozen=True)
+class PlantedFault:
+    """A fault and the scores that are for it.
+
+    Attributes:
+        title: of its row.
+        spoil: makes it.
+        seen_by: scores that must be worse than the sound model's.
+    """
+
+    title: str
+    spoil: Fault
+    seen_by: tuple[str, ...]
+
+
+FAULTS = {
+    "delay": PlantedFault("80 ms late", delayed, ("closures", "gap", "correlation", "lag")),
+    # Lips that hardly part close in time, so that closures alone would call such a model good.
+    "muted": PlantedFault("muted lips", muted, ("lips", "step")),
+    "jitter": PlantedFault("jitter", trembling, ("jitter",)),
+    "sentence": PlantedFault("wrong sentence", wrong_sentence, ("closures", "gap", "correlation")),
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Whether a score sees a fault: its values of the sound model and of the spoilt one."""
+
+    fault: str
+    score: str
+    sound: float
+    spoilt: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether the spoilt motion is worse."""
+        score = SCORES[self.score]
+        return score.badness(self.spoilt) > score.badness(self.sound)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A row of the report, with those of its planted faults.
+
+    Attributes:
+        name: of the model.
+        scores: by name, as far as there are any; ``closures_de`` and so on by language.
+        faults: the scores of each planted fault.
+        facts: how it was put on the open face, its licence and so on, by title.
+        seconds: of the processor for a second of speech; None if not measured.
+        memory: bytes at most; None if not known.
+        openings: (T,) in metres or radians, of the first clip, for the plot.
+        problem: why there are no scores; empty if there are.
+    """
+
+    name: str
+    scores: Mapping[str, float] = field(default_factory=dict)
+    faults: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    facts: Mapping[str, str] = field(default_factory=dict)
+    seconds: float | None = None
+    memory: float | None = None
+    frame_rate: float = 25.0
+    openings: Array | None = None
+    problem: str = ""
+
+    def seen(self) -> list[Seen]:
+        """What each score that is for a fault says of it, where it says anything."""
+        return [
+            Seen(fault, score, self.scores[score], values[score])
+            for fault, values in self.faults.items()
+            for score in FAULTS[fault].seen_by
+            if score in self.scores and score in values and not self.lacks(score)
+        ]
+
+    def lacks(self, score: str) -> str:
+        """Why a score has nothing to see in this model, in words; empty if it has."""
+        if score in ("closures", "gap") and self.scores.get("closures", 0) < CLOSES:
+            return f"it closes its lips for fewer than {100 * CLOSES:.0f} % of p, b and m"
+        if score in ("correlation", "lag") and self.scores.get("correlation", 0) < FOLLOWS:
+            return "its mouth does not follow the speech"
+        if score in ("lips", "step") and self.scores.get(score, 0) > LIVELY:
+            return f"its lips move more than {LIVELY:g} times as much as the reference's"
+        if score == "jitter" and self.scores.get("jitter", 0) > SHIVERS:
+            return "it shivers already"
+        return ""
+
+
+def judge(
+    clips: Sequence[SpokenClip], motions: Mapping[str, ClipMotion], frame_rate: float, jaw: int | None
+) -> tuple[dict[str, float], dict[str, dict[str, float]], Array]:
+    """The scores of a model, those of its planted faults, and the mouth's opening in the first clip.
+
+    Args:
+        clips: what was spoken.
+        motions: what the model made of each.
+        frame_rate: frames a second.
+        jaw: the channel that opens the jaw, of motion that is channels.
+    """
+    truths = {clip.name: reference(clip, frame_rate) for clip in clips}
+    sound = Tally(frame_rate, jaw)
+    for clip in clips:
+        sound.add(clip, motions[clip.name], truths[clip.name])
+    faults = {}
+    for name, fault in FAULTS.items():
+        spoilt = Tally(frame_rate, jaw)
+        for clip in clips:
+            motion = motions[clip.name]
+            points = fault.spoil(motion, motions[another(clip, clips).name], frame_rate, open_face())
+            spoilt.add(clip, ClipMotion(points, motion.head), truths[clip.name])
+        faults[name] = spoilt.scores()
+    return sound.scores(), faults, sound.opening(motions[clips[0].name].points)
+
+
+def another(clip: SpokenClip, clips: Sequence[SpokenClip]) -> SpokenClip:
+    """The next sentence of the same voice, or else of the same language, or else of any."""
+    place = [other.name for other in clips].index(clip.name)
+    others = [other for other in (*clips[place + 1 :], *clips[:place]) if other.text != clip.text]
+    for alike in ("voice", "language"):
+        same = [other for other in others if getattr(other, alike) == getattr(clip, alike)]
+        if same:
+            return same[0]
+    return others[0] if others else clip
+
+
+def reference_judgement(clips: Sequence[SpokenClip], frame_rate: float = 25.0) -> Judgement:
+    """The row of the reference itself, whose faults are not planted."""
+    tally = Tally(frame_rate)
+    for clip in clips:
+        motion = reference(clip, frame_rate)
+        tally.add(clip, motion, motion)
+    openings = tally.opening(reference(clips[0], frame_rate).points)
+    return Judgement("reference", tally.scores(), frame_rate=frame_rate, openings=openings)

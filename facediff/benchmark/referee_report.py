@@ -1,0 +1,247 @@
+"""The referee's report as Markdown, HTML, CSV and JSON, and as text for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from facediff.benchmark.referee import FAULTS, SCORES, Judgement
+from facediff.reporting.documents import (
+    BEST,
+    NONE,
+    Block,
+    Bullets,
+    Drawing,
+    Paragraph,
+    ReportTable,
+    Title,
+    html_page,
+    markdown,
+    terminal_text,
+    write_texts,
+)
+from facediff.reporting.drawing import has_matplotlib, line_style, plot_svg
+from facediff.synthetic.spoken_set import LANGUAGES, SpokenClip
+from facediff.utils.plain_files import write_json, write_rows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+NAME = "referee"
+ARROWS = {"higher": " ↑", "lower": " ↓", "zero": " →0", "one": " →1"}
+
+
+@dataclass(frozen=True)
+class RefereeReport:
+    """What the referee says.
+
+    Attributes:
+        clips: what was spoken.
+        reference: the row of the built-in corpus's own motion.
+        rows: of the models.
+        command: by which it was made.
+        code: version, and commit of a checkout.
+        machine: what computed.
+    """
+
+    clips: Sequence[SpokenClip]
+    reference: Judgement
+    rows: Sequence[Judgement]
+    command: str
+    code: Mapping[str, str]
+    machine: str
+
+
+def write_report(report: RefereeReport, folder: Path) -> list[Path]:
+    """Write all forms into a folder; the files."""
+    drawing = openings(report)
+    files = write_texts(
+        folder,
+        {
+            f"{NAME}.md": markdown(document(report)),
+            f"{NAME}.html": html_page("Referee", document(report, [] if drawing is None else [drawing])),
+        },
+    )
+    write_rows(folder / f"{NAME}.csv", csv_rows(report))
+    write_json(folder / f"{NAME}.json", content(report))
+    return [*files, folder / f"{NAME}.csv", folder / f"{NAME}.json"]
+
+
+def text(report: RefereeReport) -> str:
+    """For the terminal."""
+    return "\n" + terminal_text([scores_table(report), *languages_and_costs(report), Bullets(self_check(report))])
+
+
+def document(report: RefereeReport, drawings: Sequence[Drawing] = ()) -> list[Block]:
+    """The whole report."""
+    spoken = {LANGUAGES[clip.language].name for clip in report.clips}
+    return [
+        Title("Referee"),
+        Paragraph(
+            "Synthetic speech and a synthetic face: models are compared with what phonemes ask for, not with people.",
+            warning=True,
+        ),
+        scores_table(report),
+        *languages_and_costs(report),
+        *drawings,
+        Title("What the referee sees", 2),
+        Paragraph(
+            "Faults were planted in every model's motion; each score that is for one of them must find it worse."
+        ),
+        Bullets(self_check(report)),
+        Title("What the numbers are", 2),
+        Bullets(
+            [
+                *(f"{score.title}: {score.meaning}" for score in SCORES.values()),
+                "the reference is the built-in corpus's own motion for the same speech: its mouth follows from the "
+                "phonemes, its brows, blinks and head are one of many performances; models that were trained on that "
+                "corpus know its way of speaking",
+                f"{len(report.clips)} sentences, {sum(clip.seconds for clip in report.clips):.0f} s, in "
+                f"{', '.join(sorted(spoken))}; voices {', '.join(dict.fromkeys(clip.voice for clip in report.clips))}",
+                f"processor seconds for a second of speech, loading left out; memory is the whole process's; on "
+                f"{report.machine}",
+                f"facediff {' '.join(report.code.values())}; made by `{report.command}`",
+            ]
+        ),
+    ]
+
+
+def scores_table(report: RefereeReport) -> ReportTable:
+    """A row for each model, the reference's, and those of planted faults."""
+    sound = [*report.rows]
+    rows: list[list[str]] = [[row.name, *_cells(row.scores)] for row in sound]
+    marks: dict[tuple[int, int], str] = {}
+    for column, (name, score) in enumerate(SCORES.items(), 1):
+        values = [(score.badness(row.scores[name]), place) for place, row in enumerate(sound) if name in row.scores]
+        if score.ideal is not None and len(values) > 1:
+            best = min(values)[0]
+            marks |= {(place, column): BEST for value, place in values if value == best}
+    rows.append([report.reference.name, *_cells(report.reference.scores)])
+    rows += [
+        [f"{row.name}, {FAULTS[fault].title}", *_cells(values)] for row in sound for fault, values in row.faults.items()
+    ]
+    head = ["", *(score.title + ARROWS.get(str(score.ideal), "") for score in SCORES.values())]
+    return ReportTable(head, rows, marks, frozenset(range(len(sound), len(rows))))
+
+
+def _cells(scores: Mapping[str, float]) -> list[str]:
+    return [f"{scores[name]:.{score.digits}f}" if name in scores else NONE for name, score in SCORES.items()]
+
+
+def languages_and_costs(report: RefereeReport) -> list[Block]:
+    """Closures in each language, costs and licences, and what kept a model from being scored."""
+    spoken = list(dict.fromkeys(clip.language for clip in report.clips))
+    rows = []
+    for row in report.rows:
+        closed = [row.scores.get(f"closures_{code}") for code in spoken]
+        cost = [
+            NONE if row.seconds is None else f"{row.seconds:.3g}",
+            NONE if row.memory is None else f"{row.memory / 2**20:.0f} MiB",
+        ]
+        shares = [NONE if share is None else f"{share:.2f}" for share in closed]
+        rows.append(
+            [
+                row.name,
+                *shares,
+                *cost,
+                NONE if row.problem else f"{row.frame_rate:g}",
+                row.facts.get("commercial use", "unknown"),
+            ]
+        )
+    head = ["", *(f"closures, {LANGUAGES[code].name}" for code in spoken), "CPU s/s", "memory", "fps", "commercial use"]
+    notes = [
+        f"{row.name}: {title}: {value}"
+        for row in report.rows
+        for title, value in row.facts.items()
+        if title != "commercial use"
+    ]
+    notes += [f"{row.name}: not scored: {row.problem}" for row in report.rows if row.problem]
+    return [ReportTable(head, rows), Bullets(notes)]
+
+
+def self_check(report: RefereeReport) -> list[str]:
+    """What the scores see of the planted faults, a line for each model and fault."""
+    lines = []
+    for row in report.rows:
+        for fault, planted in FAULTS.items() if not row.problem else ():
+            checks = [check for check in row.seen() if check.fault == fault]
+            changes = [
+                f"{SCORES[check.score].title} {check.sound:.{SCORES[check.score].digits}f} → "
+                f"{check.spoilt:.{SCORES[check.score].digits}f}{'' if check.seen else ' (NOT SEEN)'}"
+                for check in checks
+            ]
+            reasons = dict.fromkeys(reason for score in planted.seen_by if (reason := row.lacks(score)))
+            changes += [f"not asked further, since {' and '.join(reasons)}"] if reasons else []
+            if not changes:
+                changes = ["nothing that is scored of this model shows it"]
+            count = sum(check.seen for check in checks)
+            verdict = "the referee sees" if checks and count == len(checks) else "NOT SEEN by all scores:"
+            lines.append(f"{verdict if checks else 'no score for'} {row.name}, {planted.title}: {'; '.join(changes)}")
+    return lines
+
+
+def openings(report: RefereeReport) -> Drawing | None:
+    """The mouth's opening over the first sentence; None without matplotlib, or where no model has the open face."""
+    rows = [row for row in report.rows if row.openings is not None and "gap" in row.scores]
+    if not rows or not has_matplotlib():
+        return None
+
+    def draw(axes: Axes) -> None:
+        for number, row in enumerate([report.reference, *rows]):
+            if row.openings is not None:
+                style = {"color": "black", "linewidth": 0.9} if number == 0 else line_style(number - 1)
+                axes.plot(np.arange(len(row.openings)) / row.frame_rate, 1000 * row.openings, label=row.name, **style)
+        axes.set_xlabel("s")
+        axes.set_ylabel("opening of the lips, mm")
+
+    caption = f"The mouth's opening: {report.clips[0].text}"
+    return Drawing(plot_svg(draw, caption, width=8.0, height=2.6), caption)
+
+
+def csv_rows(report: RefereeReport) -> list[dict[str, Any]]:
+    """One row for each model and planted fault."""
+    names = [*SCORES, *(f"closures_{code}" for code in LANGUAGES)]
+    rows = []
+    for row in [*report.rows, report.reference]:
+        facts = {"cpu_seconds_per_second": row.seconds, "memory_bytes": row.memory, "problem": row.problem}
+        for fault, values in [("", row.scores), *row.faults.items()]:
+            scores = {name: values.get(name) for name in names}
+            rows.append({"model": row.name, "fault": fault, **scores, **(facts if not fault else dict.fromkeys(facts))})
+    return rows
+
+
+def content(report: RefereeReport) -> dict[str, Any]:
+    """Everything as plain data."""
+    return {
+        "command": report.command,
+        "code": dict(report.code),
+        "machine": report.machine,
+        "clips": [
+            {
+                "name": clip.name,
+                "language": clip.language,
+                "voice": clip.voice,
+                "text": clip.text,
+                "seconds": clip.seconds,
+            }
+            for clip in report.clips
+        ],
+        "rows": [
+            {
+                "name": row.name,
+                "scores": dict(row.scores),
+                "faults": {fault: dict(values) for fault, values in row.faults.items()},
+                "sees": {f"{check.fault}/{check.score}": check.seen for check in row.seen()},
+                "facts": dict(row.facts),
+                "cpu_seconds_per_second": row.seconds,
+                "memory_bytes": row.memory,
+                "frame_rate": row.frame_rate,
+                "problem": row.problem,
+            }
+            for row in [*report.rows, report.reference]
+        ],
+    }

@@ -1,0 +1,186 @@
+"""``facediff benchmark referee``: models of every kind on one face, scored by what phonemes ask of it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from facediff.cli.options import FrameRate, OutputFolder, named_folders
+from facediff.cli.process import tell
+from facediff.errors import FaceDiffError, choices
+from facediff.utils import ranges
+from facediff.utils.hub import BUNDLED, check_animating_source
+from facediff.utils.option import Option
+
+if TYPE_CHECKING:
+    from facediff.benchmark.referee import Judgement
+    from facediff.pipelines.candidates import Candidate
+    from facediff.synthetic.spoken_set import SpokenClip
+
+PLANS = (".yaml", ".yml")
+KEYS = ("model", "motion", "layout", "frame_rate", "identity", "style", "licence", "commercial_use")
+COMMERCIAL = ("allowed", "forbidden", "unknown")
+
+
+def referee(
+    models: Annotated[list[str] | None, Option(metavar="MODEL", reads=True)] = None,
+    *,
+    output: OutputFolder = Path("referee"),
+    motion: Annotated[list[str] | None, Option(metavar="NAME=FOLDER", reads=True)] = None,
+    layout: Annotated[str | None, Option(metavar="LAYOUT")] = None,
+    frame_rate: FrameRate = None,
+    flame: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
+    languages: str = "en,de,es,fr,it,cmn",
+    voices: Annotated[ranges.Samples, Option(metavar="N")] = 2,
+    sentences: Annotated[ranges.Samples, Option(metavar="N")] = 3,
+    write_speech: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
+) -> int:
+    """Compare models on one face and the same speech, whose phonemes are known.
+
+    MODEL is NAME=PATH or PATH of a checkpoint, a model folder, an exported folder or a folder of Audio2Face-3D, or a
+    plan (.yaml) of them; without any, the model that comes with facediff. Closures, timing, jitter, blinks, head,
+    languages, cost and licence are reported, and four faults that are planted in every model must be seen.
+    Exit status: 0 all scored, 1 some models could not be scored, 2 something to put right.
+
+    For example:
+      facediff benchmark referee lam.ckpt unitalker.ckpt Audio2Face-3D-v2.3-Mark -o referee
+      facediff benchmark referee --write-speech speech
+      facediff benchmark referee puppet.ckpt --motion theirs=out --layout arkit
+
+    Args:
+        models: what is compared; see above
+        output: folder for the report
+        motion: folder of motion that another program made of the speech of --write-speech, called as the recordings;
+            repeatable
+        layout: layout of .npy and .npz in parameters, such as arkit or flame_artalk (docs/parameters.md)
+        frame_rate: frames a second of motion that does not say it
+        flame: your FLAME model file, which shows FLAME's coefficients on the face; without it, only their jaw is scored
+        languages: what is spoken: en, de, es, fr, it, cmn, joined by commas
+        voices: voices of each language, as far as they are installed
+        sentences: sentences of each voice
+        write_speech: write the speech for models that run elsewhere, and do nothing else
+    """
+    from facediff.synthetic.spoken_set import spoken_set, write_spoken_set
+
+    if write_speech is None:
+        import facediff.benchmark.referee  # noqa: F401 - what is missing is named before anybody speaks
+
+    clips = spoken_set([code.strip() for code in languages.split(",") if code.strip()], voices, sentences)
+    if write_speech is not None:
+        write_spoken_set(clips, write_speech)
+        tell(f"written: {len(clips)} recordings in {write_speech / 'wav'}; call motion as they are called")
+        return 0
+    from facediff.benchmark.referee import reference_judgement
+    from facediff.benchmark.referee_report import RefereeReport, text, write_report
+    from facediff.benchmark.results import code_of
+    from facediff.metrics import device_name
+
+    if not clips:
+        raise FaceDiffError("--languages: names none; expected such as en,de")
+    candidates = candidates_of(models or [], motion or [], layout, frame_rate)
+    rows = []
+    for number, candidate in enumerate(candidates, 1):
+        rows.append(judged(candidate, clips, flame))
+        state = rows[-1].problem or f"{rows[-1].seconds or 0:.2g} processor seconds for a second"
+        tell(f"[{number}/{len(candidates)}] {candidate.name}: {state}")
+    if all(row.problem for row in rows):
+        raise FaceDiffError(f"no model could be scored, the first: {rows[0].name}: {rows[0].problem}")
+    words = [*(models or []), *(f"--motion={word}" for word in motion or [])]
+    words += [f"--flame={flame}"] if flame is not None else []
+    words += [f"--languages={languages}", f"--voices={voices}", f"--sentences={sentences}"]
+    command = shlex.join(["facediff", "benchmark", "referee", *words])
+    report = RefereeReport(clips, reference_judgement(clips), rows, command, code_of(), device_name("cpu"))
+    files = write_report(report, output)
+    tell(*text(report).split("\n"), *(f"written: {path}" for path in files))
+    return int(any(row.problem for row in rows))
+
+
+def judged(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None) -> Judgement:
+    """The row of a model, which animates in a process of its own."""
+    from facediff.benchmark.referee import Judgement, judge
+    from facediff.pipelines.candidates import perform
+    from facediff.utils.workers import WorkerDied, in_own_process
+
+    made = in_own_process(partial(perform, clips=clips, flame=flame), candidate)
+    if isinstance(made, WorkerDied):
+        return Judgement(candidate.name, problem="killed its process, perhaps for lack of memory")
+    if isinstance(made, str):
+        return Judgement(candidate.name, problem=made)
+    scores, faults, openings = judge(clips, made.clips, made.frame_rate, made.jaw)
+    facts = {"put on the face": made.way, "licence": made.licence, "commercial use": made.commercial_use}
+    return Judgement(candidate.name, scores, faults, facts, made.seconds, made.memory, made.frame_rate, openings)
+
+
+def candidates_of(
+    models: Sequence[str], motion: Sequence[str], layout: str | None, frame_rate: float | None
+) -> list[Candidate]:
+    """What is compared: from words and plans.
+
+    Raises:
+        FaceDiffError: naming what does not exist, or is called twice.
+    """
+    from facediff.pipelines.candidates import Candidate
+
+    candidates: list[Candidate] = []
+    for word in models:
+        name, equals, path = word.partition("=")
+        if not equals or Path(word).exists():
+            name, path = Path(word).stem if Path(word).suffix == ".ckpt" else Path(word).name, word
+        if Path(path).suffix in PLANS:
+            candidates += read_models(Path(path))
+            continue
+        check_animating_source(path)
+        candidates.append(Candidate(name, path))
+    for name, folder in named_folders(motion).items():
+        candidates.append(Candidate(name, motion=folder, layout=layout, frame_rate=frame_rate))
+    if not candidates:
+        candidates = [Candidate("puppet", str(BUNDLED))]
+    names = [candidate.name for candidate in candidates]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise FaceDiffError(f'{twice}: two models are called "{twice}"; name them with NAME=PATH')
+    return candidates
+
+
+def read_models(path: Path) -> list[Candidate]:
+    """The models of a plan: names with paths, or with the keys of :data:`KEYS`."""
+    from facediff.benchmark.plan import Section
+    from facediff.pipelines.candidates import Candidate
+    from facediff.utils.yaml_files import load_yaml
+
+    expected = "expected models: with a name and a path each"
+    top = Section(load_yaml(path, expected), str(path), ("models",))
+    candidates = []
+    content = top.content.get("models") or {}
+    whole = {"models": {name: {"model": value} if isinstance(value, str) else value for name, value in content.items()}}
+    for name, section in (
+        Section(whole if isinstance(content, dict) else {}, str(path), None).sections("models", KEYS).items()
+    ):
+        fields = {key: section.optional(key) for key in KEYS if key != "frame_rate"}
+        if (fields["model"] is None) == (fields["motion"] is None):
+            raise FaceDiffError(f"{section.place}: expected either a model or a folder of motion")
+        commercial = fields["commercial_use"] or "unknown"
+        if commercial not in COMMERCIAL:
+            raise FaceDiffError(f"{section.place}: commercial_use: {choices(commercial, COMMERCIAL)}")
+        if fields["model"] is not None:
+            check_animating_source(fields["model"])
+        rate = section.number("frame_rate", None, 1000)
+        candidates.append(
+            Candidate(
+                name,
+                fields["model"],
+                None if fields["motion"] is None else Path(fields["motion"]),
+                fields["layout"],
+                None if rate is None else float(rate),
+                fields["identity"],
+                fields["style"],
+                fields["licence"] or "",
+                commercial,
+            )
+        )
+    if not candidates:
+        raise FaceDiffError(f"{path}: names no model; {expected}")
+    return candidates

@@ -1,0 +1,223 @@
+"""Speech whose phonemes are exactly known, in several voices and languages, and the open face that models are put on.
+
+The face is the built-in speaker F1's. The motion that the built-in corpus would have for the same speech is the
+reference: its mouth follows from the phonemes, the rest is one of many performances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facediff.errors import FaceDiffError, choices
+from facediff.spaces.rigs import LinearRig
+from facediff.speech.espeak import SpokenPhoneme, Utterance
+from facediff.synthetic.geometry import Array
+from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.rig import eyelid_pairs, lip_pairs
+from facediff.synthetic.known_faces import built_in_rig
+from facediff.synthetic.second_edition import PerformedClip, perform_clip, region_vertices, rig_of, speak_clip
+from facediff.synthetic.sentences import GERMAN, TEST
+from facediff.synthetic.voices import installed_voices, open_voice
+from facediff.utils import SAMPLE_RATE
+from facediff.utils.files import atomic_folder
+from facediff.utils.plain_files import write_table
+
+SPEAKER = "F1"
+"""The built-in speaker whose face, delivery and habits are taken."""
+
+# Written for this purpose, and rich in p, b and m.
+_SPANISH = (
+    "Mi mamá compra un mapa bonito para papá.",
+    "El bombero bebe un vaso de agua en el balcón.",
+    "Pablo y María pasean por la playa con su bebé.",
+    "Un pequeño pájaro vuela sobre el puente del pueblo.",
+)
+_FRENCH = (
+    "Papa prépare une bonne soupe aux pommes.",
+    "Ma mère met le bébé dans son berceau.",
+    "Un beau bateau passe sous le pont.",
+    "Le boulanger vend beaucoup de pain au beurre.",
+)
+_ITALIAN = (
+    "La mamma compra il pane e le mele.",
+    "Il bambino beve un bicchiere di acqua.",
+    "Papà porta una bella palla rossa.",
+    "Piove sempre quando prendiamo il battello.",
+)
+_MANDARIN = (
+    "爸爸给妈妈买了面包。",
+    "八百个朋友跑步。",
+    "我们明天不怕爬山。",
+    "冰箱里没有苹果和葡萄。",
+)
+
+
+@dataclass(frozen=True)
+class Language:
+    """What is spoken in a language.
+
+    Attributes:
+        name: in English.
+        voices: in the order in which they are taken; those of programs that are missing are left out.
+        sentences: in which no model of the built-in corpus was trained.
+    """
+
+    name: str
+    voices: tuple[str, ...]
+    sentences: tuple[str, ...]
+
+
+LANGUAGES = {
+    "en": Language(
+        "English", ("espeak:en-us+f5", "flite:slt", "espeak:en-gb-scotland+m6", "festival:kal_diphone"), TEST
+    ),
+    "de": Language("German", ("espeak:de+m8", "espeak:de+f2"), GERMAN),
+    "es": Language("Spanish", ("espeak:es+f2", "espeak:es-419+m3"), _SPANISH),
+    "fr": Language("French", ("espeak:fr+m4", "espeak:fr+f4"), _FRENCH),
+    "cmn": Language("Mandarin", ("espeak:cmn+f2", "espeak:cmn+m3"), _MANDARIN),
+    "it": Language("Italian", ("espeak:it+f3", "espeak:it+m2"), _ITALIAN),
+}
+"""By their codes. English voices are kept out of the built-in corpus's training, and it has no other language."""
+
+
+@dataclass(frozen=True)
+class SpokenClip:
+    """A sentence as one voice speaks it, with quiet at both ends.
+
+    Attributes:
+        name: stem of its files.
+        language: a code in :data:`LANGUAGES`.
+        voice: as :func:`facediff.synthetic.voices.open_voice` takes it.
+        text: what is said.
+        samples: (S,) at 16 kHz.
+        phonemes: without gaps.
+    """
+
+    name: str
+    language: str
+    voice: str
+    text: str
+    samples: NDArray[np.float32]
+    phonemes: tuple[SpokenPhoneme, ...]
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts."""
+        return len(self.samples) / SAMPLE_RATE
+
+
+def spoken_set(languages: Sequence[str], voices: int, sentences: int) -> list[SpokenClip]:
+    """Sentences in several voices of several languages; each voice of a language has sentences of its own, in turn.
+
+    Args:
+        languages: codes in :data:`LANGUAGES`.
+        voices: of each language, as far as they are installed.
+        sentences: of each voice.
+
+    Raises:
+        FaceDiffError: if there is no such language, or no voice of one is installed.
+    """
+    installed = installed_voices()
+    clips = []
+    for code in languages:
+        if code not in LANGUAGES:
+            raise FaceDiffError(f"--languages {code}: {choices(code, LANGUAGES)}")
+        own = LANGUAGES[code]
+        usable = [voice for voice in own.voices if voice.partition(":")[0] in installed]
+        if not usable:
+            raise FaceDiffError(f'--languages {code}: no voice is installed; pip install "facediff[puppet]"')
+        for place, voice in enumerate(usable[:voices]):
+            open_voice(voice)
+            for number in range(min(sentences, len(own.sentences))):
+                text = own.sentences[(place * sentences + number) % len(own.sentences)]
+                stem = voice.replace(":", "_").replace("+", "_")
+                spoken = speak_clip(_performed(text, number, voice))
+                clips.append(SpokenClip(f"{stem}_{number + 1:02d}", code, voice, text, spoken.samples, spoken.phonemes))
+    return clips
+
+
+def _performed(text: str, number: int, voice: str) -> PerformedClip:
+    return PerformedClip(SPEAKER, "test_c", number + 1, text, "neutral", voice)
+
+
+def write_spoken_set(clips: Sequence[SpokenClip], folder: Path) -> None:
+    """Write recordings, the times of their phonemes, and a table of what is said, for models that run elsewhere."""
+    import soundfile
+
+    if folder.exists():
+        raise FaceDiffError(f"{folder}: exists already; choose a new folder")
+    with atomic_folder(folder) as temporary:
+        for name in ("wav", "phonemes"):
+            (temporary / name).mkdir()
+        for clip in clips:
+            whole = np.rint(clip.samples * 32767).astype(np.int16)
+            soundfile.write(temporary / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
+            rows = [[f"{p.start:.4f}", f"{p.end:.4f}", p.ipa] for p in clip.phonemes]
+            write_table(temporary / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *rows])
+        table = [[clip.name, clip.language, clip.voice, clip.text] for clip in clips]
+        write_table(temporary / "clips.csv", [["clip", "language", "voice", "text"], *table])
+
+
+@dataclass(frozen=True, eq=False)
+class OpenFace:
+    """The face that models are put on, and which of its vertices are looked at.
+
+    Attributes:
+        rig: the face at rest with ARKit's shapes, in metres.
+        points: vertices that are looked at, sorted; the other fields are places among them.
+        lip_pairs: (P, 2) of the inner lips, upper and lower.
+        lid_pairs: (P, 2) of the eyelids.
+        lips: both lips.
+        upper_face: forehead, brows and around the eyes.
+    """
+
+    rig: LinearRig
+    points: NDArray[np.int64]
+    lip_pairs: NDArray[np.int64]
+    lid_pairs: NDArray[np.int64]
+    lips: NDArray[np.int64]
+    upper_face: NDArray[np.int64]
+
+    @cached_property
+    def rest(self) -> Array:
+        """The points of the face at rest (P, 3)."""
+        return self.rig.neutral[self.points]
+
+
+@dataclass(frozen=True, eq=False)
+class ClipMotion:
+    """What somebody makes of a clip.
+
+    Attributes:
+        points: (T, P, 3) of the open face in metres; or (T, C, 1), the face's channels, where no face could be made.
+        head: (T, 3) how the head turns, axis-angle in radians; None if nothing is said of it.
+    """
+
+    points: Array
+    head: Array | None = None
+
+
+@lru_cache(maxsize=1)
+def open_face() -> OpenFace:
+    """The built-in speaker F1's face."""
+    mesh, regions = build_head(), region_vertices()
+    lips, lids = (np.stack(pairs(mesh), axis=1) for pairs in (lip_pairs, eyelid_pairs))
+    points = np.unique(np.concatenate([lips.ravel(), lids.ravel(), regions["lve"], regions["fdd"]]))
+    own = [np.searchsorted(points, index) for index in (lips, lids, regions["lve"], regions["fdd"])]
+    return OpenFace(built_in_rig(SPEAKER), points, *own)
+
+
+def reference(clip: SpokenClip, frame_rate: float) -> ClipMotion:
+    """How the built-in corpus performs a clip."""
+    number = int(clip.name.rpartition("_")[2]) - 1
+    spoken = Utterance(clip.samples, clip.phonemes)
+    performed, _ = perform_clip(_performed(clip.text, number, clip.voice), spoken, 0, frame_rate)
+    rig = rig_of(SPEAKER)[:, open_face().points].astype(np.float64)
+    # Turns of a few degrees about three axes are nearly the axis-angle of all of them.
+    return ClipMotion(rig[0] + np.tensordot(performed.weights, rig[1:], 1), np.deg2rad(performed.head))

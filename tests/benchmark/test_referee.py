@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from facediff.benchmark.referee import FAULTS, SCORES, Judgement, Score, Tally, judge
+from facediff.pipelines.candidates import Candidate, CandidateMotion, perform
+from facediff.synthetic.spoken_set import ClipMotion, SpokenClip, open_face, reference, spoken_set
+from facediff.utils.hub import BUNDLED
+
+
+@cache
+def clips() -> tuple[SpokenClip, ...]:
+    return tuple(spoken_set(["en", "de"], 1, 2))
+
+
+def test_the_planted_faults_of_the_bundled_model_are_seen_by_every_score_that_is_for_them() -> None:
+    made = perform(Candidate("puppet", str(BUNDLED)), clips(), None)
+    assert isinstance(made, CandidateMotion)
+    scores, faults, _ = judge(clips(), made.clips, made.frame_rate, made.jaw)
+    checks = Judgement("puppet", scores, faults).seen()
+    asked = {(fault, score) for fault, planted in FAULTS.items() for score in planted.seen_by}
+    assert {(check.fault, check.score) for check in checks} == asked
+    assert [check for check in checks if not check.seen] == []
+    assert 60 < faults["delay"]["lag"] - scores["lag"] < 100
+    assert made.commercial_use == "allowed"
+    assert made.seconds is not None
+    assert made.seconds > 0
+    assert scores["closures_de"] <= 1
+    assert "head" not in scores
+
+
+def test_the_reference_scores_as_itself() -> None:
+    tally = Tally(25.0)
+    for clip in clips():
+        truth = reference(clip, 25.0)
+        tally.add(clip, truth, truth)
+    scores = tally.scores()
+    for name in ("closures", "correlation", "lips", "jitter", "step", "upper_face"):
+        assert scores[name] == pytest.approx(1.0, abs=1e-6), name
+    assert scores["lag"] == pytest.approx(0.0, abs=1e-6)
+    assert scores["gap"] < 1.0
+    assert 0.5 < scores["head"] < 10
+
+
+def test_a_known_delay_gap_and_turn_are_measured() -> None:
+    clip, face = clips()[0], open_face()
+    truth = reference(clip, 50.0)
+    late = ClipMotion(np.concatenate([truth.points[:1]] * 3 + [truth.points[:-3]]), None)
+    tally = Tally(50.0)
+    tally.add(clip, late, truth)
+    assert tally.scores()["lag"] == pytest.approx(60.0, abs=2)
+    points = np.repeat(face.rest[None], len(truth.points), 0)
+    points[:, face.lip_pairs[:, 1], 1] -= 0.003
+    turns = np.zeros((len(points), 3))
+    turns[::2, 1] = np.deg2rad(4)
+    open_mouth = Tally(50.0)
+    open_mouth.add(clip, ClipMotion(points, turns), truth)
+    scores = open_mouth.scores()
+    assert scores["gap"] == pytest.approx(3.0, abs=0.5)
+    assert scores["closures"] == 0
+    assert scores["head"] == pytest.approx(2.0, abs=0.05)
+    assert "jitter" not in scores  # what never moves has none
+
+
+def test_channels_are_scored_by_their_jaw() -> None:
+    face = open_face()
+    motions = {}
+    for clip in clips():
+        truth = reference(clip, 25.0)
+        gap = truth.points[:, face.lip_pairs[:, 0]] - truth.points[:, face.lip_pairs[:, 1]]
+        jaw = np.linalg.norm(gap, axis=-1).mean(1)
+        motions[clip.name] = ClipMotion(np.stack([0 * jaw, 30 * jaw], 1)[..., None])
+    scores, faults, openings = judge(clips(), motions, 25.0, 1)
+    assert scores["correlation"] == pytest.approx(1)
+    assert "closures" not in scores
+    assert faults["delay"]["lag"] == pytest.approx(80, abs=5)
+    assert len(openings)
+    assert all(check.seen for check in Judgement("jaw", scores, faults).seen())
+
+
+def test_a_model_that_has_a_fault_already_is_not_asked_for_it() -> None:
+    deaf = Judgement("deaf", {"closures": 0.1, "correlation": 0.0, "lips": 3.0, "jitter": 1.7})
+    assert all(deaf.lacks(score) for score in ("closures", "gap", "correlation", "lag", "lips", "jitter"))
+    assert not Judgement("good", {"closures": 0.9, "correlation": 0.9}).lacks("gap")
+
+
+def test_scores_know_which_way_is_better() -> None:
+    lag, lips = SCORES["lag"], SCORES["lips"]
+    assert lag.badness(-80) > lag.badness(20)
+    assert lips.badness(0.5) == pytest.approx(lips.badness(2.0))
+    assert SCORES["closures"].badness(0.9) < SCORES["closures"].badness(0.5)
+    assert Score("x", "one", 1, "").badness(0.0) == float("inf")
