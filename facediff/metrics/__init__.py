@@ -28,6 +28,9 @@ class's docstring has the formula, its source, its unit, and what about it is a 
 - does it shiver: :class:`FrameStep`, :class:`DifferenceRatio`
 - the eyes: :class:`BlinkRate`, :class:`BlinkRateRatio`
 - several identities: :class:`IdentityDiversity`, :class:`StyleRetrievalAccuracy`, :class:`NearestSpeakerAccuracy`
+- motion in parameters: :class:`ChannelVariance` (Var), :class:`FramePairDistance` (Div), :class:`StepDistance` (STS),
+  :class:`ChannelDynamicsDeviation` (PDD, JDD), :class:`LipDynamicsDeviation` (LDD), :class:`FrechetDistance` (FD),
+  :class:`ShannonIndex` (SID), :class:`ResidualPartnerCorrelation` (rPCC), :class:`HeadBeatAlignment` (BA)
 - speed: :class:`RealTimeFactor`
 
 Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
@@ -46,11 +49,32 @@ from facediff.metrics.base import SequenceMetric as SequenceMetric
 from facediff.metrics.base import align as align
 from facediff.metrics.base import describe_column as describe_column
 from facediff.metrics.base import functional as functional
+from facediff.metrics.beats import HeadBeatAlignment as HeadBeatAlignment
+from facediff.metrics.beats import head_beat_alignment as head_beat_alignment
+from facediff.metrics.beats import onsets as onsets
 from facediff.metrics.by_name import NEEDS as NEEDS
 from facediff.metrics.by_name import Context as Context
 from facediff.metrics.by_name import Request as Request
 from facediff.metrics.by_name import feed as feed
 from facediff.metrics.by_name import parse as parse
+from facediff.metrics.channels import ChannelDynamicsDeviation as ChannelDynamicsDeviation
+from facediff.metrics.channels import ChannelMetric as ChannelMetric
+from facediff.metrics.channels import ChannelVariance as ChannelVariance
+from facediff.metrics.channels import FramePairDistance as FramePairDistance
+from facediff.metrics.channels import FrechetDistance as FrechetDistance
+from facediff.metrics.channels import LipDynamicsDeviation as LipDynamicsDeviation
+from facediff.metrics.channels import ResidualPartnerCorrelation as ResidualPartnerCorrelation
+from facediff.metrics.channels import ShannonIndex as ShannonIndex
+from facediff.metrics.channels import StepDistance as StepDistance
+from facediff.metrics.channels import channel_dynamics_deviation as channel_dynamics_deviation
+from facediff.metrics.channels import channel_variance as channel_variance
+from facediff.metrics.channels import frame_pair_distance as frame_pair_distance
+from facediff.metrics.channels import frechet_distance as frechet_distance
+from facediff.metrics.channels import lip_dynamics_deviation as lip_dynamics_deviation
+from facediff.metrics.channels import residual_partner_correlation as residual_partner_correlation
+from facediff.metrics.channels import shannon_index as shannon_index
+from facediff.metrics.channels import split_frames as split_frames
+from facediff.metrics.channels import step_distance as step_distance
 from facediff.metrics.eyes import BlinkRate as BlinkRate
 from facediff.metrics.eyes import BlinkRateRatio as BlinkRateRatio
 from facediff.metrics.eyes import EyelidDrift as EyelidDrift

@@ -83,6 +83,8 @@ class Clip:
         speech: intensity of the speech in each frame (frames,), float64; empty if none was given.
         closures: closures of the mouth, each a first frame and the frame after the last.
         identity: number of the identity.
+        partner: (frames, channels, dims), a view: the motion of whom the person talks with.
+        beats: frames in which the speech has an onset, fractions among them (beats,), float64.
     """
 
     name: str
@@ -92,6 +94,8 @@ class Clip:
     speech: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.float64))
     closures: tuple[tuple[int, int], ...] = ()
     identity: int = 0
+    partner: Tensor | None = None
+    beats: Tensor | None = None
 
     @property
     def frames(self) -> int:

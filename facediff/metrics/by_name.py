@@ -12,9 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
+import torch
 from torchmetrics import Metric
 
 from facediff.errors import FaceDiffError, choices
+from facediff.metrics.base import SequenceMetric
+from facediff.metrics.channels import Moment, split_frames
+from facediff.metrics.regions import Region
 from facediff.registry import UnknownComponentError
 from facediff.registry import metric as metrics
 
@@ -23,6 +27,9 @@ NEEDS: dict[str, str] = {
     "upper_face": "the upper-face vertices",
     "lip_pairs": "pairs of inner-lip vertices",
     "lid_pairs": "pairs of eyelid vertices",
+    "channels": "motion in parameters",
+    "partner": "the motion of whom the person talks with",
+    "speaking": "who speaks when",
     "gallery": "recordings of all speakers",
     "template": "each speaker's neutral face",
     "closures": "the times of bilabial phonemes",
@@ -36,11 +43,14 @@ NEEDS: dict[str, str] = {
 """What a metric may need, in words.
 
 The regions come as the constructor's ``lips`` and ``upper``, either sort of pairs as ``pairs`` (with
-``frames_per_second`` for eyelids), recordings as ``gallery``; ``speech`` as ``sample_rate`` and
+``frames_per_second`` for eyelids), channels as ``region``, recordings as ``gallery``; ``speech`` as ``sample_rate`` and
 ``frames_per_second``, ``identities`` as ``n_identities``, ``time`` as ``hardware``. With each batch come ``template``
-(of absolute vertices) or ``offsets_from``, ``closures``, ``waveform``, ``identities``, ``samples``, ``predictions`` (in
-several styles), ``embeddings`` with ``labels``, and ``computing`` with ``speech``, both in seconds.
+(of absolute vertices) or ``offsets_from``, ``partner``, ``closures``, ``waveform``, ``identities``, ``samples``,
+``predictions`` (in several styles), ``embeddings`` with ``labels``, and ``computing`` with ``speech``, both in seconds.
 """
+
+MOMENTS: dict[str, Moment] = {"s_": "speaking", "l_": "listening"}
+"""Prefixes of metrics that are taken in some frames only."""
 
 _NOT_CHOSEN = {"definition", "check_finite", "sync_on_compute", "process_group", "n_identities", "sample_rate"}
 
@@ -52,24 +62,36 @@ class Context:
     Args:
         has: by need, the constructor arguments that meet it; empty where the need is met with each batch.
         missing: by need, what to do to have it, or why it cannot be had.
+        channels: regions of channels by name, for metrics that read channels; ``all`` among them.
     """
 
     has: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     missing: Mapping[str, str] = field(default_factory=dict)
+    channels: Mapping[str, Region] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Request:
-    """A metric that was asked for by its registered name with options; ``text`` as written is the score's name."""
+    """A metric that was asked for by its registered name with options; ``text`` as written is the score's name.
+
+    ``moment`` says in which frames it is taken: all, or those in which the person speaks or listens.
+    """
 
     text: str
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    moment: Moment = "all"
 
     @property
     def needs(self) -> tuple[str, ...]:
         """What the metric needs, words of :data:`NEEDS`."""
-        return tuple(getattr(metrics.get(self.name), "needs", ()))
+        own = tuple(getattr(metrics.get(self.name), "needs", ()))
+        return own if self.moment == "all" else (*own, "speaking")
+
+    @property
+    def of_channels(self) -> bool:
+        """Whether the metric reads channels where motion is decoded to vertices."""
+        return bool(getattr(metrics.get(self.name), "of_channels", False))
 
     def build(self, context: Context) -> Metric:
         """The metric, made for a corpus.
@@ -89,8 +111,12 @@ class Request:
         arguments = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
         options = dict(self.options)
         region = options.get("region")
+        if getattr(implementation, "of_channels", False):
+            region = region or implementation.usual_channels
         if isinstance(region, str):  # a region that is given as an option by the name of its need
             regions = {need: value for need in ("lips", "upper_face") for value in context.has.get(need, {}).values()}
+            if getattr(implementation, "of_channels", False):
+                regions = dict(context.channels)
             if region not in regions:
                 raise FaceDiffError(f"metric {self.text}: there is no region {region!r}: {choices(region, regions)}")
             options["region"] = regions[region]
@@ -104,23 +130,50 @@ def parse(text: str) -> Request:
     """Read ``NAME:option=value,option=value``.
 
     Args:
-        text: a registered name, which may be followed by options of the metric.
+        text: a registered name, which may be followed by options of the metric. ``s_NAME`` and ``l_NAME`` are the
+            metric in the frames in which the person speaks, and listens.
 
     >>> parse("temporal_misalignment:at=path,smoothing=1.5").options
     {'at': 'path', 'smoothing': 1.5}
     """
+    moment: Moment = "all"
+    plain = text.strip()
+    for prefix, frames in MOMENTS.items():
+        if plain.startswith(prefix) and plain.partition(":")[0] not in metrics.names():
+            plain, moment = plain.removeprefix(prefix), frames
     try:
-        name, options = metrics.read(text, _NOT_CHOSEN)
+        name, options = metrics.read(plain, _NOT_CHOSEN)
     except UnknownComponentError as error:
         # It is an AttributeError too, which a torch module that parses in a property would report as one of its own.
         raise FaceDiffError(str(error)) from error
-    return Request(text.replace(" ", ""), name, options)
+    if moment != "all" and not {"prediction", "truth"} <= inspect.signature(metrics.get(name).update).parameters.keys():
+        raise FaceDiffError(
+            f"metric {text}: {name} is no score of prediction against truth frame by frame; omit the prefix"
+        )
+    return Request(text.replace(" ", ""), name, options, moment)
 
 
-def feed(metric: Metric, inputs: Mapping[str, Any]) -> None:
-    """Update a metric with those of the inputs, named as in :data:`NEEDS`, that its :meth:`update` takes."""
+def feed(metric: Metric, inputs: Mapping[str, Any], moment: Moment = "all") -> None:
+    """Update a metric with those of the inputs, named as in :data:`NEEDS`, that its :meth:`update` takes.
+
+    Args:
+        metric: the metric.
+        inputs: by name; with a ``moment``, ``speaking`` among them, a mask (frames,) for each sequence.
+        moment: in which frames it is taken; sequences without such a frame are left out.
+    """
     taken = inspect.signature(type(metric).update).parameters
-    metric.update(**{name: value for name, value in inputs.items() if name in taken})
+    count = None
+    if moment != "all":
+        count = len(inputs["speaking"])
+        inputs = split_frames(dict(inputs), inputs["speaking"], moment)
+    kept = inputs.get("kept", [0])
+    if kept:
+        metric.update(**{name: value for name, value in inputs.items() if name in taken})
+    if count is not None and isinstance(metric, SequenceMetric) and (not kept or metric.latest is not None):
+        values = torch.full((count,), torch.nan, dtype=torch.float64)
+        if kept and metric.latest is not None:
+            values[kept] = metric.latest.cpu()
+        metric.latest = values
 
 
 def parse_all(texts: Sequence[str]) -> list[Request]:

@@ -26,11 +26,24 @@ from facediff.metrics.regions import RegionLike, as_region
 from facediff.registry import metric
 
 
-def vertex_error_words(*, reduction: Reduction, squared: bool) -> str:
+def vertex_error_words(*, reduction: Reduction, squared: bool, root: bool = False, scale: float = 1.0) -> str:
     """The definition of a vertex error in plain words, in which region and pooling are still to be filled in."""
-    distance, unit = ("squared distance", "unit²") if squared else ("distance", "unit")
+    distance = "squared distance" if squared else "distance"
     which = "mean" if reduction == "mean" else "largest"
-    return f"in each frame the {which} {distance} over {{region}}; {{pooling}} [{unit}]"
+    rooted = ", and the root of each sequence's mean" if root else ""
+    unit = _unit_words(scale, squared=squared and not root)
+    return f"in each frame the {which} {distance} over {{region}}{rooted}; {{pooling}} [{unit}]"
+
+
+def _unit_words(scale: float, *, squared: bool) -> str:
+    unit = "unit²" if squared else "unit"
+    return unit if scale == 1.0 else f"{unit} of lengths times {scale:g}"
+
+
+def check_scale(scale: float) -> None:
+    """Refuse a factor of lengths that is not positive and finite."""
+    if not 0 < scale < float("inf"):
+        raise ValueError(f"scale is {scale}; expected a positive factor of lengths, such as 1000 from metres to mm")
 
 
 class VertexError(SequenceMetric):
@@ -43,6 +56,8 @@ class VertexError(SequenceMetric):
         region: vertices to look at, a :class:`Region` or indices; None for all.
         reduction: ``"mean"`` or ``"max"`` over the vertices of a frame.
         squared: whether distances are squared, e² instead of √e²; the score is then in the vertices' unit squared.
+        root: take the root of each sequence's mean over frames, so that a squared error is in the vertices' unit.
+        scale: factor of all lengths: 1000 gives millimetres where vertices are in metres.
     """
 
     higher_is_better = False
@@ -54,13 +69,20 @@ class VertexError(SequenceMetric):
         reduction: Reduction = "mean",
         squared: bool = False,
         pooling: Pooling = "frames",
+        root: bool = False,
+        scale: float = 1.0,
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("reduction", reduction, Reduction)
-        definition = vertex_error_words(reduction=reduction, squared=squared)
+        check_scale(scale)
+        if root and not squared:
+            raise ValueError("root is of squared distances; give squared too")
+        definition = vertex_error_words(reduction=reduction, squared=squared, root=root, scale=scale)
         super().__init__(definition=definition, pooling=pooling, region=region, **options)
         self.reduction: Reduction = reduction
         self.squared = squared
+        self.root = root
+        self.scale = scale
 
     def wanted(self) -> ErrorOf:
         """The error, as :func:`facediff.metrics.one_pass.one_pass` is asked for it."""
@@ -68,7 +90,11 @@ class VertexError(SequenceMetric):
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of one sequence, mean over its frames."""
-        return one_pass(clip.prediction, clip.truth, errors=[self.wanted()])[0][0]
+        return self.finished(one_pass(clip.prediction, clip.truth, errors=[self.wanted()])[0][0])
+
+    def finished(self, error: Tensor) -> Tensor:
+        """The error of one sequence from its mean over frames: its root, where asked for, in the unit asked for."""
+        return error.sqrt() * self.scale if self.root else error * self.scale ** (2 if self.squared else 1)
 
 
 @metric.register("mean_vertex_error")
@@ -77,7 +103,8 @@ class MeanVertexError(VertexError):
 
     ``reduction="mean"``, unsquared, pooled by frames is FaceDiffuser's script: mean over frames and vertices
     of √e². ``reduction="max"`` is the text of the dual-path style diffusion paper: the largest √e² of each
-    frame, averaged over frames. In the vertices' unit, squared if ``squared``.
+    frame, averaged over frames. In the vertices' unit, squared if ``squared``. Squared with ``root`` it is what ARTalk
+    and UniLS call MHD.
 
     >>> import torch
     >>> metric = MeanVertexError()
@@ -92,9 +119,11 @@ class MeanVertexError(VertexError):
         reduction: Reduction = "mean",
         squared: bool = False,
         pooling: Pooling = "frames",
+        root: bool = False,
+        scale: float = 1.0,
         **options: Unpack[SequenceOptions],
     ) -> None:
-        super().__init__(None, reduction=reduction, squared=squared, pooling=pooling, **options)
+        super().__init__(None, reduction=reduction, squared=squared, pooling=pooling, root=root, scale=scale, **options)
 
 
 @metric.register("lip_vertex_error")
@@ -102,7 +131,8 @@ class LipVertexError(VertexError):
     """Lip vertex error (LVE): the largest error among the lip vertices of each frame, averaged.
 
     Squared and pooled by frames is what CodeTalker's and FaceDiffuser's scripts compute (unit squared);
-    unsquared is MeshTalk's paper; squared and pooled by sequences is what DiffSpeaker's code reports.
+    unsquared is MeshTalk's paper; squared and pooled by sequences is what DiffSpeaker's code reports; squared with
+    ``root``, pooled by sequences, in millimetres is that of ARTalk and UniLS.
 
     Args:
         lips: lip vertices, a :class:`Region` or indices.
@@ -119,9 +149,17 @@ class LipVertexError(VertexError):
     needs = ("lips",)
 
     def __init__(
-        self, lips: RegionLike, *, squared: bool = True, pooling: Pooling = "frames", **options: Unpack[SequenceOptions]
+        self,
+        lips: RegionLike,
+        *,
+        squared: bool = True,
+        pooling: Pooling = "frames",
+        root: bool = False,
+        scale: float = 1.0,
+        **options: Unpack[SequenceOptions],
     ) -> None:
-        super().__init__(as_region(lips, "lips"), reduction="max", squared=squared, pooling=pooling, **options)
+        region = as_region(lips, "lips")
+        super().__init__(region, reduction="max", squared=squared, pooling=pooling, root=root, scale=scale, **options)
 
 
 @metric.register("upper_face_vertex_error")
@@ -152,12 +190,13 @@ class UpperFaceVertexError(VertexError):
         super().__init__(as_region(upper, "upper"), reduction=reduction, squared=squared, pooling=pooling, **options)
 
 
-def dynamics_words(*, sign: Sign) -> str:
+def dynamics_words(*, sign: Sign, scale: float = 1.0) -> str:
     """The definition of the face dynamics deviation in plain words, in which the region is still to be filled in."""
     kept = "signed, positive where the prediction moves less" if sign == "signed" else "its absolute value"
     return (
         "in each sequence the mean over {region} of the standard deviation over time (population) of the "
-        f"squared offset from the template, truth minus prediction, {kept}; mean over sequences [unit²]"
+        f"squared offset from the template, truth minus prediction, {kept}; mean over sequences "
+        f"[{_unit_words(scale, squared=True)}]"
     )
 
 
@@ -174,6 +213,7 @@ class FaceDynamicsDeviation(SequenceMetric):
     Args:
         upper: upper-face vertices, a :class:`Region` or indices.
         sign: ``"signed"`` or ``"absolute"`` in each sequence.
+        scale: factor of all lengths: 1000 gives square millimetres where vertices are in metres.
 
     >>> import torch
     >>> truth = torch.zeros(2, 1, 3)
@@ -188,15 +228,29 @@ class FaceDynamicsDeviation(SequenceMetric):
     needs = ("upper_face", "template")
     indices: Tensor
 
-    def __init__(self, upper: RegionLike, *, sign: Sign = "absolute", **options: Unpack[SequenceOptions]) -> None:
+    def __init__(
+        self,
+        upper: RegionLike,
+        *,
+        sign: Sign = "absolute",
+        scale: float = 1.0,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
         check_option("sign", sign, Sign)
-        super().__init__(definition=dynamics_words(sign=sign), region=as_region(upper, "upper"), **options)
+        check_scale(scale)
+        words = dynamics_words(sign=sign, scale=scale)
+        super().__init__(definition=words, region=as_region(upper, "upper"), **options)
         self.sign: Sign = sign
+        self.scale = scale
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The deviation of one sequence."""
         value = one_pass(clip.prediction, clip.truth, template=clip.template, uppers=[self.indices])[1][0]
-        return value if self.sign == "signed" else value.abs()
+        return self.finished(value)
+
+    def finished(self, deviation: Tensor) -> Tensor:
+        """The deviation of one sequence with the sign, and in the unit, asked for."""
+        return (deviation if self.sign == "signed" else deviation.abs()) * self.scale**2
 
     def update(
         self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from facediff.metrics import RealTimeFactor, Region, StyleRetrievalAccuracy, protocol
+from facediff.metrics import RealTimeFactor, Region, ShannonIndex, StyleRetrievalAccuracy, protocol
 from tests.metrics.further_cases import CASES
 
 # Rounds of sequences by rank: unequal shares, all on rank 0, none at all.
@@ -56,7 +56,11 @@ def main(rank: int, world: int, rendezvous: str, corpus: str, output: str) -> No
     metrics.update(**clips[rank])  # after the error above every metric still works
     results.append({name: value.item() for name, value in metrics.compute().items()})
     others = {case.name: case.make() for case in CASES if case.name in given["further"]}
-    others |= {"style": StyleRetrievalAccuracy(), "speed": RealTimeFactor("this machine")}
+    others |= {
+        "style": StyleRetrievalAccuracy(),
+        "speed": RealTimeFactor("this machine"),
+        "shannon": ShannonIndex([3, 4], clusters=5),
+    }
     further = {
         name: [score(metric, [given["further"][name][place] for place in shares[rank]]) for shares in ROUNDS]
         for name, metric in others.items()

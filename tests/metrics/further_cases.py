@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import linalg, ndimage
 from torch import Tensor
 
 import facediff.metrics as fm
@@ -133,6 +134,19 @@ def lone_samples_batch(corpus: Corpus, places: Sequence[int], extra: int, name: 
     batch = samples_batch(corpus, places, extra, name)
     batch.pop("truth")
     return batch
+
+
+def partner_of(corpus: Corpus, place: int) -> Array:
+    """Motion of whom each person talks with."""
+    return np.random.default_rng(400 + place).standard_normal(corpus.truths[place].shape).astype(np.float32)
+
+
+def partner_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    batch = pair_batch(corpus, places, extra)
+    partner = torch.full_like(batch["truth"], float("nan"))
+    for row, place in zip(partner, places, strict=True):
+        row[: len(corpus.truths[place])] = torch.from_numpy(partner_of(corpus, place))
+    return batch | {"partner": partner}
 
 
 # --- formulas ---------------------------------------------------------------------------------------------
@@ -407,6 +421,77 @@ def energy(corpus: Corpus, place: int, *, of: str, region: Sequence[int]) -> tup
     return float(off - 0.5 * np.mean([distance(x[a], x[b]) for a, b in combinations(range(SAMPLES), 2)])), len(g)
 
 
+def flat(x: Array, region: Sequence[int] = LIPS) -> Array:
+    return x[:, list(region)].astype(np.float64).reshape(len(x), -1)
+
+
+def one_side(corpus: Corpus, place: int, *, of: str, score: Callable[[Array], float]) -> tuple[float, float]:
+    p, g = (score(flat(x)) for x in sides(corpus, place))
+    return {"prediction": p, "truth": g, "gap": p - g}[of], 1
+
+
+def variance(x: Array) -> float:
+    return float(((x - x.mean(0)) ** 2).mean())
+
+
+def pair_distance(x: Array) -> float:
+    a, b = torch.randint(len(x), (2, 30), generator=torch.Generator().manual_seed(5)).numpy()
+    return float(np.mean([np.linalg.norm(x[i] - x[j]) for i, j in zip(a, b, strict=True)]))
+
+
+def spread_off(corpus: Corpus, place: int) -> tuple[float, float]:
+    p, g = map(flat, sides(corpus, place))
+    return float(100 * np.abs(np.std(p, axis=0) - np.std(g, axis=0)).mean()), 1
+
+
+def steps_off(corpus: Corpus, place: int) -> tuple[float, float]:
+    p, g = map(flat, sides(corpus, place))
+    return float(np.sqrt(np.sum((np.diff(p, axis=0) - np.diff(g, axis=0)) ** 2 / 0.1))), 1
+
+
+def opening_spread_off(corpus: Corpus, place: int) -> tuple[float, float]:
+    p, g = map(opening, sides(corpus, place))
+    return abs(p.std() - g.std()), 1
+
+
+def residual_correlation(corpus: Corpus, place: int) -> tuple[float, float]:
+    p, g = (flat(x).ravel() for x in sides(corpus, place))
+    q = flat(partner_of(corpus, place)).ravel()
+    return abs(np.corrcoef(g, q)[0, 1] - np.corrcoef(p, q)[0, 1]), 1
+
+
+def frechet(corpus: Corpus, *, partner: bool, region: Sequence[int]) -> float:
+    """By NumPy's covariance and SciPy's matrix root."""
+    frames = []
+    for side in (0, 1):
+        motions = [flat(sides(corpus, place)[side], region) for place in range(len(corpus.truths))]
+        if partner:
+            others = [flat(partner_of(corpus, place), region) for place in range(len(corpus.truths))]
+            motions = [np.concatenate(both, axis=1) for both in zip(others, motions, strict=True)]
+        frames.append(np.concatenate(motions))
+    a, b = (np.cov(x, rowvar=False) for x in frames)
+    gap = frames[0].mean(0) - frames[1].mean(0)
+    return float(gap @ gap + np.trace(a + b - 2 * np.real(linalg.sqrtm(a @ b))))
+
+
+def beat_alignment(corpus: Corpus, place: int, *, of: str) -> tuple[float, float] | None:
+    """By SciPy's filter, from the onsets of the package, which are tested apart."""
+    frames = len(corpus.truths[place])
+    scored = torch.from_numpy(sound(corpus, place)[: int(frames * RATE / FPS)])
+    beats = fm.onsets(scored, RATE).numpy() * FPS
+    if not len(beats):
+        return None
+
+    def score(x: Array) -> float:
+        speed = np.linalg.norm(np.diff(x, axis=0), axis=1)
+        speed = ndimage.gaussian_filter1d(speed, 1.0, mode="reflect") if len(speed) else speed
+        slow = [t + 0.5 for t in range(1, len(speed) - 1) if speed[t - 1] > speed[t] < speed[t + 1]]
+        gaps = [min(abs(beat - t) for t in slow) for beat in beats] if slow else []
+        return float(np.mean(np.exp(-np.square(gaps) / 4.0))) if slow else 0.0
+
+    return one_side(corpus, place, of=of, score=score)
+
+
 # --- the table --------------------------------------------------------------------------------------------
 
 
@@ -528,6 +613,34 @@ def _cases() -> list[Case]:
             twin = partial(fm.energy_score, region=region, **options)
             expected = pooled(partial(energy, of=of, region=region or range(40)), pooling)
             add(fm.EnergyScore, twin, (region,), options, samples_batch, expected, word, only)
+    for of in subjects:
+        for cls, function, options, score in (
+            (fm.ChannelVariance, fm.channel_variance, {}, variance),
+            (fm.FramePairDistance, fm.frame_pair_distance, {"pairs": 30, "seed": 5}, pair_distance),
+        ):
+            options = options | {"of": of}
+            expected = pooled(partial(one_side, of=of, score=score), "sequences")
+            add(cls, partial(function, region=LIPS, **options), (LIPS,), options, pair_batch, expected)
+        options = {"smoothing": 1.0, "variance": 2.0, "sample_rate": RATE, "frames_per_second": FPS, "of": of}
+        expected = pooled(partial(beat_alignment, of=of), "sequences")
+        twin = partial(fm.head_beat_alignment, region=LIPS, **options)
+        add(fm.HeadBeatAlignment, twin, (LIPS,), options, sound_batch, expected)
+    for cls, function, formula in (
+        (fm.ChannelDynamicsDeviation, fm.channel_dynamics_deviation, spread_off),
+        (fm.StepDistance, fm.step_distance, steps_off),
+    ):
+        add(cls, partial(function, region=LIPS), (LIPS,), {}, pair_batch, pooled(formula, "sequences"))
+    twin = partial(fm.lip_dynamics_deviation, pairs=PAIRS)
+    add(fm.LipDynamicsDeviation, twin, (PAIRS,), {}, pair_batch, pooled(opening_spread_off, "sequences"))
+    twin = partial(fm.residual_partner_correlation, region=LIPS)
+    expected = pooled(residual_correlation, "sequences")
+    add(fm.ResidualPartnerCorrelation, twin, (LIPS,), {}, partner_batch, expected)
+    for partner, region in ((False, LIPS[:1]), (True, LIPS[:2])):
+        options = {"with_partner": partner, "dims": 3}
+        twin = partial(fm.frechet_distance, region=region, **options)
+        batch = partner_batch if partner else pair_batch
+        expected = partial(frechet, partner=partner, region=region)
+        add(fm.FrechetDistance, twin, (region,), options, batch, expected)
     return cases
 
 

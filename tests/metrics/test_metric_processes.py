@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from facediff.metrics import RealTimeFactor, Region, StyleRetrievalAccuracy, protocol
+from facediff.metrics import RealTimeFactor, Region, ShannonIndex, StyleRetrievalAccuracy, protocol
 from tests.fakes.processes import Forked, program
-from tests.metrics.further_cases import CASES
+from tests.metrics.further_cases import CASES, pair_batch
 
 Corpus = Any  # the class of that name in conftest.py, which test files cannot import
 WORKER = Path(__file__).with_name("distributed_worker.py")
@@ -25,13 +25,18 @@ def further_batches(corpus: Corpus) -> dict[str, list[dict[str, Any]]]:
     embeddings = torch.randn(5, 3, 4, generator=torch.manual_seed(0))
     found["style"] = [{"embeddings": some, "labels": torch.tensor([0, 1, 2])} for some in embeddings]
     found["speed"] = [{"computing": float(place), "speech": 1.0 + place} for place in range(5)]
+    found["shannon"] = [pair_batch(corpus, [place], 0) for place in range(5)]
     return found
 
 
 def compare_further(written: dict[str, Any], batches: dict[str, list[dict[str, Any]]]) -> None:
     """Two processes against one, for every further metric, in each round of shares."""
     metrics: dict[str, Any] = {case.name: case.make() for case in CHOSEN}
-    metrics |= {"style": StyleRetrievalAccuracy(), "speed": RealTimeFactor("this machine")}
+    metrics |= {
+        "style": StyleRetrievalAccuracy(),
+        "speed": RealTimeFactor("this machine"),
+        "shannon": ShannonIndex([3, 4], clusters=5),
+    }
     assert written.keys() == metrics.keys()
     for name, metric in metrics.items():
         for batch in batches[name]:

@@ -1,0 +1,608 @@
+"""Metrics of motion in parameters: of expression, jaw and head as channels, and of people in a conversation.
+
+Motion is (frames, channels, 1). A metric flattens the channels of its region, so that it takes vertices too; x and y
+are prediction and truth in the formulas, both (frames, D).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, Unpack, cast
+
+import torch
+from torch import Tensor
+
+from facediff.errors import NotFiniteError
+from facediff.metrics.base import (
+    SIDE_WORDS,
+    Clip,
+    Clips,
+    SequenceMetric,
+    SequenceOptions,
+    Side,
+    UpdateOptions,
+    check_option,
+    functional,
+)
+from facediff.metrics.mouth import OpeningMetric, correlation
+from facediff.metrics.regions import LipPairsLike, RegionLike
+from facediff.metrics.vertex_errors import check_scale
+from facediff.registry import metric
+
+
+class ChannelMetric(SequenceMetric):
+    """Base of metrics of channels.
+
+    Args:
+        region: channels that are looked at, a :class:`Region` or indices; None for all. By name, ``expression``,
+            ``jaw``, ``head`` and ``eyes`` are groups of every space.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ("channels",)
+    of_channels: ClassVar[bool] = True
+    """Whether the metric reads channels where motion has a rig that decodes them."""
+    usual_channels: ClassVar[str] = "all"
+    """The group of channels that is taken where a metric is chosen by name and no region."""
+
+    def __init__(
+        self, region: RegionLike | None = None, *, definition: str | None = None, **options: Unpack[SequenceOptions]
+    ) -> None:
+        super().__init__(region=region, definition=definition, **options)
+        if self.region is None:  # "vertices" would be the wrong word
+            self.definition = self.definition.replace("all vertices", "all channels")
+
+    def flat(self, motion: Tensor) -> Tensor:
+        """The region of a motion (frames, channels, dims) as (frames, D), float64."""
+        chosen = motion if self.indices is None else motion.index_select(1, self.indices)
+        return chosen.flatten(1).double()
+
+
+class OneSideMetric(ChannelMetric):
+    """Base of metrics of one side alone, or of its difference from the truth's; a subclass defines :meth:`of_motion`.
+
+    Args:
+        of: ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
+    """
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        definition: str | None = None,
+        of: Side = "prediction",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Side)
+        words = (definition or self.words).replace("{side}", SIDE_WORDS[of])
+        super().__init__(region, definition=words, **options)
+        self.of: Side = of
+
+    def of_motion(self, motion: Tensor) -> Tensor:
+        """The score of one side (frames, D), a float64 scalar."""
+        raise NotImplementedError
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The score of one sequence."""
+        if self.of == "gap":
+            return self.of_motion(self.flat(clip.prediction)) - self.of_motion(self.flat(clip.truth))
+        return self.of_motion(self.flat(clip.prediction if self.of == "prediction" else clip.truth))
+
+
+@metric.register("channel_variance")
+class ChannelVariance(OneSideMetric):
+    """Var: how much channels vary over time, mean over channels of the population variance; DualTalk's table.
+
+    Per sequence mean_d var_t x[t, d]; then the mean over sequences. In squares of the channels' unit; a good prediction
+    has the truth's.
+
+    >>> import torch
+    >>> channel_variance(torch.tensor([0.0, 2.0])[:, None, None], torch.zeros(2, 1, 1)).item()
+    1.0
+    """
+
+    words = "in each sequence the mean over {region} of the variance over time, {side}; mean over sequences [unit²]"
+
+    def of_motion(self, motion: Tensor) -> Tensor:
+        """The variance of one side."""
+        return motion.var(0, correction=0).mean()
+
+
+@metric.register("frame_pair_distance")
+class FramePairDistance(OneSideMetric):
+    """Div: how different frames are, mean distance of random pairs of them; DualTalk's table.
+
+    Per sequence mean over ``pairs`` of ‖x[a] − x[b]‖₂ with a and b drawn independently and evenly from its frames; then
+    the mean over sequences. The same ``seed`` draws the same frames of every sequence of one length.
+
+    Args:
+        pairs: how many pairs are drawn of each sequence.
+        seed: of the drawing.
+
+    >>> import torch
+    >>> frame_pair_distance(torch.ones(9, 2, 1), torch.zeros(9, 2, 1)).item()
+    0.0
+    """
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        pairs: int = 100,
+        seed: int = 0,
+        of: Side = "prediction",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        if pairs < 1:
+            raise ValueError(f"pairs is {pairs}; expected 1 or more")
+        definition = (
+            f"in each sequence the mean distance over {{region}} of {pairs} pairs of frames drawn with the seed "
+            f"{seed}, {{side}}; mean over sequences [unit]"
+        )
+        super().__init__(region, definition=definition, of=of, **options)
+        self.n_pairs = pairs
+        self.seed = seed
+
+    def of_motion(self, motion: Tensor) -> Tensor:
+        """The mean distance of one side."""
+        random = torch.Generator().manual_seed(self.seed)
+        first, second = torch.randint(len(motion), (2, self.n_pairs), generator=random).to(motion.device)
+        return (motion[first] - motion[second]).norm(dim=1).mean()
+
+
+@metric.register("channel_dynamics_deviation")
+class ChannelDynamicsDeviation(ChannelMetric):
+    r"""PDD and JDD: by how much the spread of channels over time is off, 100 · mean_d \|std x_d − std y_d\|.
+
+    With ``region=head`` it is UniLS's pose dynamics deviation, with ``region=jaw`` its jaw dynamics deviation (its
+    inferencer's formula). The standard deviation is the population's, a choice; mean over sequences.
+
+    >>> import torch
+    >>> still, nodding = torch.zeros(2, 1, 1), torch.tensor([0.0, 0.5])[:, None, None]
+    >>> channel_dynamics_deviation(still, nodding).item()
+    25.0
+    """
+
+    higher_is_better = False
+    words = (
+        "in each sequence the mean over {region} of the difference between the standard deviations over time of "
+        "prediction and truth, without sign, times 100; mean over sequences [unit]"
+    )
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The deviation of one sequence."""
+        spread, true_spread = (self.flat(side).std(0, correction=0) for side in (clip.prediction, clip.truth))
+        return 100 * (spread - true_spread).abs().mean()
+
+
+@metric.register("step_distance")
+class StepDistance(ChannelMetric):
+    """STS: how different the steps from frame to frame are from the truth's, √(Σ (Δx − Δy)² / 0.1); DualTalk's table.
+
+    The sum is over channels and steps, so that long sequences count more than short ones; mean over sequences.
+
+    >>> import torch
+    >>> round(step_distance(torch.zeros(2, 1, 1), torch.tensor([0.0, 1.0])[:, None, None]).item(), 6)
+    3.162278
+    """
+
+    higher_is_better = False
+    words = (
+        "in each sequence the root of the sum over steps and {region} of the squared difference of steps from frame to "
+        "frame, over 0.1; mean over sequences [unit]"
+    )
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The distance of one sequence."""
+        return ((self.flat(clip.prediction) - self.flat(clip.truth)).diff(dim=0).square().sum() / 0.1).sqrt()
+
+
+@metric.register("lip_dynamics_deviation")
+class LipDynamicsDeviation(OpeningMetric):
+    r"""LDD: by how much the spread of the mouth's opening over time is off, \|std o_p − std o_g\|.
+
+    The opening o is that of :class:`MouthOpeningDifference`, the standard deviation the population's. The code of
+    ARTalk and UniLS has it commented out; mean over sequences.
+
+    Args:
+        scale: factor of all lengths: 1000 gives millimetres where vertices are in metres.
+
+    >>> import torch
+    >>> closed, ajar = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
+    >>> ajar[1, 0, 1] = 1.0
+    >>> lip_dynamics_deviation(closed, ajar, [(0, 1)]).item()
+    0.5
+    """
+
+    higher_is_better = False
+
+    def __init__(self, pairs: LipPairsLike, *, scale: float = 1.0, **options: Unpack[SequenceOptions]) -> None:
+        check_scale(scale)
+        unit = "unit" if scale == 1.0 else f"unit of lengths times {scale:g}"
+        definition = (
+            "in each sequence the difference, without sign, between the standard deviations over time of the mouth's "
+            f"openings, an opening being the mean distance of {{pairs}}; mean over sequences [{unit}]"
+        )
+        super().__init__(pairs, definition=definition, **options)
+        self.scale = scale
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The deviation of one sequence."""
+        predicted, true = self.openings(clip)
+        return self.scale * (predicted.std(correction=0) - true.std(correction=0)).abs()
+
+
+# Conversations: the motion of whom the person talks with is read too.
+
+
+def attach_partners(clips: Clips, partner: Tensor, *, single: bool) -> Clips:
+    """The sequences with their partners' motion, cut to the frames that are scored.
+
+    Args:
+        clips: the sequences.
+        partner: (batch, frames, channels, dims); without the batch axis if ``single``.
+        single: whether there is one sequence without batch axis.
+
+    Raises:
+        ValueError: if shapes do not fit, a partner has fewer frames than are scored, or holds NaN or infinity.
+    """
+    motions = partner.detach()[None] if single else partner.detach()
+    expected = (len(clips.clips), clips.n_vertices, clips.dims)
+    if motions.ndim != 4 or (len(motions), *motions.shape[2:]) != expected or not motions.is_floating_point():
+        raise ValueError(
+            f"partner has shape {tuple(partner.shape)}; expected the shape of the truth, one partner for each sequence"
+        )
+    scored = []
+    for clip, motion in zip(clips.clips, motions, strict=True):
+        if len(motion) < clip.frames:
+            raise ValueError(f"{clip.name}: the partner has {len(motion)} frames for {clip.frames} frames of motion")
+        if not bool(motion[: clip.frames].isfinite().all()):
+            raise NotFiniteError(f"the partner of {clip.name} holds NaN or infinity; repair or omit this clip")
+        scored.append(motion[: clip.frames])
+    return clips.attach("partner", scored)
+
+
+@metric.register("residual_partner_correlation")
+class ResidualPartnerCorrelation(ChannelMetric):
+    r"""rPCC: how far the correlation with the partner's motion is from the truth's, \|r(y, q) − r(x, q)\|; DualTalk.
+
+    r is Pearson's correlation of all frames and channels of one sequence, flattened, q the partner's motion; the mean
+    over sequences is a choice. A prediction that does not vary has r = 0; a sequence whose partner does not vary is
+    left out.
+    """
+
+    higher_is_better = False
+    needs = ("channels", "partner")
+    leaves_out = "the partner does not move"
+    words = (
+        "in each sequence the difference, without sign, between the Pearson correlations of truth and prediction with "
+        "the partner's motion, over all frames of {region}; mean over sequences; a sequence whose partner does not "
+        "vary is left out [1]"
+    )
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """The difference of one sequence, NaN where the partner does not vary."""
+        partner = self.flat(cast(Tensor, clip.partner)).flatten()
+        of_truth, of_prediction = (
+            correlation(partner, self.flat(side).flatten()) for side in (clip.truth, clip.prediction)
+        )
+        return (of_truth - of_prediction).abs()
+
+    def update(
+        self, prediction: Tensor, truth: Tensor, *, partner: Tensor | None = None, **batch: Unpack[UpdateOptions]
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            prediction: (batch, frames, channels, 1) or one sequence (frames, channels, 1), floating point.
+            truth: of the same shape as the prediction.
+            partner: motion of whom the person talks with, of the truth's shape.
+        """
+        if partner is None:
+            raise ValueError("the correlation with a partner needs partner=")
+        self.add(attach_partners(self.align(prediction, truth, **batch), partner, single=truth.ndim == 3))
+
+
+# Distances of distributions over all frames of all sequences.
+
+
+class DistributionMetric(ChannelMetric):
+    """Base of metrics over all frames of all sequences, which have no value of a single sequence."""
+
+    def clip_weight(self, clip: Clip) -> int:
+        """Its frames; the score is no mean over sequences."""
+        return clip.frames
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """None of its own."""
+        return torch.zeros((), dtype=torch.float64, device=clip.truth.device)
+
+    def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
+        """Add frames (frames, D) of both sides to the states."""
+        raise NotImplementedError
+
+    def add(self, clips: Clips) -> None:
+        """Check aligned sequences and add their frames; nothing is added where one is refused."""
+        super().add(clips)
+        for clip in clips.clips:
+            sides = [self.flat(side) for side in (clip.prediction, clip.truth)]
+            if clip.partner is not None:
+                sides = [torch.cat([self.flat(clip.partner), side], 1) for side in sides]
+            self.add_frames(*sides)
+        # The score is no mean of the sequences' values; whoever combines sequences must add up states instead.
+        self.latest = None
+
+
+@metric.register("frechet_distance")
+class FrechetDistance(DistributionMetric):
+    r"""FD: Fréchet distance between the distributions of frames of prediction and truth, as Gaussians.
+
+    \|μ_x − μ_y\|² + tr(Σ_x + Σ_y − 2 (Σ_x Σ_y)^½) over all frames of all sequences, Σ with n − 1 as NumPy's ``cov``; of
+    expression, jaw and head apart in DualTalk's and the UniLS family's tables. With ``with_partner`` it is DualTalk's
+    P-FD: a frame is the partner's followed by the person's own. Blind to time: motion in any order has the same score.
+
+    Args:
+        region: channels, a :class:`Region` or indices; the covariance is a state, whose size must be known.
+        with_partner: look at both people of a conversation.
+        dims: numbers of each point: 1 of channels, 3 of vertices.
+
+    >>> import torch
+    >>> metric = FrechetDistance([0])
+    >>> truth = torch.tensor([0.0, 2.0])[:, None, None]
+    >>> metric.update(truth + 3, truth)
+    >>> metric.compute().item()
+    9.0
+    """
+
+    higher_is_better = False
+    sums: Tensor
+    products: Tensor
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        with_partner: bool = False,
+        dims: int = 1,
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        if region is None:
+            raise ValueError("the Fréchet distance needs its channels; give a region, such as region=expression")
+        whose = "the partner's frame followed by the person's own" if with_partner else "frames"
+        definition = f"Fréchet distance between Gaussians of {whose}, over {{region}}, all sequences together [unit²]"
+        super().__init__(region, definition=definition, **options)
+        self.with_partner = with_partner
+        size = len(self.region.indices) * dims * (2 if with_partner else 1) if self.region is not None else 0
+        self.add_state("sums", torch.zeros(2, size, dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("products", torch.zeros(2, size, size, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
+        """Add to the sums and to the sums of products."""
+        both = torch.stack([prediction, truth])
+        self.sums = self.sums + both.sum(1)
+        self.products = self.products + both.mT @ both
+
+    def update(
+        self, prediction: Tensor, truth: Tensor, *, partner: Tensor | None = None, **batch: Unpack[UpdateOptions]
+    ) -> None:
+        """Add a batch of sequences.
+
+        Args:
+            prediction: (batch, frames, channels, 1) or one sequence (frames, channels, 1), floating point.
+            truth: of the same shape as the prediction.
+            partner: motion of whom the person talks with, of the truth's shape; for ``with_partner``.
+        """
+        clips = self.align(prediction, truth, **batch)
+        if self.with_partner:
+            if partner is None:
+                raise ValueError("the Fréchet distance of both people needs partner=")
+            clips = attach_partners(clips, partner, single=truth.ndim == 3)
+        self.add(clips)
+
+    def compute(self) -> Tensor:
+        """The distance over all frames so far, a float64 scalar.
+
+        Raises:
+            ValueError: if there are fewer than two frames.
+        """
+        frames = int(self.counts[0])
+        if int(self.counts[1]) == 0:
+            self.refuse_to_compute(0)
+        if frames < 2:
+            self.leave_synchronised_state()
+            raise ValueError("FrechetDistance has one frame, which has no covariance; score more")
+        means = self.sums / frames
+        covariances = (self.products - frames * means[:, :, None] * means[:, None, :]) / (frames - 1)
+        # tr (A B)^½ is the sum of the roots of the eigenvalues of A^½ B A^½, which is symmetric.
+        values, vectors = torch.linalg.eigh(covariances[0])
+        root = vectors * values.clamp_min(0).sqrt() @ vectors.T
+        shared = torch.linalg.eigvalsh(root @ covariances[1] @ root).clamp_min(0).sqrt().sum()
+        traces = covariances.diagonal(dim1=1, dim2=2).sum()
+        distance = (means[0] - means[1]).square().sum() + traces - 2 * shared
+        return distance.clamp_min(0)
+
+
+def cluster_centres(frames: Tensor, count: int, seed: int) -> Tensor:
+    """k-means: at most ``count`` centres (k, D) of frames (frames, D), whatever their order.
+
+    Our own, so that the metrics need no further library: k-means++ chooses the first centres with the seed, then
+    Lloyd's two steps are repeated until no frame changes its centre, 300 times at most. Equal frames count as often as
+    they occur; an empty cluster keeps its centre. There are fewer centres than asked for where there are fewer
+    different frames.
+
+    Args:
+        frames: float64.
+        count: how many centres.
+        seed: of the first centres.
+    """
+    points, weights = torch.unique(frames.cpu(), dim=0, return_counts=True)
+    weights = weights.double()
+    random = torch.Generator().manual_seed(seed)
+    chosen = torch.multinomial(weights, 1, generator=random)
+    while len(chosen) < min(count, len(points)):
+        far = (points[:, None] - points[chosen]).square().sum(-1).amin(1) * weights
+        if not bool(far.any()):
+            break
+        chosen = torch.cat([chosen, torch.multinomial(far, 1, generator=random)])
+    centres = points[chosen]
+    labels = torch.full((len(points),), -1)
+    for _ in range(300):
+        nearest = nearest_centres(points, centres)
+        if torch.equal(nearest, labels):
+            break
+        labels = nearest
+        sums = torch.zeros_like(centres).index_add(0, labels, points * weights[:, None])
+        sizes = torch.zeros(len(centres), dtype=torch.float64).index_add(0, labels, weights)
+        centres = torch.where(sizes[:, None] > 0, sums / sizes.clamp_min(1)[:, None], centres)
+    return centres
+
+
+def nearest_centres(frames: Tensor, centres: Tensor) -> Tensor:
+    """The number of the centre (k, D) that is nearest to each frame (frames, D); the first of equals."""
+    rows = [torch.cdist(some, centres).argmin(1) for some in torch.split(frames, 4096)]
+    return torch.cat(rows) if rows else torch.zeros(0, dtype=torch.int64)
+
+
+@metric.register("shannon_index")
+class ShannonIndex(DistributionMetric):
+    """SID: how evenly a prediction visits the clusters of the truth's frames, entropy of their histogram in bits.
+
+    k-means finds ``clusters`` centres of all the truth's frames, each predicted frame gets the label of the nearest,
+    and the score is −Σ p log₂ p over the labels' shares p: 0 for a frozen face, log₂ k at most. Learning2Listen and
+    DualTalk take k 40 for the expression, 10 for jaw and 10 for head, seed 0, and scikit-learn's k-means; ours is
+    :func:`cluster_centres`, whose centres are of the same kind and not the same. Compare with ``of="truth"``.
+
+    **Memory grows with the number of frames**, which are kept in float64: 100 000 of 50 channels take 80 MB.
+
+    Args:
+        clusters: k.
+        seed: of k-means.
+        of: ``"prediction"`` or ``"truth"``: whose labels are counted.
+
+    >>> import torch
+    >>> truth = torch.tensor([0.0, 1.0, 8.0, 9.0])[:, None, None]
+    >>> shannon_index(truth, truth, clusters=2).item(), shannon_index(truth[:1].expand(4, 1, 1), truth).item()
+    (1.0, 0.0)
+    """
+
+    predicted: list[Tensor]
+    true: list[Tensor]
+    width: Tensor
+
+    def __init__(
+        self,
+        region: RegionLike | None = None,
+        *,
+        clusters: int = 40,
+        seed: int = 0,
+        of: Literal["prediction", "truth"] = "prediction",
+        **options: Unpack[SequenceOptions],
+    ) -> None:
+        check_option("of", of, Literal["prediction", "truth"])
+        if clusters < 1:
+            raise ValueError(f"clusters is {clusters}; expected 1 or more")
+        definition = (
+            f"entropy of the shares of {clusters} clusters of the truth's frames (k-means, seed {seed}) among the "
+            f"frames {SIDE_WORDS[of]}, over {{region}}, all sequences together [bit]"
+        )
+        super().__init__(region, definition=definition, **options)
+        self.clusters = clusters
+        self.seed = seed
+        self.of = of
+        # Flat, and never an empty list: torchmetrics gathers a process without data as one flat float32 tensor.
+        self.add_state("predicted", [], dist_reduce_fx="cat")
+        self.add_state("true", [], dist_reduce_fx="cat")
+        self.add_state("width", torch.zeros((), dtype=torch.int64), dist_reduce_fx="max")
+        self._begin()
+
+    def _begin(self) -> None:
+        for state in (self.predicted, self.true):
+            state.append(torch.empty(0, dtype=torch.float64, device=self.width.device))
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        super().reset()
+        self._begin()
+
+    def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
+        """Keep the frames."""
+        self.width = torch.full_like(self.width, prediction.shape[1])
+        self.predicted.append(prediction.flatten())
+        self.true.append(truth.flatten())
+
+    def compute(self) -> Tensor:
+        """The entropy over all frames so far, a float64 scalar."""
+        if int(self.counts[1]) == 0:
+            self.refuse_to_compute(0)
+        predicted, true = (
+            (torch.cat(state) if isinstance(state, list) else state).view(-1, int(self.width)).cpu()
+            for state in (self.predicted, self.true)
+        )
+        centres = cluster_centres(true, self.clusters, self.seed)
+        labels = nearest_centres(predicted if self.of == "prediction" else true, centres)
+        shares = labels.bincount(minlength=len(centres)).double() / len(labels)
+        return -torch.special.xlogy(shares, shares).sum() / torch.log(torch.tensor(2.0, dtype=torch.float64)) + 0.0
+
+
+# Speaking and listening: the same metric on some frames of each sequence.
+
+Moment = Literal["all", "speaking", "listening"]
+"""The frames of a sequence that are scored."""
+
+
+def split_frames(inputs: dict[str, Any], speaking: Sequence[Tensor] | Tensor, moment: Moment) -> dict[str, Any]:
+    """A batch's inputs with only those frames of each sequence in which the person speaks, or listens.
+
+    Args:
+        inputs: ``prediction`` and ``truth`` (batch, frames, points, dims), with ``lengths``, and whatever else a metric
+            takes for each sequence; sequences that have no such frame are left out of all of them.
+        speaking: for each sequence a mask (frames,), true where the person speaks.
+        moment: ``"speaking"`` or ``"listening"``.
+
+    Returns:
+        The inputs, and under ``kept`` the places of the sequences that are left.
+    """
+    check_option("moment", moment, Literal["speaking", "listening"])
+    prediction, truth = inputs["prediction"], inputs["truth"]
+    if truth.ndim == 3:
+        prediction, truth = prediction[None], truth[None]
+    lengths = inputs.get("lengths")
+    counts = [truth.shape[1]] * len(truth) if lengths is None else torch.as_tensor(lengths).reshape(-1).tolist()
+    masks = []
+    for place, (mask, count) in enumerate(zip(speaking, counts, strict=True)):
+        if mask.dtype != torch.bool or mask.ndim != 1 or len(mask) < count:
+            raise ValueError(
+                f"the mask of speaking frames of sequence {place} has type {mask.dtype} and shape {tuple(mask.shape)}; "
+                f"expected {count} booleans"
+            )
+        chosen = mask if moment == "speaking" else ~mask
+        # Predictions may be shorter than the truth; a metric's own rule no longer applies to frames that are picked.
+        masks.append(chosen[: min(count, prediction.shape[1])].to(truth.device))
+    kept = [place for place, mask in enumerate(masks) if bool(mask.any())]
+    width = max((int(masks[place].sum()) for place in kept), default=1)
+
+    def picked(motion: Tensor) -> Tensor:
+        rows = motion.new_zeros(len(kept), width, *motion.shape[2:])
+        for row, place in zip(rows, kept, strict=True):
+            frames = motion[place, : len(masks[place])][masks[place]]
+            row[: len(frames)] = frames
+        return rows
+
+    result = {**inputs, "prediction": picked(prediction), "truth": picked(truth), "kept": kept}
+    result["lengths"] = [int(masks[place].sum()) for place in kept]
+    for name, value in inputs.items():
+        per_sequence = name in ("template", "offsets_from") and isinstance(value, Tensor) and value.ndim == 3
+        if per_sequence or name in ("clip_names", "identities"):
+            result[name] = value[kept] if isinstance(value, Tensor) else [value[place] for place in kept]
+        elif name == "partner":
+            result[name] = picked(value if value.ndim == 4 else value[None])
+    return result
+
+
+channel_variance = functional(ChannelVariance)
+frame_pair_distance = functional(FramePairDistance)
+channel_dynamics_deviation = functional(ChannelDynamicsDeviation)
+step_distance = functional(StepDistance)
+lip_dynamics_deviation = functional(LipDynamicsDeviation)
+residual_partner_correlation = functional(ResidualPartnerCorrelation)
+frechet_distance = functional(FrechetDistance)
+shannon_index = functional(ShannonIndex)

@@ -1,0 +1,54 @@
+"""Onsets of sound where they were planted, and a head that nods with them or beside them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from facediff.metrics import head_beat_alignment, onsets
+
+RATE, FPS = 16_000, 25
+
+
+def clicks(times: list[float], seconds: float = 4.0) -> torch.Tensor:
+    """Bursts of noise of 50 ms on a quiet ground."""
+    random = torch.Generator().manual_seed(0)
+    sound = 1e-4 * torch.randn(round(seconds * RATE), generator=random)
+    for time in times:
+        start = round(time * RATE)
+        sound[start : start + 800] += torch.randn(800, generator=random)
+    return sound
+
+
+def test_onsets_are_where_sounds_begin() -> None:
+    times = [0.5, 1.3, 2.0, 3.1]
+    for factor in (1.0, 1e-3):
+        found = onsets(factor * clicks(times), RATE)
+        assert found.tolist() == pytest.approx(times, abs=0.02)
+    assert not len(onsets(torch.zeros(RATE), RATE))
+    assert not len(onsets(torch.zeros(0), RATE))
+
+
+def test_a_head_that_pauses_on_the_beat_is_aligned_and_one_between_the_beats_is_not() -> None:
+    times = [0.6, 1.4, 2.2, 3.0]
+    frames = torch.arange(100, dtype=torch.float64)
+    # The speed of −cos(ω t) / ω is |sin ω t|, with minima every half turn; one of them lies on the first beat.
+    turn = torch.pi / (0.8 * FPS)
+
+    def nodding(first: float) -> torch.Tensor:
+        return torch.cos(turn * (frames - first * FPS))[:, None, None]
+
+    scores = [
+        head_beat_alignment(
+            nodding(first), nodding(0.6), waveform=clicks(times), frames_per_second=FPS, smoothing=1.0, variance=2.0
+        ).item()
+        for first in (0.6, 1.0)
+    ]
+    assert scores[0] > 0.9
+    assert scores[1] < 0.1
+    still = torch.zeros(100, 1, 1)
+    assert head_beat_alignment(still, nodding(0.6), waveform=clicks(times), frames_per_second=FPS).item() == 0
+    with pytest.raises(ValueError, match="onset"):
+        head_beat_alignment(still, still, waveform=torch.zeros(64_000), frames_per_second=FPS)
+    with pytest.raises(ValueError, match="frames_per_second"):
+        head_beat_alignment(still, still, waveform=torch.zeros(64_000))
