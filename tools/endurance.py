@@ -7,8 +7,8 @@
 ``live`` performs a recording of the repository over and over with the bundled model, in real time, to four receivers
 of this machine. ``serve`` has visitors who load the page and the model again and again. ``fit`` trains on the built-in
 corpus until the time is over, and is then asked to stop, as a cluster does. Each row of NAME.csv is a minute of the
-whole tree of processes. The table compares the second tenth of the time with the last one (the first has the start in it); a
-leak of a few bytes in every frame shows.
+whole tree of processes. The table compares the second tenth of the time with the last one; the start is in the
+first. A leak of a few bytes in every frame shows.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import facediff
 from facediff.cli import process
 from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.utils import renamed
 
 
 @dataclass(frozen=True)
@@ -112,9 +113,6 @@ COMMANDS = {
         "facediff.cli.check_install:check_install", "print versions, devices and extras, and try the bundled model"
     ),
 }
-RENAMED = {"yardsticks": "generation-metrics"}
-"""Commands of version 0.1 that have another name now; the error names it."""
-
 HELP = ("-h", "--help")
 GROUPS = {
     "style": "speaking styles of trained models",
@@ -157,8 +155,9 @@ def find(arguments: Sequence[str]) -> tuple[str, list[str]]:
         return f"{first} {rest[0]}", rest[1:]
     if first in COMMANDS:
         return first, rest
-    if first in RENAMED:
-        raise FaceDiffError(f'"{first}" is now called "{RENAMED[first]}"; run  facediff {RENAMED[first]}')
+    if first in renamed.COMMANDS:
+        renamed.tell(renamed.COMMANDS[first].note(first))
+        return renamed.COMMANDS[first].new, rest
     if first not in GROUPS:
         commands = list(dict.fromkeys(name.partition(" ")[0] for name in COMMANDS))
         raise FaceDiffError(f'there is no command "{first}": {choices(first, commands)}')

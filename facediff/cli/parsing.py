@@ -28,12 +28,10 @@ from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.option import Option
 from facediff.utils.ranges import Range, extras_of, range_of, shown
+from facediff.utils.renamed import current_option
 
 MISSING = inspect.Parameter.empty
 LONGEST_NAME = 255  # Bytes of the name of a file on usual disks; a path may be longer
-
-RENAMED = {"--takes": "--samples", "--directing-seed": "--controls-seed", "--at-once": "--low-latency"}
-"""Options of version 0.1 that have another name now; the error names it."""
 
 
 @dataclass(frozen=True)
@@ -307,8 +305,11 @@ def parse(
     details: str | Callable[[], str] = "",
 ) -> dict[str, Any]:
     """The values of a command's parameters; those of a group as an instance of its dataclass."""
+    flags = {flag for parameter in flat(parameters) for flag in parameter.flags}
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    arguments = [*(current_option(word, flags) for word in arguments[:end]), *arguments[end:]]
     refuse_repeated(flat(parameters), arguments)
-    values = vars(make_parser(parameters, program, summary, details).parse_args(list(arguments)))
+    values = vars(make_parser(parameters, program, summary, details).parse_args(arguments))
     for parameter in flat(parameters):
         value = values[parameter.name]
         if parameter.length and value is not None:
@@ -386,8 +387,6 @@ def readable(message: str, parameters: Collection[Parameter], program: str) -> s
         if not word.startswith("-"):
             return f"{word}: one argument too many; {see}"
         known = [parameter.flag for parameter in parameters if not parameter.positional]
-        if RENAMED.get(word) in known:
-            return f"{word}: there is no such option; it is called {RENAMED[word]} now"
         hint = choices(word, known).partition("known are")[0].strip()
         return f"{word}: there is no such option; {hint} S{see[1:]}" if hint else f"{word}: no such option; {see}"
     needed = re.search(r"arguments are required: (.*)", message)

@@ -12,7 +12,6 @@ import pytest
 from facediff.cli.app import COMMANDS, load
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.parsing import (
-    RENAMED,
     OptionGroup,
     Parameters,
     arguments_of,
@@ -168,15 +167,6 @@ FILES = ["a.wav", "b.wav", "-o", "out.mp4"]
 )
 def test_mistakes_name_the_option(words: list[str], named: str) -> None:
     assert named in refused(*words)
-
-
-def test_renamed_options_name_the_new_one() -> None:
-    def renamed(*, samples: int = 1, controls_seed: int = 0, low_latency: int = 0) -> None:
-        """Nothing."""
-
-    for old, new in RENAMED.items():
-        with pytest.raises(FaceDiffError, match=new):
-            arguments_of(renamed, "x", [old, "3"])
 
 
 def test_a_sequence_is_one_word_with_commas() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from facediff.cli.app import COMMANDS, GROUPS, RENAMED, main, usage
+from facediff.cli.app import COMMANDS, GROUPS, main, usage
 from facediff.registry import KINDS
 
 # Every command line in one process; after each, whether anything heavy has been loaded.
@@ -77,13 +77,6 @@ def test_help_and_mistakes_import_nothing_heavy(tmp_path: Path) -> None:
     rows = spied(["animate --help", "demo --help", *MISTAKES], ["torch", "lightning", "numpy"], tmp_path)
     wrong = {line: row for line, row in rows.items() if row != ([0, [], 0] if line.endswith("--help") else [2, [], 1])}
     assert not wrong
-
-
-def test_a_renamed_command_names_the_new_one(capsys: pytest.CaptureFixture[str]) -> None:
-    for old, new in RENAMED.items():
-        assert main([old, "--anything"]) == 2
-        [line] = capsys.readouterr().err.splitlines()
-        assert f'"{old}" is now called "{new}"' in line
 
 
 @pytest.mark.parametrize("group", ["", *GROUPS])

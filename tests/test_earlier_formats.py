@@ -1,0 +1,56 @@
+"""What earlier versions wrote is read, and moves as it did then.
+
+The archives of ``formats/`` hold what the versions in their names wrote of the miniature corpus ``tests.fakes.tiny``:
+a checkpoint, and from 0.2 on a model folder and an exported folder of the same model (``tests.fakes.formats`` wrote
+them). ``animation.npz`` is what that version's ``facediff animate docs/examples/question.wav`` gave.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import facediff
+from tests.fakes.tiny import Tiny
+
+ROOT = Path(__file__).parents[1]
+RECORDING = ROOT / "docs" / "examples" / "question.wav"
+WRITTEN = [
+    ("0.1", "tiny.ckpt", "A_e01", "off"),  # which had no voice gate
+    ("0.2", "tiny.ckpt", "A_e01", "energy"),
+    ("0.2", "folder", "A_e01", "energy"),
+    ("0.2", "exported", "A", "energy"),  # which keeps a style for each identity
+    ("1.0", "tiny.ckpt", "A_e01", "energy"),
+    ("1.0", "folder", "A_e01", "energy"),
+    ("1.0", "exported", "A", "energy"),
+]
+
+
+@pytest.fixture(scope="module")
+def formats(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("formats")
+    for archive in sorted((ROOT / "tests" / "formats").glob("*.tar.xz")):
+        with tarfile.open(archive) as file:
+            file.extractall(folder / archive.name.removesuffix(".tar.xz"), filter="data")
+    return folder
+
+
+@pytest.mark.parametrize(("version", "name", "style", "voice_gate"), WRITTEN)
+def test_a_model_of_an_earlier_version_moves_as_it_did(
+    formats: Path, version: str, name: str, style: str, voice_gate: str
+) -> None:
+    assert Tiny.corpus_name == "tiny"  # a checkpoint names its corpus, which has to be imported
+    then = facediff.read(formats / version / "animation.npz")
+    model = facediff.load(formats / version / name)
+    now = model.animate(RECORDING, identity="A", style=style, seed=0, voice_gate=voice_gate)
+    assert now.frame_rate == then.frame_rate
+    extent = np.ptp(then.vertices, axis=0).max()
+    assert np.abs(now.vertices - then.vertices).max() < 1e-4 * extent
+
+
+def test_every_archive_is_tried(formats: Path) -> None:
+    held = {(path.parent.name, path.name) for path in formats.glob("*/*") if path.name != "animation.npz"}
+    assert held == {(version, name) for version, name, *_ in WRITTEN}
