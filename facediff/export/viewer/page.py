@@ -46,6 +46,8 @@ SCRIPTS = (
 
 UNITS = {"brows": "mm", "blinks": "a minute", "gaze": "degrees", "sway": "degrees", "head": "degrees"}
 """What channels of keys are measured in, where it is no plain factor."""
+USUAL = {"head": (-10.0, 10.0)}
+"""Values that a lane shows at first, where the whole range would hide what is usual."""
 REST = {"expressivity": 1.0, "guidance": 1.0, "expressiveness": 1.0, "acting": 1.0}
 """Where a channel stays without keys, and gets its first one; 0 for the others."""
 PREVIEWED = ("expressiveness", "head")
@@ -193,6 +195,7 @@ def _direction_facts() -> dict[str, Any]:
         facts = {
             "range": [limits.least, limits.most] if limits else None,
             "rest": rest,
+            "usual": USUAL.get(name),
             "unit": UNITS.get(name, ""),
             "regions": channel.regions,
             "preview": name in PREVIEWED,

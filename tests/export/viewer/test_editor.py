@@ -7,6 +7,7 @@ readers of the command line.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -202,6 +203,92 @@ def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
         assert not np.allclose(found, made.vertices[number], atol=2)
     page.evaluate("document.getElementById('preview').click()")
     assert np.array_equal(np.reshape(page.evaluate(f"{frame}(31)"), (-1, 3)), before)
+
+
+def test_lanes_are_magnified_and_several_keys_are_moved_copied_and_pasted(show: Show) -> None:
+    keys = [Key(time, "head.pitch", value) for time, value in ((0.4, 0.0), (0.8, 3.0), (1.2, -1.0), (2.0, 0.0))]
+    page = show([directed(Direction([*keys, Key(0.8, "brows", 5.0)]))], width=1000, height=900)
+
+    def mouse(kind: str, point: tuple[float, float], modifiers: int = 0, **more: object) -> None:
+        page.send("Input.dispatchMouseEvent", type=kind, x=point[0], y=point[1], modifiers=modifiers, **more)
+
+    def drag(start: tuple[float, float], end: tuple[float, float], modifiers: int = 0) -> None:
+        mouse("mousePressed", start, modifiers, button="left", buttons=1, clickCount=1)
+        mouse("mouseMoved", end, modifiers, button="left", buttons=1)
+        mouse("mouseReleased", end, modifiers, button="left", clickCount=1)
+
+    def point(name: str, seconds: float, value: float) -> tuple[float, float]:
+        """A point of a lane as it is magnified."""
+        left, top, width, height = lane(page, name)
+        (start, end), (low, high) = page.evaluate(f"[facediff.stretch, facediff.seen('{name}')]")
+        return left + width * (seconds - start) / (end - start), top + height * (high - value) / (high - low)
+
+    def rows(name: str) -> list[tuple[float, float]]:
+        return [(round(key.time, 6), float(key.value)) for key in keys_in(page).channels.get(name, ())]
+
+    # Ctrl and the wheel magnify the time by e in 250 pixels, about the pointer; Shift scrolls it; 0 shows all.
+    whole = FRAMES / RATE
+    mouse("mouseWheel", point("head.pitch", 1.2, 0), 2, deltaX=0, deltaY=-250)
+    page.wait_for(f"facediff.stretch[1] < {whole - 0.01}")
+    start, end = page.evaluate("facediff.stretch")
+    assert end - start == pytest.approx(whole / math.e)
+    assert (1.2 - start) / (end - start) == pytest.approx(1.2 / whole, abs=0.01)
+    # The shown time turns the page, by keyboard too.
+    page.evaluate("facediff.seek(70)")
+    assert page.evaluate("facediff.stretch[1] >= 70 / 25")
+    for key, expected in (("PageUp", end - start), ("-", 1.5 * (end - start)), ("0", whole)):
+        press(page, key)
+        assert page.evaluate("facediff.stretch[1] - facediff.stretch[0]") == pytest.approx(expected)
+    # A nod of three degrees fills its lane, and a drag by a tenth of the lane is a tenth of that.
+    low, high = page.evaluate("facediff.seen('head.pitch')")
+    assert (low, high) == (-10, 10)
+    press(page, "f")
+    low, high = page.evaluate("facediff.seen('head.pitch')")
+    assert (low + high) / 2 == pytest.approx(1, abs=0.1)
+    assert high - low == pytest.approx(5, abs=0.1)
+    drag(point("head.pitch", 0.8, 3), point("head.pitch", 0.8, 2.5))
+    assert rows("head.pitch")[1] == (0.8, pytest.approx(2.5, abs=0.16))
+    press(page, "z", 2)
+    # A box over two lanes, one more key by a click, and a drag of all of them: one step of the history.
+    assert rows("head.pitch")[1] == (0.8, 3)
+    drag(point("head.pitch", 0.6, 3.2), point("brows", 0.9, 0.0), 8)
+    drag(point("head.pitch", 1.2, -1), point("head.pitch", 1.2, -1), 8)
+    drag(point("head.pitch", 1.2, -1), point("head.pitch", 1.29, -0.5))
+    assert rows("brows") == [(0.88, 5)]
+    assert rows("head.pitch") == [
+        (0.4, 0),
+        (0.88, pytest.approx(3.5, abs=0.16)),
+        (1.28, pytest.approx(-0.5, abs=0.16)),
+        (2, 0),
+    ]
+    press(page, "z", 2)
+    assert rows("brows") == [(0.8, 5)]
+    assert rows("head.pitch")[1] == (0.8, 3)
+    # By keyboard: two keys are copied, pasted at the shown frame, and moved, raised, bent and removed together.
+    lane(page, "head.pitch")
+    for key, modifiers in (("Escape", 0), ("ArrowRight", 0), ("ArrowRight", 0), ("ArrowRight", 2), ("c", 2)):
+        press(page, key, modifiers)
+    page.evaluate("facediff.seek(55)")
+    press(page, "v", 2)
+    assert rows("head.pitch")[-2:] == [(2.2, 3), (2.6, -1)]
+    for key, modifiers in (("ArrowRight", 8), ("ArrowUp", 0), ("2", 0)):
+        press(page, key, modifiers)
+    raised = (high - low) / 40
+    assert rows("head.pitch")[-2:] == [(2.24, pytest.approx(3 + raised)), (2.64, pytest.approx(-1 + raised))]
+    assert [key.interpolation for key in keys_in(page).channels["head.pitch"][-2:]] == ["linear", "linear"]
+    press(page, "Delete")
+    assert len(rows("head.pitch")) == 4
+    # Keys of one channel go into the lane that has the focus, within its range.
+    lane(page, "brows")
+    press(page, "v", 2)
+    assert rows("brows") == [(0.8, 5), (2.2, 3), (2.6, -1)]
+    press(page, "a", 2)
+    press(page, "x", 2)
+    assert rows("brows") == []
+    for _ in range(9):
+        press(page, "z", 2)
+    assert keys_in(page).rows() == Direction([*keys, Key(0.8, "brows", 5.0)]).rows()
+    assert page.evaluate("[...document.querySelectorAll('#direction button')].every((each) => each.textContent.trim())")
 
 
 @pytest.mark.slow  # a picture for every look

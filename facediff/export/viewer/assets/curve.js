@@ -13,8 +13,8 @@ function ticks(end, wanted) {
 
 class Curve extends Plot {
   /** Lines are {values, number}: openings in mm by frame, and the number of the animation. */
-  constructor(canvas, cursor, lines, facts, onSeek) {
-    super(canvas, cursor, facts, onSeek);
+  constructor(canvas, cursor, lines, facts, onSeek, view) {
+    super(canvas, cursor, facts, onSeek, view);
     this.lines = lines;
     this.highest = 1.08 * lines.reduce((most, line) => line.values.reduce((a, b) => Math.max(a, b), most), 0.5);
   }
@@ -39,9 +39,12 @@ class Curve extends Plot {
     }
     pen.textBaseline = "alphabetic";
     pen.textAlign = "center";
-    for (const { value, text } of ticks(this.seconds, this.width / 90)) {
+    for (const { value, text } of ticks(this.view.to, (this.width / 90) * (this.view.to / this.view.span))) {
+      if (value < this.view.from - 1e-9) continue;
       pen.fillText(`${text} s`, Math.min(this.x(value), wide - MARGIN.right - 8), high - 6);
     }
+    pen.save();
+    this.clip(pen);
     pen.lineWidth = 1.75;
     pen.lineJoin = "round";
     for (const line of this.lines) {
@@ -51,6 +54,7 @@ class Curve extends Plot {
       if (line.values.length === 1) pen.lineTo(this.x(this.seconds), y(line.values[0]));
       pen.stroke();
     }
+    pen.restore();
     this.point(this.shown ?? 0);
   }
 }

@@ -127,8 +127,23 @@ class Direction {
     return this.keys.find((each) => each.channel === changed.channel && each.time === changed.time);
   }
 
-  remove(key) {
-    this.set(this.keys.filter((each) => each !== key));
+  remove(keys) {
+    this.set(this.keys.filter((key) => !keys.includes(key)));
+  }
+
+  /** Put rows in the place of keys, in one change, and return them as keys; null if two keys of a channel would meet. */
+  replace(keys, rows) {
+    const kept = this.keys.filter((key) => !keys.includes(key));
+    const taken = ({ channel, time }) => kept.some((key) => key.channel === channel && Math.abs(key.time - time) < SAME_TIME);
+    if (rows.some((row) => row.time < 0 || taken(row))) return null;
+    const placed = rows.map((row) => {
+      const { range } = this.channel(row.channel);
+      const value = range ? Math.max(range[0], Math.min(range[1], Number(row.value.toFixed(4)))) : row.value;
+      return Object.freeze({ ...row, value });
+    });
+    if (JSON.stringify(placed) !== JSON.stringify(keys)) this.set([...kept, ...placed]);
+    else return keys;
+    return placed;
   }
 
   removeChannel(name) {

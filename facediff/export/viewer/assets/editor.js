@@ -25,11 +25,21 @@ class Editor {
       ({ direction }) => new Direction(this.facts.direction, direction ?? [], () => this.changed())
     );
     this.lanes = [];
-    this.selected = null;
+    this.chosen = []; // keys; the last one is that of the fields
+    this.copied = [];
     this.drawing = null;
     this.connect();
     this.show(this.facts.animations.some(({ direction }) => direction));
     this.direct(this.number);
+  }
+
+  get selected() {
+    return this.chosen.at(-1) ?? null;
+  }
+
+  /** Whether a drag in a lane draws a box around keys, as with Shift. */
+  get boxing() {
+    return find("box").getAttribute("aria-pressed") === "true";
   }
 
   get direction() {
@@ -38,7 +48,8 @@ class Editor {
 
   /** Time of the shown frame in s. */
   get time() {
-    return Math.max(0, this.player.shown) / this.facts.frameRate;
+    const { shown, wanted } = this.player;
+    return (shown < 0 ? wanted : shown) / this.facts.frameRate; // none is shown while changed keys are being drawn
   }
 
   get snaps() {
@@ -56,7 +67,15 @@ class Editor {
     click("directing", () => this.show(find("direction").hidden));
     click("undo", () => this.direction.undo());
     click("redo", () => this.direction.redo());
-    click("delete-key", () => this.removeKey());
+    click("delete-key", () => this.removeKeys());
+    click("copy-keys", () => this.copyKeys());
+    click("paste-keys", () => this.pasteKeys());
+    click("box", () => find("box").setAttribute("aria-pressed", String(!this.boxing)));
+    const { view } = this.player;
+    click("time-closer", () => view.zoom(1.5, this.time));
+    click("time-further", () => view.zoom(1 / 1.5, this.time));
+    click("time-all", () => view.set(0, view.seconds));
+    find("time-from").addEventListener("input", () => view.set(Number(find("time-from").value), view.span));
     click("save-keys", () => this.save());
     click("open-keys", () => find("keys-file").click());
     find("keys-file").addEventListener("change", () => this.open(find("keys-file")));
@@ -73,7 +92,8 @@ class Editor {
     const field = (id, changes) =>
       find(id).addEventListener("change", () => {
         const words = find(id).value.trim();
-        if (this.selected && (words || id === "key-slope")) this.select(this.direction.change(this.selected, changes(words)));
+        if (this.chosen.length > 1 && id === "key-kind") this.bend(words);
+        else if (this.selected && (words || id === "key-slope")) this.select(this.direction.change(this.selected, changes(words)));
         this.showFields();
       });
     field("key-time", (words) => ({ time: Number(words) }));
@@ -126,7 +146,7 @@ class Editor {
     find("directed").value = number;
     for (const lane of this.lanes) lane.element.remove();
     this.lanes = [];
-    this.selected = null;
+    this.chosen = [];
     this.changed();
   }
 
@@ -148,16 +168,28 @@ class Editor {
 
   /** Choose a key, or none. */
   select(key, lane) {
-    this.selected = key;
+    this.choose(key ? [key] : [], lane);
+  }
+
+  /** Choose a key as well, or no longer. */
+  toggle(key, lane) {
+    const left = this.chosen.filter((other) => other !== key);
+    this.choose(left.length < this.chosen.length ? left : [...left, key], lane);
+  }
+
+  /** Choose keys. */
+  choose(keys, lane) {
+    this.chosen = [...keys];
+    const key = this.selected;
     if (lane && document.activeElement !== lane.canvas) lane.canvas.focus({ preventScroll: true });
     this.showFields();
     this.drawLanes();
-    if (key) find("direction-said").textContent = `${key.channel}: ${sayKey(key)}`;
+    if (key) find("direction-said").textContent = keys.length > 1 ? `${keys.length} keys chosen` : `${key.channel}: ${sayKey(key)}`;
   }
 
   /** The focus has come to a lane: keys of another one are no longer chosen. */
   enter(lane) {
-    if (this.selected && this.selected.channel !== lane.name) this.select(null);
+    if (this.selected && !this.chosen.some(({ channel }) => channel === lane.name)) this.select(null);
   }
 
   /** Draw all lanes before the next picture, once however much has changed. */
@@ -168,22 +200,97 @@ class Editor {
     });
   }
 
-  removeKey() {
-    const key = this.selected;
-    if (!key) return;
-    this.selected = null;
-    this.direction.remove(key);
-    find("direction-said").textContent = `${key.channel}: removed the key at ${short(key.time)} s`;
+  /** What the view of the time has changed. */
+  draw() {
+    const { view } = this.player, from = find("time-from");
+    from.hidden = view.whole;
+    Object.assign(from, { min: 0, max: view.seconds - view.span, step: "any", value: view.from });
+    from.setAttribute("aria-valuetext", `${short(view.from)} to ${short(view.to)} seconds`);
+    find("time-all").disabled = find("time-further").disabled = view.whole;
+    this.drawLanes();
+  }
+
+  // Several keys.
+
+  removeKeys() {
+    const keys = this.chosen;
+    if (!keys.length) return;
+    this.chosen = [];
+    this.direction.remove(keys);
+    const [{ channel, time }] = keys;
+    find("direction-said").textContent = keys.length > 1 ? `removed ${keys.length} keys` : `${channel}: removed the key at ${short(time)} s`;
+  }
+
+  /** A time that was computed, on the frame that it means. */
+  onFrame(time) {
+    const frame = Math.round(time * this.facts.frameRate) / this.facts.frameRate;
+    return Math.abs(frame - time) < SAME_TIME ? frame : Number(time.toFixed(6));
+  }
+
+  /** Move keys, as they were when they were grasped, by seconds, and those of a lane by an amount: all of them or none. */
+  shift(keys, seconds, amount, lane) {
+    const rows = keys.map((key) => ({
+      ...key,
+      time: this.onFrame(key.time + seconds),
+      value: key.channel === lane.name && lane.known.range ? key.value + amount : key.value,
+    }));
+    this.put(this.chosen, rows, lane);
+  }
+
+  bend(interpolation, lane) {
+    this.put(this.chosen, this.chosen.map((key) => ({ ...key, interpolation })), lane);
+  }
+
+  put(keys, rows, lane) {
+    const placed = this.direction.replace(keys, rows);
+    if (placed) this.choose(placed, lane);
+  }
+
+  copyKeys() {
+    this.copied = [...this.chosen].sort((a, b) => a.time - b.time);
+    find("direction-said").textContent = `copied ${this.copied.length} keys`;
+    this.showFields();
+    return this.copied.length > 0;
+  }
+
+  /** Put copies of keys at the shown frame: into their channels, or those of one channel of numbers into the lane in use. */
+  pasteKeys(lane = this.lanes.find(({ canvas }) => canvas === document.activeElement)) {
+    if (!this.copied.length) return;
+    const [first] = this.copied, channels = new Set(this.copied.map(({ channel }) => channel));
+    const other = lane && channels.size === 1 && lane.known.range && this.direction.channel(first.channel).range ? lane.name : null;
+    const moved = this.onFrame(this.snapped(this.time)) - first.time;
+    const rows = this.copied.map((key) => ({ ...key, channel: other ?? key.channel, time: this.onFrame(key.time + moved) }));
+    const under = rows.map(({ channel, time }) => this.direction.at(channel, time)).filter(Boolean);
+    this.put(under, rows, lane);
+    find("direction-said").textContent = `pasted ${rows.length} keys at ${short(this.time)} s`;
+  }
+
+  /** Choose the keys of all lanes within a box from where it began to a pointer; without a box, show none. */
+  drawBox(box, event, lane) {
+    const frame = find("chosen-box");
+    frame.hidden = !box;
+    if (!box) return;
+    const left = Math.min(box.x, event.clientX), right = Math.max(box.x, event.clientX);
+    const top = Math.min(box.y, event.clientY), bottom = Math.max(box.y, event.clientY);
+    Object.assign(frame.style, { left: `${left}px`, top: `${top}px`, width: `${right - left}px`, height: `${bottom - top}px` });
+    const inside = this.lanes.flatMap((each) => {
+      const place = each.canvas.getBoundingClientRect();
+      return each.keys.filter((key) => {
+        const x = place.left + each.x(key.time), y = place.top + each.y(key.value);
+        return x >= left && x <= right && y >= top && y <= bottom;
+      });
+    });
+    this.choose([...box.kept.filter((key) => !inside.includes(key)), ...inside], lane);
   }
 
   /** Bring the page up to date after a change of the keys. */
   changed() {
     const { direction } = this;
-    if (this.selected && !direction.keys.includes(this.selected)) {
-      this.selected = direction.at(this.selected.channel, this.selected.time) ?? null;
-    }
+    const now = (key) => (direction.keys.includes(key) ? key : direction.at(key.channel, key.time));
+    this.chosen = this.chosen.map(now).filter(Boolean);
     for (const name of direction.channels) this.addLane(name);
     this.drawLanes();
+    find("paste-keys").disabled = !this.copied.length;
     find("undo").disabled = !direction.past.length;
     find("redo").disabled = !direction.future.length;
     find("save-keys").disabled = !direction.keys.length;
@@ -208,10 +315,14 @@ class Editor {
   showFields() {
     const key = this.selected;
     find("key-fields").hidden = !key;
+    find("paste-keys").disabled = !this.copied.length;
     if (!key) return;
+    const several = this.chosen.length > 1;
+    for (const id of ["key-time", "key-value"]) find(id).parentElement.hidden = several;
+    find("delete-key").textContent = several ? "Delete keys" : "Delete key";
     const { range } = this.direction.channel(key.channel);
     const value = find("key-value");
-    find("key-channel").textContent = key.channel;
+    find("key-channel").textContent = several ? `${this.chosen.length} keys` : key.channel;
     find("key-time").value = short(key.time);
     find("key-time").step = this.snaps ? 1 / this.facts.frameRate : "any";
     value.type = range ? "number" : "text";
@@ -219,7 +330,7 @@ class Editor {
     value.value = range ? short(key.value) : key.value;
     find("key-kind").value = key.interpolation;
     find("key-slope").value = key.slope ?? "";
-    find("key-slope").parentElement.hidden = !range || key.interpolation !== "smooth";
+    find("key-slope").parentElement.hidden = several || !range || key.interpolation !== "smooth";
   }
 
   showTime() {

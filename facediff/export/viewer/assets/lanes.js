@@ -11,8 +11,9 @@ class Lane extends Plot {
   constructor(editor, name) {
     const canvas = make("canvas");
     const cursor = make("div", "cursor");
-    super(canvas, cursor, editor.facts, (frame) => editor.player.seek(frame));
+    super(canvas, cursor, editor.facts, (frame) => editor.player.seek(frame), editor.player.view);
     Object.assign(this, { editor, name, known: editor.direction.channel(name) });
+    this.start();
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application"); // arrow keys are the lane's own
     canvas.setAttribute("aria-describedby", "lane-help");
@@ -30,6 +31,13 @@ class Lane extends Plot {
     if (this.known.unit) head.append(make("span", "what", this.known.unit));
     if (!this.known.preview) head.append(make("span", "mark", "shows after a new run"));
     const tools = make("span", "lane-tools");
+    if (this.known.range) {
+      tools.append(
+        button("−", "Show more values", () => this.zoomValue(1 / 1.5)),
+        button("+", "Magnify the values", () => this.zoomValue(1.5)),
+        button("Fit", "Fit the lane to its keys", () => this.fit())
+      );
+    }
     tools.append(
       button("+ Key", "Add a key here", () => this.add(editor.time)),
       button("✕", "Remove the channel", () => editor.removeLane(this))
@@ -49,17 +57,51 @@ class Lane extends Plot {
     return this.known.range ?? [0, 1];
   }
 
-  y(value) {
+  /** Show the values that a channel usually takes, and those of its keys. */
+  start() {
+    const values = this.keys.map(({ value }) => value), [least, most] = this.known.usual ?? this.range;
+    this.seen = this.known.range ? [Math.min(least, ...values), Math.max(most, ...values)] : this.range;
+  }
+
+  /** Show what the curve takes, with a margin. */
+  fit() {
+    const { keys, range } = this, slopes = slopesOf(keys);
+    if (!keys.length) this.start();
+    else {
+      const from = keys[0].time, span = keys.at(-1).time - from;
+      const values = Array.from({ length: 201 }, (_, i) => valueAt(keys, from + (span * i) / 200, range, 0, slopes));
+      const least = Math.min(...values), most = Math.max(...values);
+      this.see((least + most) / 2, Math.max(1.25 * (most - least), (range[1] - range[0]) / 20));
+    }
+    this.editor.drawLanes();
+  }
+
+  /** Magnify the values by a factor; one of them stays where it is. */
+  zoomValue(factor, about = this.editor.selected?.channel === this.name ? this.editor.selected.value : (this.seen[0] + this.seen[1]) / 2) {
+    if (!this.known.range) return;
+    const [least, most] = this.seen, span = (most - least) / factor;
+    this.see(about + ((least + most) / 2 - about) / factor, span);
+    this.editor.drawLanes();
+  }
+
+  see(middle, span) {
     const [least, most] = this.range;
+    span = Math.max((most - least) / 200, Math.min(most - least, span));
+    const low = Math.max(least, Math.min(most - span, middle - span / 2));
+    this.seen = [low, low + span];
+  }
+
+  y(value) {
+    const [least, most] = this.seen;
     const share = typeof value === "number" ? (value - least) / (most - least) : 0.5;
     return EDGE_SPACE + (1 - share) * (this.canvas.clientHeight - 2 * EDGE_SPACE);
   }
 
   valueUnder(event) {
-    const [least, most] = this.range;
+    const [least, most] = this.seen;
     const box = this.canvas.getBoundingClientRect();
     const share = 1 - (event.clientY - box.top - EDGE_SPACE) / (box.height - 2 * EDGE_SPACE);
-    return least + Math.max(0, Math.min(1, share)) * (most - least);
+    return Math.max(this.range[0], Math.min(this.range[1], least + share * (most - least)));
   }
 
   /** The key under a pointer. */
@@ -74,7 +116,8 @@ class Lane extends Plot {
     this.editor.select(this.editor.direction.add(this.name, this.editor.snapped(time), value));
   }
 
-  // Pointers: a press on a key selects and drags it, elsewhere it goes to the moment; a double click adds a key there.
+  // Pointers: a press on a key selects and drags it and all that are chosen, elsewhere it goes to the moment, or with Shift
+  // draws a box around keys; a double click adds a key there.
 
   listen() {
     const { canvas } = this;
@@ -89,11 +132,19 @@ class Lane extends Plot {
   press(event) {
     if (event.button) return;
     this.canvas.setPointerCapture(event.pointerId);
-    const key = this.keyUnder(event);
-    this.editor.select(key, this);
+    const { editor } = this, key = this.keyUnder(event);
+    if (!key && (event.shiftKey || editor.boxing)) {
+      if (document.activeElement !== this.canvas) this.canvas.focus({ preventScroll: true });
+      this.box = { x: event.clientX, y: event.clientY, kept: event.shiftKey ? editor.chosen : [] };
+      return;
+    }
+    if (key && event.shiftKey) editor.toggle(key, this);
+    else if (!key || !editor.chosen.includes(key)) editor.select(key, this);
+    else editor.choose([...editor.chosen.filter((other) => other !== key), key], this);
     if (!key) return this.onSeek(this.frameAt(event));
-    this.grasp = { key, x: event.clientX, y: event.clientY, moved: false };
-    this.editor.direction.hold();
+    if (!editor.chosen.includes(key)) return;
+    this.grasp = { key, keys: editor.chosen, x: event.clientX, y: event.clientY, moved: false };
+    editor.direction.hold();
   }
 
   drag(event) {
@@ -101,10 +152,16 @@ class Lane extends Plot {
       this.canvas.style.cursor = this.keyUnder(event) ? "grab" : "";
       return;
     }
+    if (this.box) return this.editor.drawBox(this.box, event, this);
     if (!this.grasp) return this.onSeek(this.frameAt(event));
     const { grasp } = this;
     if (!grasp.moved && Math.hypot(event.clientX - grasp.x, event.clientY - grasp.y) < 3) return; // a click, not a drag
     grasp.moved = true;
+    if (grasp.keys.length > 1) {
+      const time = event.shiftKey ? grasp.key.time : this.editor.snapped(this.timeAt(event), event.altKey);
+      const amount = this.known.range ? this.valueUnder(event) - grasp.key.value : 0;
+      return this.editor.shift(grasp.keys, time - grasp.key.time, amount, this);
+    }
     const changes = event.shiftKey ? {} : { time: this.between(grasp.key, this.timeAt(event), event.altKey) };
     if (this.known.range) changes.value = this.valueUnder(event);
     grasp.key = this.editor.direction.change(grasp.key, changes);
@@ -112,6 +169,8 @@ class Lane extends Plot {
   }
 
   letGo() {
+    this.box = null;
+    this.editor.drawBox(null);
     if (!this.grasp) return;
     this.grasp = null;
     this.editor.direction.release();
@@ -130,9 +189,27 @@ class Lane extends Plot {
   // Keyboard.
 
   type(event) {
-    if (event.ctrlKey || event.metaKey) return;
-    const { editor } = this, { direction } = editor;
+    const { editor } = this, { direction } = editor, { view } = this;
     const selected = editor.selected && editor.selected.channel === this.name ? editor.selected : null;
+    const extend = (by) => {
+      const next = this.keys[selected ? this.keys.indexOf(selected) + by : by > 0 ? 0 : this.keys.length - 1];
+      if (next) editor.choose([...editor.chosen.filter((key) => key !== next), next], this);
+    };
+    if (event.ctrlKey || event.metaKey) {
+      const own = {
+        a: () => editor.choose(this.keys, this),
+        c: () => editor.copyKeys(),
+        x: () => editor.copyKeys() && editor.removeKeys(),
+        v: () => editor.pasteKeys(this),
+        ArrowLeft: () => extend(-1),
+        ArrowRight: () => extend(1),
+      }[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+      if (!own) return;
+      event.preventDefault();
+      event.stopPropagation();
+      own();
+      return;
+    }
     const frame = 1 / this.facts.frameRate;
     const go = (by) => {
       const { keys } = this;
@@ -141,13 +218,16 @@ class Lane extends Plot {
       editor.select(keys[next], this);
       this.onSeek(Math.min(this.facts.frames - 1, Math.floor(keys[next].time / frame + FRAME_LEEWAY)));
     };
-    const move = (by) => selected && editor.select(direction.change(selected, { time: this.between(selected, selected.time + by * frame) }), this);
+    const several = editor.chosen.length > 1;
+    const move = (by) => {
+      if (several) editor.shift(editor.chosen, by * frame, 0, this);
+      else if (selected) editor.select(direction.change(selected, { time: this.between(selected, selected.time + by * frame) }), this);
+    };
     const raise = (share) => {
       if (!selected || !this.known.range) return;
-      const [least, most] = this.range;
-      editor.select(direction.change(selected, { value: selected.value + share * (most - least) }), this);
+      editor.shift(editor.chosen, 0, share * (this.seen[1] - this.seen[0]), this);
     };
-    const bend = (interpolation) => selected && editor.select(direction.change(selected, { interpolation }), this);
+    const bend = (interpolation) => selected && editor.bend(interpolation, this);
     const actions = {
       ArrowLeft: () => (event.shiftKey ? move(-1) : go(-1)),
       ArrowRight: () => (event.shiftKey ? move(1) : go(1)),
@@ -155,8 +235,16 @@ class Lane extends Plot {
       ArrowDown: () => raise(event.shiftKey ? -0.005 : -0.025),
       Enter: () => this.add(editor.time),
       Insert: () => this.add(editor.time),
-      Delete: () => selected && editor.removeKey(),
-      Backspace: () => selected && editor.removeKey(),
+      Delete: () => selected && editor.removeKeys(),
+      Backspace: () => selected && editor.removeKeys(),
+      "+": () => view.zoom(1.5, editor.time),
+      "-": () => view.zoom(1 / 1.5, editor.time),
+      0: () => view.set(0, view.seconds),
+      PageUp: () => view.scroll(-0.5),
+      PageDown: () => view.scroll(0.5),
+      v: () => this.zoomValue(1.5),
+      V: () => this.zoomValue(1 / 1.5),
+      f: () => this.known.range && this.fit(),
       Escape: () => editor.select(null, this),
       1: () => bend("step"),
       2: () => bend("linear"),
@@ -174,16 +262,18 @@ class Lane extends Plot {
   draw() {
     const pen = this.pen();
     const { colour } = pen;
-    const { keys, range } = this;
+    const { keys, seen } = this;
     const left = MARGIN.left, right = MARGIN.left + this.width;
     pen.fillStyle = colour("--raised");
     pen.fillRect(left, 0, this.width, pen.high);
     pen.fillStyle = colour("--quiet");
     pen.textBaseline = "middle";
     pen.textAlign = "right";
-    if (this.known.range) for (const value of range) pen.fillText(short(value), left - 8, this.y(value));
+    if (this.known.range) for (const value of seen) pen.fillText(String(Number(value.toFixed(2))), left - 8, this.y(value));
     pen.strokeStyle = colour("--line");
     pen.lineWidth = 1;
+    pen.save();
+    this.clip(pen, 8);
     const level = Math.round(this.y(this.known.rest)) + 0.5;
     pen.beginPath();
     pen.moveTo(left, level);
@@ -191,6 +281,7 @@ class Lane extends Plot {
     pen.stroke();
     if (keys.length) this.drawCurve(pen, keys, left, right);
     keys.forEach((key) => this.drawKey(pen, key));
+    pen.restore();
     this.point(this.shown ?? Math.max(0, this.editor.player.shown));
     this.describe(keys);
   }
@@ -207,14 +298,14 @@ class Lane extends Plot {
     }
     const slopes = slopesOf(keys);
     for (let x = left; x <= right; x++) {
-      pen.lineTo(x, this.y(valueAt(keys, ((x - left) / this.width) * this.seconds, this.range, 0, slopes)));
+      pen.lineTo(x, this.y(valueAt(keys, this.view.from + ((x - left) / this.width) * this.view.span, this.range, 0, slopes)));
     }
     pen.stroke();
   }
 
   /** A key's shape says how the curve goes on: a square for a step, a diamond for a line, a disc for smooth. */
   drawKey(pen, key) {
-    const x = this.x(key.time), y = this.y(key.value), chosen = key === this.editor.selected;
+    const x = this.x(key.time), y = this.y(key.value), chosen = this.editor.chosen.includes(key);
     const size = chosen ? 6.5 : 5;
     pen.beginPath();
     if (key.interpolation === "smooth") pen.arc(x, y, size, 0, 2 * Math.PI);
@@ -239,7 +330,8 @@ class Lane extends Plot {
   /** Words for those who do not see the lane. */
   describe(keys) {
     const at = keys.indexOf(this.editor.selected);
-    const words = at < 0 ? `${keys.length} keys` : `key ${at + 1} of ${keys.length}: ${sayKey(keys[at])}`;
+    const several = this.editor.chosen.length > 1 ? `, ${this.editor.chosen.length} keys chosen` : "";
+    const words = at < 0 ? `${keys.length} keys` : `key ${at + 1} of ${keys.length}: ${sayKey(keys[at])}${several}`;
     this.canvas.setAttribute("aria-label", `${this.name}, ${words}`);
   }
 

@@ -29,6 +29,7 @@ class Player {
     this.waiting = [];
     this.stats = { shown: 0, late: 0, workMs: 0 };
     this.pace = new Pace(facts.frameRate);
+    this.view = new TimeView(facts.frames / facts.frameRate, () => this.redrawPlots());
     this.extent = [0, 1, 2].map((axis) => Math.max(...facts.animations.map((animation) => animation.extent[axis])));
     this.clock = new SilentClock(facts.frames / facts.frameRate);
     this.scene = new Scene(find("view"), faces, ramp);
@@ -39,9 +40,9 @@ class Player {
     const lines = faces.flatMap(({ opening }, number) => (opening ? [{ values: opening, number }] : []));
     find("opening").hidden = !lines.length;
     const toFrame = (frame) => this.seek(frame);
-    this.plots = lines.length ? [new Curve(find("curve"), find("cursor"), lines, facts, toFrame)] : [];
+    this.plots = lines.length ? [new Curve(find("curve"), find("cursor"), lines, facts, toFrame, this.view)] : [];
     find("voice").hidden = !wav;
-    if (wav) this.plots.push(new Waveform(find("waveform"), find("voice-cursor"), facts, this.wav, toFrame));
+    if (wav) this.plots.push(new Waveform(find("waveform"), find("voice-cursor"), facts, this.wav, toFrame, this.view));
     this.editor = new Editor(this);
     this.takes = new Takes(this);
     this.plots.push(this.editor);
@@ -121,6 +122,14 @@ class Player {
     this.stir();
   }
 
+  /** Draw the plots before the next picture, once however often the view has changed. */
+  redrawPlots() {
+    this.drawing ??= requestAnimationFrame(() => {
+      this.drawing = null;
+      for (const plot of this.plots) plot.draw();
+    });
+  }
+
   tick() {
     requestAnimationFrame(() => this.tick());
     const started = performance.now();
@@ -170,6 +179,7 @@ class Player {
     });
     this.shown = frame;
     this.scene.fresh = false;
+    this.view.follow(frame / this.facts.frameRate);
     for (const plot of this.plots) plot.point(frame);
     return true;
   }
@@ -202,6 +212,8 @@ async function start() {
     directed: (name, time, easing) => player.current.editor.direction.value(name, time, easing),
     openKeys: (text) => player.current.editor.direction.open(text),
     direct: (on) => player.current.editor.show(on),
+    get stretch() { return [player.current.view.from, player.current.view.to]; },
+    seen: (name) => player.current.editor.addLane(name).seen,
     turn: (yaw, pitch) => player.current.camera.turn(yaw, pitch),
     positions: (number) => player.current.faces[number].positions,
     distances: (number) => player.current.faces[number].distances,

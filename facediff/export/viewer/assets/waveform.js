@@ -22,13 +22,14 @@ function readWav(buffer) {
 }
 
 class Waveform extends Plot {
-  constructor(canvas, cursor, facts, wav, onSeek) {
-    super(canvas, cursor, facts, onSeek);
+  constructor(canvas, cursor, facts, wav, onSeek, view) {
+    super(canvas, cursor, facts, onSeek, view);
     this.hear(facts, wav);
   }
 
   /** Show a recording { samples, rate } from now on. */
   hear(facts, wav) {
+    if (facts !== this.facts) this.view = new TimeView(facts.frames / facts.frameRate);
     this.facts = facts;
     this.seconds = facts.frames / facts.frameRate;
     this.wav = wav;
@@ -47,8 +48,9 @@ class Waveform extends Plot {
     pen.fillText("voice", MARGIN.left - 8, middle);
     pen.fillStyle = pen.colour("--wave");
     for (let pixel = 0; pixel < this.width; pixel++) {
-      const start = Math.floor((pixel / this.width) * this.seconds * rate);
-      const end = Math.min(samples.length, Math.max(start + 1, Math.floor(((pixel + 1) / this.width) * this.seconds * rate)));
+      const sample = (x) => Math.floor((this.view.from + (x / this.width) * this.view.span) * rate);
+      const start = sample(pixel);
+      const end = Math.min(samples.length, Math.max(start + 1, sample(pixel + 1)));
       let low = 0, high = 0;
       for (let i = start; i < end; i++) {
         if (samples[i] < low) low = samples[i];
