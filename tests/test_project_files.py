@@ -37,6 +37,17 @@ def test_the_pythons_that_are_tested_are_those_that_are_claimed() -> None:
     assert job["strategy"]["matrix"]["python"] == named
     assert PROJECT["project"]["requires-python"] == f">={named[0]}"
     assert job["steps"][-1]["run"] == ".ci/run"
+    assert read(".github/workflows/release.yml")["jobs"]["packages"]["strategy"]["matrix"]["python"] == named
+
+
+def test_the_release_check_uses_every_extra_that_the_workflow_names() -> None:
+    (command,) = [
+        words
+        for step in read(".github/workflows/release.yml")["jobs"]["packages"]["steps"]
+        if (words := step.get("run", "").split())[:2] == ["python", "tools/release_check.py"]
+    ]
+    extras = command[command.index("--extras") + 1 :]
+    assert {*extras} - {"base"} <= {*PROJECT["project"]["optional-dependencies"]}
 
 
 @pytest.mark.parametrize("extra", ["metrics", "train", "render", "prepare", "mesh", "figures", "live", "serve", "docs"])

@@ -234,7 +234,6 @@ def check_cells(
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
     classes: dict[str, str] = {}
-    models: dict[str, str] = {}
     roots: dict[str, str] = {}
     kinds: dict[str, type[SpeechMotionDataModule]] = {}
     for cell in left:
@@ -250,9 +249,7 @@ def check_cells(
                 continue
             seen.add(mark)
             with naming(plan, cell):
-                model_class, class_path, arguments = parse_fit(command_line)
-                if not model_class.startswith("facediff."):
-                    models[cell.row] = model_class
+                class_path, arguments = parse_fit(command_line)
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
                 kinds[cell.corpus] = type(data_of(prepared, class_path, arguments, make=not dry_run))
@@ -275,7 +272,7 @@ def check_cells(
         if cell.kind == "checkpoint":
             with naming(plan, cell):
                 check_checkpoint(cell, kinds.get(cell.corpus), classes.get(cell.corpus), roots.get(cell.corpus))
-    return replace(setting, clips=clips, truths=truths, classes=classes, models=models, roots=roots)
+    return replace(setting, clips=clips, truths=truths, classes=classes, roots=roots)
 
 
 @contextmanager

@@ -15,7 +15,8 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.ipynb")),
 ]
 
-LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#\s]*)(?:#([^)\s]+))?\)")
+# `../../actions/` of the README is the code host's page of this repository's checks, wherever it is hosted.
+LINK = re.compile(r"\]\((?!https?:|mailto:|\.\./\.\./actions/)([^)#\s]*)(?:#([^)\s]+))?\)")
 
 
 @cache
