@@ -96,7 +96,7 @@ class ScoreTable(Callback):
         if not trainer.is_global_zero:
             return
         assets = pl_module.assets
-        chosen = [request.text for request in evaluation.requests]
+        chosen = list(evaluation.requests)
         print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=chosen))
         if groups:
             print(describe_groups(groups, evaluation.score_by))

@@ -46,6 +46,11 @@ def evaluate(
     frame_rate: FrameRate = None,
     topology: Annotated[str | None, Option(metavar="NAME")] = None,
     n_vertices: Annotated[ranges.Vertices | None, Option(metavar="V")] = None,
+    layout: Annotated[str | None, Option(metavar="NAME")] = None,
+    truth_layout: Annotated[str | None, Option(metavar="NAME")] = None,
+    rig: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
+    unit: Annotated[str | None, Option(metavar="UNIT")] = None,
+    file_unit: Annotated[str | None, Option(metavar="UNIT")] = None,
     pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None,
     truth_pattern: Annotated[str | None, Option(metavar="PATTERN")] = None,
     identity: Annotated[str, Option(metavar="NAME")] = "own",
@@ -64,6 +69,7 @@ def evaluate(
 
     PREDICTIONS and TRUTH are folders of .npy files of absolute vertices, (frames, V, 3) or (frames, 3V), of any
     floating-point type. TRUTH may also be a corpus folder: then its vertices_npy, templates.pkl and regions are used.
+    Or both hold parameters: .csv of Live Link Face or Audio2Face, .json of BEAT, or .npy and .npz in a --layout.
     Exit status: 0 scored, 2 something to put right.
 
     Args:
@@ -82,6 +88,11 @@ def evaluate(
         frame_rate: frames per second of the predictions (default: as the corpus's manifest.json says)
         topology: biwi, vocaset, mead3d or multiface: unusual regions are pointed out
         n_vertices: vertices of the mesh (default: as the templates have)
+        layout: layout of arrays of parameters, such as flame_artalk or arkit
+        truth_layout: the same of the truth's (default: as --layout)
+        rig: what decodes parameters to vertices, the head at rest: a .glb, a folder of shapes, or FLAME's model file
+        unit: unit of lengths of the scores: m, cm or mm (default: the protocol's, or the files')
+        file_unit: unit of the files' vertices (default: as the rig or the corpus's manifest.json says)
         pattern: how predictions are named, repeatable (default: see the manual)
         truth_pattern: how truths are named (default: {subject}_{sentence})
         identity: which conditions are scored: own, all, or an identity's name
@@ -105,6 +116,8 @@ def evaluate(
             "frame_rate": frame_rate is not None,
         }
         refuse_idle("is for further metrics, chosen with --metric", **idle)
+    if layout is None:
+        refuse_idle("goes with --layout, that of the predictions", truth_layout=truth_layout is not None)
     methods = named_folders([predictions, *(method or [])])
     check_folders(methods)
     if not truth.is_dir():
@@ -119,26 +132,34 @@ def evaluate(
     from facediff.evaluation import evaluate as score
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
     from facediff.evaluation.files import count_vertices, find_truths, read_pairs
+    from facediff.evaluation.parameters import holds_parameters, parameter_files
     from facediff.metrics import EyelidPairs
 
     protocols, metrics = find_protocols(protocol or ["paper"], topology), metric or []
-    truth, corpus = find_truths(truth)
+    files = None
+    corpus: Path | None = truth
+    if layout is not None or holds_parameters(truth):
+        files = parameter_files(truth, (layout, truth_layout or layout), rig, truth_stride)
+    else:
+        refuse_idle("is for motion in parameters, which TRUTH has not", rig=rig is not None)
+        truth, corpus = find_truths(truth)
     if corpus is not None:
         if templates is None and (corpus / "templates.pkl").is_file():
             templates = corpus / "templates.pkl"
         if regions is None and (corpus / "regions").is_dir():
             regions = corpus / "regions"
-    n_vertices = n_vertices or count_vertices(topology, templates, truth)
+    n_vertices = n_vertices or (count_vertices(topology, templates, truth) if files is None else files.n_points)
+    own = files.regions(lips=lips or regions, upper_face=upper_face or regions) if files is not None else {}
     upper = None
     if needs_upper_face(protocols, metrics):
-        upper = read_region("upper_face", n_vertices, folder=regions, source=upper_face)
-    clips = sum(1 for _ in truth.glob("*.npy"))
+        upper = own.get("upper_face") or read_region("upper_face", n_vertices, folder=regions, source=upper_face)
+    clips = sum(1 for path in truth.iterdir() if path.suffix in (".npy", ".npz", ".csv", ".json"))
     seconds = DRAW_SECONDS * bootstrap * clips * (2 * len(methods) - 1) * len(protocols)
     confirm_cost(yes, "--bootstrap", seconds=seconds)
     report = score(
         methods,
         truth,
-        lips=read_region("lips", n_vertices, folder=regions, source=lips),
+        lips=own.get("lips") or read_region("lips", n_vertices, folder=regions, source=lips),
         upper_face=upper,
         templates=None if templates is None else read_templates(templates, n_vertices),
         n_vertices=n_vertices,
@@ -149,6 +170,9 @@ def evaluate(
         corpus=corpus,
         by=by or (),
         frame_rate=frame_rate,
+        files=files,
+        unit=unit,
+        file_unit=file_unit,
         patterns=pattern or DEFAULT_PATTERNS,
         truth_pattern=truth_pattern or TRUTH_PATTERN,
         identity=identity,

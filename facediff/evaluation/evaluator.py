@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from facediff.data.conversations import CONVERSATION, channel_regions, conversation_file
 from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, read_manifest
 from facediff.errors import FaceDiffError
 from facediff.evaluation.files import (
@@ -25,14 +26,17 @@ from facediff.evaluation.files import (
     read_pairs,
 )
 from facediff.evaluation.groups import attributes_of
+from facediff.evaluation.parameters import ParameterFiles, refuse_vertex_protocols
 from facediff.evaluation.report import EvaluationReport, MethodTable, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
 from facediff.reporting.statistics import Bootstrap
+from facediff.spaces.files.reading import SUFFIXES
 from facediff.speech.audio import SAMPLE_RATE, read_speech
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
+from facediff.utils.units import metres_per_unit
 
 
 @ranges.checked
@@ -52,6 +56,9 @@ def evaluate(
     by: Sequence[str] = (),
     frame_rate: ranges.FrameRate | None = None,
     topology: str | None = None,
+    files: ParameterFiles | None = None,
+    unit: str | None = None,
+    file_unit: str | None = None,
     patterns: Sequence[str] = DEFAULT_PATTERNS,
     truth_pattern: str = TRUTH_PATTERN,
     identity: str = OWN,
@@ -85,6 +92,9 @@ def evaluate(
         by: attributes of clips, columns of the corpus's ``clips.csv``, by which scores are grouped too.
         frame_rate: frames per second of the predictions; that of the corpus's ``manifest.json`` if None.
         topology: name of the mesh (``biwi``, ``vocaset`` …), to have unusual regions pointed out.
+        files: how files of parameters are read; None for files of vertices.
+        unit: unit of lengths of the scores of vertices; that of each protocol, or of the vertices, if None.
+        file_unit: unit of the vertices; as the rig or the corpus's ``manifest.json`` says if None.
         patterns: how predictions may be named; see :class:`facediff.evaluation.files.NamePattern`.
         truth_pattern: how truths are named.
         identity: which predictions of a clip are scored where several were conditioned on different identities:
@@ -106,22 +116,40 @@ def evaluate(
         raise FaceDiffError("expected at least one method and at least one protocol")
     settings = find_protocols(protocols, topology)
     sampling = Bootstrap(bootstrap, level, seed)
-    requests = parse_all(metrics)
-    names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())])
+    source = source_unit(settings, files, corpus, unit, file_unit)
+    scales = {setting.name: scale_of(source, unit or setting.unit) for setting in settings}
+    requests = {request.text: request.scaled(scale_of(source, unit)) for request in parse_all(metrics)}
+    owners: dict[str, tuple[str, str]] = {}
+    for setting in settings:
+        for label, request in setting.further(scales[setting.name]).items():
+            owners[f"{setting.name}/{label}"] = setting.name, label
+            requests[f"{setting.name}/{label}"] = request
+    suffixes = (".npy",) if files is None else SUFFIXES
+    names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())], suffixes)
     truths = index_truths(names)
     if frame_rate is None and requests and corpus is not None:
         stored = read_manifest(corpus).get("frame_rate")
         frame_rate = stored / truth_stride if isinstance(stored, int | float) and stored > 0 else None
-    needed = {need for request in requests for need in request.needs}
+    if files is not None:
+        frame_rate = files.frame_rate
+    needed = {need for request in requests.values() for need in request.needs}
     if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / LIP_PAIRS).is_file():
         lip_pairs = read_pairs(None, corpus, n_vertices)
     if eyelid_pairs is None and "lid_pairs" in needed and corpus is not None and (corpus / EYELID_PAIRS).is_file():
         eyelid_pairs = read_pairs(None, corpus, n_vertices, EyelidPairs)
-    material = CorpusInputs(corpus if requests else None, frame_rate, sorted({name.subject for name in names.values()}))
+    speakers = sorted({name.subject for name in names.values()})
+    material = CorpusInputs(corpus if requests else None, frame_rate, speakers, files)
     context = material.context(
-        lips, upper_face, lip_pairs, eyelid_pairs, templated=bool(templates), every_condition=identity == ALL
+        lips,
+        upper_face,
+        lip_pairs,
+        eyelid_pairs,
+        templated=bool(templates) or files is not None,
+        every_condition=identity == ALL,
     )
-    chosen = {request.text: request.build(context) for request in requests}
+    if files is not None and files.rig is None:
+        refuse_vertex_protocols(settings)
+    chosen = {name: request.build(context) for name, request in requests.items()}
     scorer = Scorer(
         settings,
         lips=lips,
@@ -131,12 +159,17 @@ def evaluate(
         truth_stride=truth_stride,
         metrics=chosen,
         inputs=partial(material.inputs, needed=needed),
+        moments={name: request.moment for name, request in requests.items()},
+        owners=owners,
+        read=None if files is None else files.read,
+        channels=None if files is None else channel_regions(files.space),
+        scales=scales,
     )
     readers = [NamePattern(pattern, templates or ()) for pattern in patterns]
     paired = {}
     for method, folder in methods.items():
-        files, unnamed = list_names(Path(folder), readers)
-        pairs, missing = pair_up(files, truths, identity)
+        predictions, unnamed = list_names(Path(folder), readers, suffixes)
+        pairs, missing = pair_up(predictions, truths, identity)
         paired[method] = pairs, replace(missing, unnamed=unnamed)
     jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
     reads = [Path(truth), *map(Path, methods.values()), *([] if corpus is None else [corpus])]
@@ -147,8 +180,9 @@ def evaluate(
     ]
     attributes = attributes_of(corpus, names_of(paired), by) if by else {}
     definitions = {setting.name: setting.describe() for setting in settings}
-    if chosen:
-        lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in chosen.items()]
+    named = {name: metric for name, metric in chosen.items() if name not in owners}
+    if named:
+        lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in named.items()]
         definitions[METRICS] = "\n".join(["further metrics", *lines])
     results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
@@ -168,6 +202,7 @@ def evaluate(
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
+        points="channels" if files is not None and files.rig is None else "vertices",
     )
 
 
@@ -178,8 +213,11 @@ def names_of(paired: Mapping[str, tuple[Sequence[Pair], object]]) -> set[str]:
 
 def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> bool:
     """Whether a protocol or a metric chosen by name reads the upper-face vertices."""
-    return any(setting.fdd for setting in protocols) or any(
-        "upper_face" in (*request.needs, request.options.get("region")) for request in parse_all(metrics)
+    requests = [*parse_all(metrics), *(request for one in protocols for request in one.further().values())]
+    return any(setting.fdd and not setting.channels for setting in protocols) or any(
+        "upper_face" in (*request.needs, request.options.get("region"))
+        for request in requests
+        if not request.of_channels
     )
 
 
@@ -190,6 +228,7 @@ class CorpusInputs:
     corpus: Path | None
     frame_rate: float | None  # of the predictions, if known
     identities: Sequence[str]  # names of all speakers
+    files: ParameterFiles | None = None  # how files of parameters are read
 
     def context(
         self,
@@ -215,6 +254,9 @@ class CorpusInputs:
         ):
             if there:
                 has[need] = arguments
+        if self.files is not None:
+            has["channels"] = {}
+        has |= {need: {} for need in CONVERSATION if self.corpus is not None and (self.corpus / need).is_dir()}
         rate = "" if self.frame_rate else " and give --frame-rate"
         in_test = "is known to `facediff test --model.metrics=[…]` only"
         are_known = in_test.replace("is", "are", 1)
@@ -224,6 +266,9 @@ class CorpusInputs:
                 "upper_face": "give --upper-face FILE, or --regions FOLDER with fdd.txt",
                 "lip_pairs": "give --lip-pairs FILE",
                 "lid_pairs": "give --eyelid-pairs FILE",
+                "channels": "these are files of vertices",
+                "partner": "no partner: score against a folder with partner/, one file of parameters for each truth",
+                "speaking": "score against a folder with speaking/<clip>.npy, a boolean for each frame",
                 "gallery": f"recordings outside the test splits {are_known}",
                 "template": "give --templates FILE",
                 "closures": f"score against a corpus folder with phonemes/{rate}",
@@ -233,6 +278,7 @@ class CorpusInputs:
                 "style": f"a model's style encoder {in_test}",
                 "time": f"the time that inference takes {in_test}",
             },
+            {} if self.files is None else channel_regions(self.files.space),
         )
 
     def _has(self, folder: str) -> bool:
@@ -249,7 +295,41 @@ class CorpusInputs:
         if "closures" in needed and self.frame_rate is not None:
             file = phonemes_file(self.corpus, clip)
             inputs["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
+        if "speaking" in needed and self.corpus is not None:
+            inputs["speaking"] = [torch.from_numpy(conversation_file(self.corpus, "speaking", clip))]
+        if "partner" in needed and self.corpus is not None and self.files is not None:
+            path = self.corpus / "partner" / pair.truth.path.name
+            inputs["partner"] = replace(self.files, truth=path.parent, rig=None).read(path, 1).channels
         return inputs
+
+
+def source_unit(
+    protocols: Sequence[Protocol],
+    files: ParameterFiles | None,
+    corpus: Path | None,
+    unit: str | None,
+    stated: str | None,
+) -> str | None:
+    """The unit of the vertices that are scored; None where no score needs it.
+
+    Raises:
+        FaceDiffError: if a score is in a unit, and nothing says that of the files.
+    """
+    named = next((one.name for one in protocols if one.unit is not None), None)
+    if unit is None and named is None:
+        return None
+    source = stated or (files.unit if files is not None else None)
+    if not source and corpus is not None:
+        source = str(read_manifest(corpus).get("unit") or "")
+    if not source and (files is None or files.rig is not None):
+        asked = f"--unit {unit}" if unit is not None else f"protocol {named}"
+        raise FaceDiffError(f"{asked}: the scores' unit is known, that of the files is not; give --file-unit")
+    return source or None
+
+
+def scale_of(source: str | None, target: str | None) -> float:
+    """The factor of lengths from one unit to another; 1 where either is not asked for."""
+    return 1.0 if source is None or target is None else metres_per_unit(source) / metres_per_unit(target)
 
 
 def find_protocols(protocols: Sequence[str | Protocol], topology: str | None = None) -> list[Protocol]:

@@ -80,24 +80,31 @@ class NamePattern:
         return Name(**match.groupdict()) if match else None
 
 
-def list_names(folder: Path, patterns: Sequence[NamePattern]) -> tuple[dict[Path, Name], list[str]]:
-    """The ``.npy`` files of a folder by what their names say, sorted, and the names that no pattern fits.
+def list_names(
+    folder: Path, patterns: Sequence[NamePattern], suffixes: Sequence[str] = (".npy",)
+) -> tuple[dict[Path, Name], list[str]]:
+    """The motion files of a folder by what their names say, sorted, and the names that no pattern fits.
 
     Files whose names begin with a dot are ignored.
     """
+    expected = "files of vertices (frames, 3V) or (frames, V, 3)" if len(suffixes) == 1 else "files of parameters"
     if not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; expected one with .npy files of vertices")
+        raise FaceDiffError(f"{folder}: no such folder; expected one with {', '.join(suffixes)} {expected}")
     deep = any("/" in pattern.pattern for pattern in patterns)
-    files = sorted(file for file in folder.glob("**/*.npy" if deep else "*.npy") if not file.name.startswith("."))
+    files = sorted(
+        file
+        for file in folder.glob("**/*" if deep else "*")
+        if file.suffix in suffixes and not file.name.startswith(".")
+    )
     if not files:
-        raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
+        raise FaceDiffError(f"{folder}: holds no {' or '.join(suffixes)} file; expected {expected}")
     names: dict[Path, Name] = {}
     unnamed = []
     for file in files:
-        name = file.relative_to(folder).as_posix().removesuffix(".npy")
+        name = file.relative_to(folder).as_posix().removesuffix(file.suffix)
         read = next((match for pattern in patterns if (match := pattern.match(name))), None)
         if read is None:
-            unnamed.append(f"{name}.npy")
+            unnamed.append(f"{name}{file.suffix}")
         else:
             names[file] = read
     return names, unnamed

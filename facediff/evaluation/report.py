@@ -142,6 +142,7 @@ class EvaluationReport:
     unnamed_truths: list[str]  # files among the truths whose names do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
     runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
+    points: str = "vertices"  # what regions list: vertices, or channels where only these are scored
 
     def regions(self) -> dict[str, dict[str, Any]]:
         """Name, vertex count, hash and repeated indices of each region."""
@@ -221,7 +222,7 @@ class MethodTable:
                 for column, value in zip(
                     self.columns, pooled(self.values[chosen], self.weights[chosen]).tolist(), strict=True
                 )
-                if column.metric not in self.rows[0][1].states
+                if column.source not in self.rows[0][1].states
             }
             groups.append(GroupScores(self.name, dict(zip(names, key, strict=True)), len(chosen), scores))
         return groups
@@ -241,9 +242,9 @@ class MethodTable:
                     total,
                     interval,
                     frames,
-                    len(self.rows) if column.metric in self.rows[0][1].states else int(np.count_nonzero(weights)),
+                    len(self.rows) if column.source in self.rows[0][1].states else int(np.count_nonzero(weights)),
                     column.region,
-                    None if column.metric in self.rows[0][1].states else column.pooling,
+                    None if column.source in self.rows[0][1].states else column.pooling,
                     column.better,
                 )
                 for column, total, interval, weights in zip(
@@ -262,12 +263,12 @@ class MethodTable:
         """The score of each column over all clips."""
         totals: list[float] = pooled(self.values, self.weights).tolist()
         for place, column in enumerate(self.columns):
-            if column.metric in self.rows[0][1].states and column.protocol == METRICS:
+            if column.source in self.rows[0][1].states:
                 # Such a metric has no values of single clips, whose mean it would be; its sums are added, clip by clip.
-                whole = self.rows[0][1].states[column.metric].clone()
+                whole = self.rows[0][1].states[column.source].clone()
                 try:
                     for _, scores in self.rows[1:]:
-                        whole.merge_state(scores.states[column.metric])
+                        whole.merge_state(scores.states[column.source])
                     totals[place] = float(whole.compute())
                 except (ValueError, RuntimeError) as error:
                     raise FaceDiffError(f"{self.folder}: metric {column.metric}: {error}") from error
@@ -290,7 +291,7 @@ class MethodTable:
             {
                 column.name: None if math.isnan(value) else value
                 for column, value in zip(self.columns, scores.values, strict=True)
-                if column.metric not in scores.states
+                if column.source not in scores.states
             },
         )
 
@@ -376,15 +377,15 @@ SHOWN = 5  # Names that are listed before the rest is counted
 
 def text(report: EvaluationReport) -> str:
     """Scores by protocol, comparisons, and what was cut, skipped or missing."""
+    mesh = "mesh of " if report.points == "vertices" else ""
     lines = [
         f"truth {report.truth}" + (f", every {report.truth_stride}. frame" if report.truth_stride > 1 else ""),
-        f"mesh of {report.n_vertices} vertices; conditions: {report.identity}",
+        f"{mesh}{report.n_vertices} {report.points}; conditions: {report.identity}",
     ]
     for part, region in report.regions().items():
         again = f", {region['duplicates']} repeated in the source" if region["duplicates"] else ""
-        lines.append(
-            f"{part.replace('_', ' ')} {region['name']}: {region['count']} vertices, hash {region['hash']}{again}"
-        )
+        counted = f"{region['count']} {report.points}, hash {region['hash']}{again}"
+        lines.append(f"{part.replace('_', ' ')} {region['name']}: {counted}")
     lines += report.remarks
     for name in report.protocols:
         title = "further metrics" if name == METRICS else f"protocol {name}"
@@ -406,10 +407,16 @@ def text(report: EvaluationReport) -> str:
     return "\n".join(lines)
 
 
+MOST_COLUMNS = 5
+"""Scores of a protocol that stand side by side."""
+
+
 def _scores(report: EvaluationReport, protocol: str) -> list[str]:
     rows = []
-    if protocol == METRICS:  # names of metrics with their options are long: one row for each
-        for score in [score for score in report.methods[0].scores if score.protocol == METRICS]:
+    scored = [score for score in report.methods[0].scores if score.protocol == protocol]
+    # Names of metrics with their options are long, and some protocols have many scores: one row for each.
+    if protocol == METRICS or len(scored) > MOST_COLUMNS:
+        for score in scored:
             same = [
                 score_of_method
                 for method in report.methods

@@ -27,6 +27,7 @@ from facediff.metrics import (
     feed,
 )
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
+from facediff.metrics.channels import Moment
 from facediff.metrics.one_pass import one_pass
 from facediff.utils.arrays import in_range, open_vertices
 from facediff.utils.jobs import run_tasks
@@ -46,9 +47,11 @@ class Column:
     pooling: Pooling
     rule: LengthRule  # what the protocol does where lengths differ
     source: str  # which of the scorer's metrics gives the value of a sequence
-    absolute: bool = False  # whether its sign is dropped
+    finish: Callable[[Tensor], Tensor] | None = None  # from that value to the score: sign, root and unit
     region: dict[str, Any] | str = "all vertices"  # name, count and hash of what the score was taken over
     better: str | None = None  # ``lower``, ``higher``, ``zero``, or None; see :func:`facediff.metrics.describe_column`
+    channels: bool = False  # whether it is of channels and not of vertices
+    by_name: bool = False  # whether it is a metric that was chosen by name, also by a protocol
 
     @property
     def name(self) -> str:
@@ -65,8 +68,26 @@ class ClipScores:
     frames: int  # frames scored, all conditions together
     cut_prediction: int  # frames cut from predictions
     cut_truth: int
-    # The metrics of this clip that have a value over all clips only, by name.
+    # The metrics of this clip that have a value over all clips only, by the source of their column.
     states: Mapping[str, Metric] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a file holds, as vertices or channels or both."""
+
+    vertices: Tensor | None = None  # (T, V, 3) absolute
+    channels: Tensor | None = None  # (T, C, 1)
+    template: Tensor | None = None  # (V, 3) the person's neutral face, where the file says it
+
+    def get(self, *, channels: bool) -> Tensor:
+        """The one or the other."""
+        motion = self.channels if channels else self.vertices
+        if motion is None:
+            raise FaceDiffError(
+                "the files hold vertices, and no channels" if channels else "the files hold channels, and no vertices"
+            )
+        return motion
 
 
 class Scorer:
@@ -83,6 +104,11 @@ class Scorer:
         truth_stride: 2 takes every second frame of the truth, and so on.
         metrics: further metrics by name, made for the corpus.
         inputs: gives what these read of a clip in addition to its motion.
+        moments: in which frames a metric of that name is taken, where not in all.
+        owners: the protocol that each of these belongs to, and its name there; none of those chosen by name.
+        read: reads a file, every ``stride``-th frame of it; None for files of vertices.
+        channels: regions ``lips`` and ``upper_face`` of channels, for protocols of channels.
+        scales: factor of lengths of each protocol, by its name.
 
     Raises:
         FaceDiffError: if a protocol needs what is not given, or a region does not fit the mesh.
@@ -99,6 +125,11 @@ class Scorer:
         truth_stride: int = 1,
         metrics: Mapping[str, Metric] | None = None,
         inputs: Callable[[Pair], dict[str, Any]] = lambda _: {},
+        moments: Mapping[str, Moment] | None = None,
+        owners: Mapping[str, tuple[str, str]] | None = None,
+        read: Callable[[Path, int], Motion] | None = None,
+        channels: Mapping[str, Region] | None = None,
+        scales: Mapping[str, float] | None = None,
     ) -> None:
         self.columns: list[Column] = []
         self.metrics: dict[str, SequenceMetric] = {}
@@ -106,25 +137,36 @@ class Scorer:
         self.n_vertices = n_vertices
         self.truth_stride = truth_stride
         self.remarks: list[str] = []
+        self.read = read or self._read
+        self.moments = dict(moments or {})
+        self.owners = dict(owners or {})
         for protocol in protocols:
             try:
-                built = protocol.build(lips, upper_face)
-                for region in (built.lips, built.upper):
-                    if region is not None:
-                        region.check(n_vertices)
+                if protocol.channels:
+                    if not channels:
+                        raise ValueError("it scores channels, and the files hold vertices")
+                    built = protocol.build(channels["lips"], channels["upper_face"])
+                else:
+                    built = protocol.build(lips, upper_face, scale=(scales or {}).get(protocol.name, 1.0))
+                    for region in (built.lips, built.upper):
+                        if region is not None:
+                            region.check(n_vertices)
             except ValueError as error:
                 raise FaceDiffError(f"protocol {protocol.name}: {error}") from error
             self.remarks += [remark for remark in built.summary().remarks if remark not in self.remarks]
             for name, metric in built.scores().items():
                 self._add(protocol, name, metric)
-        self.needs_template = any(isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values())
+        self.needs_template = read is None and any(
+            isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values()
+        )
         if self.needs_template and not templates:
             raise FaceDiffError("FDD needs each speaker's neutral face: give --templates, or a protocol without FDD")
         self.chosen = dict(metrics or {})
         self.inputs = inputs
         for name, chosen in self.chosen.items():
             over = chosen.over if isinstance(chosen, SequenceMetric) else None
-            if over is not None:
+            of_channels = bool(getattr(chosen, "of_channels", False))
+            if over is not None and not of_channels:
                 try:
                     over.check(n_vertices)
                 except ValueError as error:
@@ -132,26 +174,33 @@ class Scorer:
             pooling: Pooling = getattr(chosen, "pooling", "sequences")
             where = "all vertices" if over is None else over.as_dict()
             better = describe_column(chosen)["better"]
-            self.columns.append(Column(METRICS, name, pooling, "min", name, region=where, better=better))
-        self.needs_template |= any("template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values())
+            protocol_name, label = self.owners.get(name, (METRICS, name))
+            facts: dict[str, Any] = {"region": where, "better": better, "channels": of_channels, "by_name": True}
+            self.columns.append(Column(protocol_name, label, pooling, "min", name, **facts))
+        self.needs_template |= read is None and any(
+            "template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values()
+        )
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
-        absolute = False
+        finish: Callable[[Tensor], Tensor] | None = None
         better = describe_column(metric)["better"]
         if isinstance(metric, FaceDynamicsDeviation):
-            absolute = metric.sign == "absolute"
+            finish = metric.finished
             source = f"fdd {metric.region}"
-            if metric.sign != "signed":
-                metric = FaceDynamicsDeviation(cast(Region, metric.region), sign="signed", check_finite=False)
+            metric = FaceDynamicsDeviation(cast(Region, metric.region), sign="signed", check_finite=False)
         elif isinstance(metric, VertexError):
+            finish = metric.finished
             source = f"{metric.reduction} {metric.squared} {metric.region}"
         else:
             source = f"{protocol.name} {name}"
+        source += " of channels" if protocol.channels else ""
         self.metrics.setdefault(source, metric)
         pooling: Pooling = "sequences" if source.startswith("fdd") else protocol.pooling
         region = "all vertices" if metric.region is None else metric.region.as_dict()
         self.columns.append(
-            Column(protocol.name, name, pooling, protocol.length_rule, source, absolute, region, better)
+            Column(
+                protocol.name, name, pooling, protocol.length_rule, source, finish, region, better, protocol.channels
+            )
         )
 
     def score(self, pair: Pair) -> ClipScores | str:
@@ -165,11 +214,10 @@ class Scorer:
         if self.needs_template and template is None:
             return f"no template for {subject}"
         try:
-            truth = read_vertices(pair.truth.path, self.n_vertices, self.truth_stride)
-            predictions = {
-                condition: read_vertices(path, self.n_vertices) for condition, path in pair.predictions.items()
-            }
-            inputs = {"truth": truth, "template": template} | (self.inputs(pair) if self.chosen else {})
+            truth = self.read(pair.truth.path, self.truth_stride)
+            predictions = {condition: self.read(path, 1) for condition, path in pair.predictions.items()}
+            template = template if truth.template is None else truth.template
+            inputs = self.inputs(pair) if self.chosen else {}
         except FaceDiffError as error:
             return str(error)
         done = [
@@ -181,7 +229,7 @@ class Scorer:
         by_frames = np.array([column.pooling == "frames" for column in self.columns[: values.shape[1]]])
         # A condition's share of the clip is its frames where all frames count alike; they differ only if one was cut.
         shares = np.where(by_frames, weights, 1.0)
-        further, states = self._chosen(pair, predictions, inputs)
+        further, states = self._chosen(pair, truth, predictions, inputs | {"template": template})
         return ClipScores(
             (*((values * shares).sum(0) / shares.sum(0)).tolist(), *(value for value, _ in further)),
             (*weights.mean(0).tolist(), *(weight for _, weight in further)),
@@ -192,22 +240,29 @@ class Scorer:
         )
 
     def _chosen(
-        self, pair: Pair, predictions: Mapping[str, Tensor], inputs: dict[str, Any]
+        self, pair: Pair, truth: Motion, predictions: Mapping[str, Motion], inputs: dict[str, Any]
     ) -> tuple[list[tuple[float, float]], dict[str, Metric]]:
         """Value and weight of a clip under each metric chosen by name, and the metrics that have no such values."""
         valued: list[tuple[float, float]] = []
         states: dict[str, Metric] = {}
         for name, chosen in self.chosen.items():
             one = chosen.clone()
+            channels = bool(getattr(chosen, "of_channels", False))
+            moment = self.moments.get(name, "all")
             try:
                 if "conditions" in getattr(chosen, "needs", ()):
-                    frames = min(map(len, predictions.values()))
-                    several = torch.stack([motion[:frames] for motion in predictions.values()])
+                    motions = [motion.get(channels=channels) for motion in predictions.values()]
+                    frames = min(map(len, motions))
+                    several = torch.stack([motion[:frames] for motion in motions])
                     feed(one, {"predictions": several, "clip_names": [pair.clip]})
                 else:
                     for condition, motion in predictions.items():
                         clip_names = [pair.predictions[condition].stem]
-                        feed(one, inputs | {"prediction": motion, "clip_names": clip_names})
+                        sides = {
+                            "prediction": motion.get(channels=channels),
+                            "truth": truth.get(channels=channels),
+                        }
+                        feed(one, inputs | sides | {"clip_names": clip_names}, moment)
                 if not isinstance(one, SequenceMetric) or one.latest is None:
                     states[name] = one
                     valued.append((math.nan, 0.0))
@@ -218,37 +273,51 @@ class Scorer:
                 raise FaceDiffError(f"metric {name}: {error}") from error
         return valued, states
 
-    def _score(self, name: str, prediction: Tensor, truth: Tensor, template: Tensor | None) -> ClipScores:
+    def _score(self, name: str, prediction: Motion, truth: Motion, template: Tensor | None) -> ClipScores:
         """One prediction."""
-        aligned: dict[str, Clips] = {}
-        columns = [column for column in self.columns if column.protocol != METRICS]
+        aligned: dict[tuple[bool, str], Clips] = {}
+        columns = [column for column in self.columns if not column.by_name]
         for column in columns:
-            if column.rule not in aligned:
+            if (column.channels, column.rule) not in aligned:
                 # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
                 try:
-                    clips = align(prediction, truth, clip_names=[name], rule=column.rule)
+                    sides = (motion.get(channels=column.channels) for motion in (prediction, truth))
+                    clips = align(*sides, clip_names=[name], rule=column.rule)
                 except ValueError as error:
                     raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
-                aligned[column.rule] = clips.attach("template", [template])
+                # Channels are offsets from a face at rest.
+                clips = clips.attach("template", [None if column.channels else template])
+                aligned[column.channels, column.rule] = clips
+        by_source: dict[str, float] = {}
+        for channels in {column.channels for column in columns}:
+            clips = next(clips for (of_channels, _), clips in aligned.items() if of_channels == channels)
+            sources = {column.source for column in columns if column.channels == channels}
+            by_source |= self._values(clips, {source: self.metrics[source] for source in sources})
         first = next(iter(aligned.values()))
-        by_source = self._values(first)
-        valued = [(by_source[column.source], column.absolute) for column in columns]
+        values = [
+            by_source[column.source]
+            if column.finish is None
+            else column.finish(torch.tensor(by_source[column.source], dtype=torch.float64)).item()
+            for column in columns
+        ]
         frames = first.clips[0].frames
         return ClipScores(
-            tuple(abs(value) if absolute else value for value, absolute in valued),
-            (float(frames),) * len(valued),
+            tuple(values),
+            (float(frames),) * len(values),
             frames,
             first.cut_prediction,
             first.cut_truth,
         )
 
-    def _values(self, clips: Clips) -> dict[str, float]:
+    def _read(self, path: Path, stride: int) -> Motion:
+        """A file of vertices."""
+        return Motion(read_vertices(path, self.n_vertices, stride))
+
+    def _values(self, clips: Clips, metrics: Mapping[str, SequenceMetric]) -> dict[str, float]:
         """What each source says of the one clip."""
         clip = clips.clips[0]
-        errors = {source: metric for source, metric in self.metrics.items() if isinstance(metric, VertexError)}
-        dynamics = {
-            source: metric for source, metric in self.metrics.items() if isinstance(metric, FaceDynamicsDeviation)
-        }
+        errors = {source: metric for source, metric in metrics.items() if isinstance(metric, VertexError)}
+        dynamics = {source: metric for source, metric in metrics.items() if isinstance(metric, FaceDynamicsDeviation)}
         means, deviations = one_pass(
             clip.prediction,
             clip.truth,
@@ -264,8 +333,8 @@ class Scorer:
                 clips.check_finite()
             except ValueError as error:
                 raise FaceDiffError(f"protocol {self.columns[0].protocol}: {error}") from error
-        others = self.metrics.keys() - by_source.keys()
-        return by_source | {source: float(self.metrics[source].clip_value(clip)) for source in others}
+        others = metrics.keys() - by_source.keys()
+        return by_source | {source: float(metrics[source].clip_value(clip)) for source in others}
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:

@@ -58,7 +58,6 @@ from facediff.metrics.by_name import Request as Request
 from facediff.metrics.by_name import feed as feed
 from facediff.metrics.by_name import parse as parse
 from facediff.metrics.channels import ChannelDynamicsDeviation as ChannelDynamicsDeviation
-from facediff.metrics.channels import ChannelMetric as ChannelMetric
 from facediff.metrics.channels import ChannelVariance as ChannelVariance
 from facediff.metrics.channels import FramePairDistance as FramePairDistance
 from facediff.metrics.channels import FrechetDistance as FrechetDistance

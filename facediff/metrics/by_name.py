@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import torch
@@ -85,13 +85,21 @@ class Request:
     @property
     def needs(self) -> tuple[str, ...]:
         """What the metric needs, words of :data:`NEEDS`."""
-        own = tuple(getattr(metrics.get(self.name), "needs", ()))
+        implementation = metrics.get(self.name)
+        own = tuple(getattr(implementation, "needs", ()))
+        by_option = getattr(implementation, "option_needs", {})
+        own += tuple(need for option, need in by_option.items() if self.options.get(option))
         return own if self.moment == "all" else (*own, "speaking")
 
     @property
     def of_channels(self) -> bool:
         """Whether the metric reads channels where motion is decoded to vertices."""
         return bool(getattr(metrics.get(self.name), "of_channels", False))
+
+    def scaled(self, scale: float) -> Request:
+        """The same with a factor of lengths, if the metric takes one and none was given."""
+        takes = "scale" in inspect.signature(metrics.get(self.name)).parameters and "scale" not in self.options
+        return replace(self, options={**self.options, "scale": scale}) if takes and scale != 1.0 else self
 
     def build(self, context: Context) -> Metric:
         """The metric, made for a corpus.

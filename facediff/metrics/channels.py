@@ -6,7 +6,7 @@ are prediction and truth in the formulas, both (frames, D).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Unpack, cast
 
 import torch
@@ -41,6 +41,8 @@ class ChannelMetric(SequenceMetric):
     needs: ClassVar[tuple[str, ...]] = ("channels",)
     of_channels: ClassVar[bool] = True
     """Whether the metric reads channels where motion has a rig that decodes them."""
+    option_needs: ClassVar[Mapping[str, str]] = {}
+    """What is needed in addition where an option is on."""
     usual_channels: ClassVar[str] = "all"
     """The group of channels that is taken where a metric is chosen by name and no region."""
 
@@ -354,6 +356,7 @@ class FrechetDistance(DistributionMetric):
     """
 
     higher_is_better = False
+    option_needs: ClassVar[Mapping[str, str]] = {"with_partner": "partner"}
     sums: Tensor
     products: Tensor
 

@@ -23,6 +23,7 @@ from facediff.metrics.base import (
     align,
     check_option,
 )
+from facediff.metrics.by_name import Request, parse
 from facediff.metrics.regions import TOPOLOGIES, Region
 from facediff.metrics.vertex_errors import (
     FaceDynamicsDeviation,
@@ -42,11 +43,17 @@ class Protocol:
         source: where the setting comes from.
         mve: reduction over vertices of the mean vertex error; None omits the metric.
         mve_squared: whether its distances are squared.
+        lve: whether the lip vertex error is taken.
         lve_squared: whether the lip vertex error's distances are squared.
+        lve_root: whether it is the root of each sequence's mean.
         fdd: signs of the face dynamics deviation to report; the first is called ``fdd``, a second
             ``fdd_<sign>``; empty omits the metric.
         pooling: of MVE and LVE; FDD is always a mean over sequences.
         length_rule: what to do where prediction and truth differ in length.
+        channels: whether these are taken of channels, the formulas of vertices with channels for vertices; else of
+            vertices, which motion in parameters is decoded to, with the head at rest.
+        unit: unit of lengths in which vertices are scored; None for that of the motion.
+        metrics: further scores, each its name and the metric by name with options.
         topology: name of the mesh, one of :data:`TOPOLOGIES`. Then regions and motion of another mesh are refused,
             and the summary says whether the regions are those in use on it. None for any mesh.
     """
@@ -55,10 +62,15 @@ class Protocol:
     source: str
     mve: Reduction | None = None
     mve_squared: bool = False
+    lve: bool = True
     lve_squared: bool = True
+    lve_root: bool = False
     fdd: tuple[Sign, ...] = ()
     pooling: Pooling = "frames"
     length_rule: LengthRule = "min"
+    channels: bool = False
+    unit: str | None = None
+    metrics: tuple[tuple[str, str], ...] = ()
     topology: str | None = None
 
     def __post_init__(self) -> None:
@@ -73,6 +85,26 @@ class Protocol:
         check_option("length rule", self.length_rule, LengthRule)
         if self.topology is not None:
             check_option("topology", self.topology, TOPOLOGIES)
+        if self.mve is None and not self.lve:
+            raise ValueError(f"protocol {self.name!r} has neither MVE nor LVE, by which frames are counted; add one")
+
+    @property
+    def of_parameters(self) -> bool:
+        """Whether the protocol is one of motion in parameters, and not only of vertices."""
+        return self.channels or self.unit is not None or bool(self.metrics)
+
+    @property
+    def needs_vertices(self) -> bool:
+        """Whether a score is taken of vertices, so that motion in parameters needs a rig."""
+        return not self.channels or any(not request.of_channels for request in self.further().values())
+
+    def further(self, scale: float = 1.0) -> dict[str, Request]:
+        """The further scores by name, as requests.
+
+        Args:
+            scale: factor of lengths, for metrics that take one.
+        """
+        return {name: parse(text).scaled(scale) for name, text in self.metrics}
 
     def describe(self) -> str:
         """The definition in plain words, one line per number."""
@@ -81,10 +113,17 @@ class Protocol:
         if self.mve is not None:
             definition = vertex_error_words(reduction=self.mve, squared=self.mve_squared)
             lines.append(f"  mve: {definition.format(region='all vertices', pooling=pooling)}")
-        definition = vertex_error_words(reduction="max", squared=self.lve_squared)
-        lines.append(f"  lve: {definition.format(region='the lip vertices', pooling=pooling)}")
+        if self.lve:
+            definition = vertex_error_words(reduction="max", squared=self.lve_squared, root=self.lve_root)
+            lines.append(f"  lve: {definition.format(region='the lip vertices', pooling=pooling)}")
         for name, sign in self.deviations().items():
             lines.append(f"  {name}: {dynamics_words(sign=sign).format(region='the upper-face vertices')}")
+        lines += [f"  {name}: {text}" for name, text in self.metrics]
+        if self.channels:
+            lines.append("  of channels, one number each, in place of vertices")
+        if self.unit is not None:
+            lines.append(f"  lengths are in {self.unit}")
+            lines.append("  vertices of motion in parameters are those of the head at rest")
         lines.append(f"  lengths: {LENGTH_WORDS[self.length_rule]}")
         return "\n".join(lines)
 
@@ -92,17 +131,18 @@ class Protocol:
         """Sign of each face dynamics deviation by its name."""
         return {f"fdd_{sign}" if place else "fdd": sign for place, sign in enumerate(self.fdd)}
 
-    def build(self, lips: Region, upper: Region | None = None) -> ProtocolMetrics:
-        """The metrics of this protocol for a topology.
+    def build(self, lips: Region, upper: Region | None = None, *, scale: float = 1.0) -> ProtocolMetrics:
+        """The metrics of this protocol for a topology, without the further ones, which :meth:`further` gives.
 
         Args:
-            lips: lip vertices.
+            lips: lip vertices; channels where the protocol is of channels.
             upper: upper-face vertices; needed if the protocol has FDD.
+            scale: factor of all lengths, by which the motion's unit becomes the protocol's.
         """
         if self.topology is not None:
             topology = TOPOLOGIES[self.topology]
             lips, upper = topology.bind(lips), None if upper is None else topology.bind(upper)
-        return ProtocolMetrics(self, lips, upper)
+        return ProtocolMetrics(self, lips, upper, scale=1.0 if self.channels else scale)
 
 
 _PAPER = (
@@ -110,6 +150,7 @@ _PAPER = (
     "root of the printed LVE to be a mean of per-frame maxima, so it is the mean over vertices"
 )
 _PAPER_TEXT = "the dual-path style diffusion paper, the formulas of its text to the letter"
+_MHD = "mean_vertex_error:squared=true,root=true,pooling=sequences"
 _SETTINGS = (
     Protocol("paper", _PAPER, mve="mean", fdd=("absolute",)),
     Protocol("paper_text", _PAPER_TEXT, mve="max", lve_squared=False, fdd=("absolute",)),
@@ -117,6 +158,63 @@ _SETTINGS = (
     Protocol("facediffuser", "FaceDiffuser's released script", mve="mean", fdd=("signed", "absolute")),
     Protocol("diffspeaker", "DiffSpeaker's released code", fdd=("signed",), pooling="sequences"),
     Protocol("meshtalk", "MeshTalk's paper", lve_squared=False),
+    Protocol("unitalker", "UniTalker's code; its L2norm is mve here", mve="mean"),
+    Protocol(
+        "artalk",
+        "ARTalk's code; the root and the mean over sequences are how we read it",
+        lve_root=True,
+        fdd=("absolute",),
+        pooling="sequences",
+        unit="mm",
+        metrics=(("mhd", _MHD),),
+    ),
+    Protocol(
+        "unils",
+        "UniLS's inferencer, frames of speaking (s_) and of listening (l_) apart",
+        lve_root=True,
+        pooling="sequences",
+        unit="mm",
+        metrics=tuple(
+            (f"{moment}_{name}", f"{moment}_{metric}")
+            for moment in ("s", "l")
+            for name, metric in (
+                ("lve", "lip_vertex_error:root=true,pooling=sequences"),
+                ("mhd", _MHD),
+                ("fdd", "face_dynamics_deviation"),
+                ("pdd", "channel_dynamics_deviation:region=head"),
+                ("jdd", "channel_dynamics_deviation:region=jaw"),
+            )
+        ),
+    ),
+    Protocol(
+        "dualtalk",
+        "DualTalk's tables of expression, jaw and head; mve is the mean squared error of all channels",
+        mve="mean",
+        mve_squared=True,
+        lve=False,
+        channels=True,
+        metrics=tuple(
+            (f"{score}_{part}", f"{metric}:region={part}" + more)
+            for score, metric, option in (
+                ("fd", "frechet_distance", ""),
+                ("p_fd", "frechet_distance", ",with_partner=true"),
+                ("sid", "shannon_index", ",clusters="),
+                ("rpcc", "residual_partner_correlation", ""),
+                ("sts", "step_distance", ""),
+                ("var", "channel_variance", ""),
+                ("div", "frame_pair_distance", ""),
+            )
+            for part, clusters in (("expression", 40), ("jaw", 10), ("head", 10))
+            for more in (f"{option}{clusters}" if score == "sid" else option,)
+        ),
+    ),
+    Protocol(
+        "facediffuser_beat",
+        "FaceDiffuser's script on BEAT's weights",
+        mve="mean",
+        fdd=("signed", "absolute"),
+        channels=True,
+    ),
 )
 
 PROTOCOLS: dict[str, Protocol] = {setting.name: setting for setting in _SETTINGS}
@@ -195,9 +293,10 @@ class ProtocolMetrics(MetricCollection):
         protocol: the setting; usually made by :meth:`Protocol.build`.
         lips: lip vertices.
         upper: upper-face vertices; may be None if the protocol has no FDD.
+        scale: factor of all lengths.
     """
 
-    def __init__(self, protocol: Protocol, lips: Region, upper: Region | None = None) -> None:
+    def __init__(self, protocol: Protocol, lips: Region, upper: Region | None = None, *, scale: float = 1.0) -> None:
         if protocol.fdd and upper is None:
             raise ValueError(f"protocol {protocol.name!r} includes FDD; give the upper-face region")
         # Metrics with equal states must not be merged, and the inputs are checked here once for all of them.
@@ -210,11 +309,14 @@ class ProtocolMetrics(MetricCollection):
         scores: dict[str, Metric] = {}
         if protocol.mve is not None:
             scores["mve"] = MeanVertexError(
-                reduction=protocol.mve, squared=protocol.mve_squared, pooling=pooling, **options
+                reduction=protocol.mve, squared=protocol.mve_squared, pooling=pooling, scale=scale, **options
             )
-        scores["lve"] = LipVertexError(lips, squared=protocol.lve_squared, pooling=pooling, **options)
+        if protocol.lve:
+            scores["lve"] = LipVertexError(
+                lips, squared=protocol.lve_squared, root=protocol.lve_root, pooling=pooling, scale=scale, **options
+            )
         for name, sign in protocol.deviations().items():
-            scores[name] = FaceDynamicsDeviation(cast(Region, upper), sign=sign, **options)
+            scores[name] = FaceDynamicsDeviation(cast(Region, upper), sign=sign, scale=scale, **options)
         for name, score in scores.items():  # one by one: a dictionary would be sorted by name
             self.add_metrics({name: score})
 

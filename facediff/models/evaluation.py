@@ -14,6 +14,7 @@ from torchmetrics import Metric
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import pad
+from facediff.data.conversations import CONVERSATION, channel_regions, conversation_file
 from facediff.data.corpus import EYELID_PAIRS
 from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import ArgumentError, FaceDiffError, choices
@@ -36,6 +37,7 @@ from facediff.metrics.by_name import parse_all
 from facediff.models.inference import Inference, Style
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
+from facediff.utils.units import metres_per_unit
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
 """Which identity unseen speakers are tested with. ``style_only``: none, with the style of their own reference.
@@ -178,10 +180,11 @@ class Evaluation:
         self.score_by = list(score_by)
         self.energies: dict[str, EnergyScore] = {}
         try:
-            self.requests = parse_all(metrics)
+            self.requests = {request.text: request for request in parse_all(metrics)}
         except FaceDiffError as error:
             raise ArgumentError({"model.metrics": list(metrics)}, str(error), located=True) from error
-        self.needs = {need for request in self.requests for need in request.needs}
+        self.requests |= self.protocol.further()
+        self.needs = {need for request in self.requests.values() for need in request.needs}
         self.splits: list[str] = []
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
         self.chosen: dict[str, dict[str, dict[str, Metric]]] = {}
@@ -204,6 +207,10 @@ class Evaluation:
         self._assets = assets
         # Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
         regions = regions_of(assets.scored)
+        self._check_space(assets)
+        scale = self._scale(assets)
+        self.requests |= self.protocol.further(scale)
+        of_protocol = regions_of(assets) if self.protocol.channels else regions
         self.splits = list(splits)
         self._sequences = []
         self._data = data
@@ -214,7 +221,8 @@ class Evaluation:
         methods = list(METHODS) if self.splits != ["val"] else ["model"]
         self.metrics = {
             split: {
-                method: self.protocol.build(regions["lips"], regions["upper_face"]).to(device) for method in methods
+                method: self.protocol.build(of_protocol["lips"], of_protocol["upper_face"], scale=scale).to(device)
+                for method in methods
             }
             for split in self.splits
         }
@@ -222,8 +230,8 @@ class Evaluation:
         self.chosen = {
             split: {
                 method: {
-                    request.text: request.build(context).to(device)
-                    for request in self.requests
+                    name: request.build(context).to(device)
+                    for name, request in self.requests.items()
                     if method == "model" or not OF_THE_MODEL & set(request.needs)
                 }
                 | self._of_channels(device)
@@ -232,6 +240,25 @@ class Evaluation:
             }
             for split in self.splits
         }
+
+    def _check_space(self, assets: Assets) -> None:
+        """Refuse a protocol that needs vertices, or channels, of a corpus that has none."""
+        protocol, advice = self.protocol.name, "; choose another --model.protocol"
+        if self.protocol.channels and assets.space.is_vertices:
+            raise FaceDiffError(f"protocol {protocol} scores channels, and {assets.corpus} has vertices{advice}")
+        without_rig = not assets.space.is_vertices and assets.rig is None
+        # Before there were protocols of parameters, those of vertices were taken of channels where no rig is known.
+        if self.protocol.unit is not None and without_rig:
+            raise FaceDiffError(
+                f"protocol {protocol} scores vertices in {self.protocol.unit}, and no rig decodes the channels of "
+                f"{assets.corpus}{advice}, or give the corpus a rig"
+            )
+
+    def _scale(self, assets: Assets) -> float:
+        """The factor of lengths from the corpus's unit to the protocol's."""
+        if self.protocol.unit is None:
+            return 1.0
+        return metres_per_unit(assets.scored.unit) / metres_per_unit(self.protocol.unit)
 
     def decoded(self, motion: Tensor, batch: Batch) -> Tensor:
         """Offsets of a batch's clips, (batch, …, points, dims), as those of what is scored."""
@@ -250,7 +277,7 @@ class Evaluation:
 
     def _of_channels(self, device: torch.device) -> dict[str, Metric]:
         """The formulas of vertices on the channels themselves, of parametric spaces."""
-        if self._assets is None or self._assets.space.is_vertices:
+        if self._assets is None or self._assets.space.is_vertices or self.protocol.channels:
             return {}
         metrics = self.protocol.build(*(regions_of(self._assets)[name] for name in ("lips", "upper_face")))
         return {f"{PARAMETERS}{name}": metric.to(device) for name, metric in metrics.scores().items()}
@@ -321,6 +348,9 @@ class Evaluation:
             has["gallery"] = {"gallery": speaker_gallery(data, self._speakers, assets)}
         if (data.root / "phonemes").is_dir():
             has["closures"] = {}
+        if not assets.space.is_vertices:
+            has["channels"] = {}
+        has |= {need: {} for need in CONVERSATION if (data.root / need).is_dir()}
         if model.samples:
             has["samples"] = {}
         if len(self._styles(model)) > 1:
@@ -335,11 +365,14 @@ class Evaluation:
             "lid_pairs": f"the corpus has no {EYELID_PAIRS}; list pairs of an upper and a lower eyelid vertex there, "
             "or in the file that data.eyelid_pairs names",
             "closures": f"{data.root / 'phonemes'}: no such folder",
+            "channels": f"{assets.corpus} has vertices",
+            "partner": f"no partner: {data.root / 'partner'} with <clip>.npy, (frames, channels), is not there",
+            "speaking": f"{data.root / 'speaking'} with <clip>.npy, a boolean for each frame, is not there",
             "samples": f"{name} is deterministic",
             "conditions": "the corpus has no style references of two training identities",
             "style": f"{name} has no style encoder",
         }
-        return Context(has, missing)
+        return Context(has, missing, channel_regions(assets.space))
 
     @staticmethod
     def _styles(model: Inference) -> dict[int, Reference | Style]:
@@ -411,9 +444,10 @@ class Evaluation:
         if batch.repeated:
             return
         metrics = self.metrics[split][method].to(motion.device)
-        channels = {"prediction": motion, "truth": batch.motion}
+        channels: dict[str, Any] = {"prediction": motion, "truth": batch.motion}
         motion, truth = self.decoded(motion, batch), self.decoded(batch.motion, batch)
-        metrics.update(motion, truth, lengths=batch.frame_lengths, clip_names=batch.names)
+        sides = (channels["prediction"], channels["truth"]) if self.protocol.channels else (motion, truth)
+        metrics.update(*sides, lengths=batch.frame_lengths, clip_names=batch.names)
         scores: dict[str, Metric] = {**metrics.scores()}
         inputs = dict(inputs or {})
         for name in ("samples", "predictions"):  # several motions of each clip
@@ -421,11 +455,13 @@ class Evaluation:
                 inputs[name] = self.decoded(inputs[name], batch)
         inputs = self._inputs(motion, truth, batch) | inputs if self.chosen[split][method] else {}
         for name, metric in self.chosen[split][method].items():
-            own_inputs = inputs | channels if name.startswith(PARAMETERS) else inputs
+            request = self.requests.get(name)
+            of_channels = name.startswith(PARAMETERS) if request is None else request.of_channels
+            own_inputs = inputs | channels if of_channels else inputs
             if "samples" in inputs and hasattr(metric, "n_samples"):
                 own_inputs = inputs | {"samples": inputs["samples"][:, : metric.n_samples]}
             try:
-                feed(metric.to(motion.device), own_inputs)
+                feed(metric.to(motion.device), own_inputs, "all" if request is None else request.moment)
             except ValueError as error:
                 raise FaceDiffError(f"metric {name}: {error}") from error
             scores[name] = metric
@@ -507,6 +543,12 @@ class Evaluation:
             inputs["identities"] = self._numbers(batch)
         if "closures" in self.needs and self._data is not None:
             inputs["closures"] = [closures_of(self._data, clip) for clip in batch.names]
+        if self._data is not None and "partner" in self.needs:
+            partners = [conversation_file(self._data.root, "partner", clip) for clip in batch.names]
+            inputs["partner"] = pad([torch.from_numpy(partner) for partner in partners])[..., None].to(motion.device)
+        if self._data is not None and "speaking" in self.needs:
+            masks = (conversation_file(self._data.root, "speaking", clip) for clip in batch.names)
+            inputs["speaking"] = [torch.from_numpy(mask) for mask in masks]
         return inputs
 
     def sequences(self) -> list[dict[str, Any]]:

@@ -163,6 +163,24 @@ class Space:
         """The channels of a region by their names: ``lips``, ``upper_face`` or ``eyes``; empty if none is named so."""
         return tuple(channel for channel, text in enumerate(self.channels) if text.casefold().startswith(REGIONS[name]))
 
+    @property
+    def groups(self) -> dict[str, tuple[int, ...]]:
+        """Channels by what scores are taken of them: all, expression, jaw, head, eyes, and the regions.
+
+        The jaw is its rotation, or the channels that are named so; the expression is the rest of the face. A region
+        that no channel is named after, as with FLAME's expressions, is all channels; other groups may be empty.
+        """
+        jaw = self._turning("jaw") or tuple(c for c in self.face if self.channels[c].casefold().startswith("jaw"))
+        everything = tuple(range(len(self.channels)))
+        return {
+            "all": everything,
+            "expression": tuple(channel for channel in self.face if channel not in jaw),
+            "jaw": jaw,
+            "head": self.head,
+            "eyes": self.eyes,
+            **{name: self.region(name) or everything for name in ("lips", "upper_face")},
+        }
+
     def state(self) -> dict[str, Any]:
         """The record as plain containers, fit for checkpoints and JSON."""
         return {name: _plain(value) for name, value in asdict(self).items()}

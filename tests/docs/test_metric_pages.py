@@ -15,7 +15,8 @@ from torchmetrics import Metric
 import facediff.metrics as fm
 
 DOCS = Path(__file__).parents[2] / "docs"
-METRICS, WHICH = (DOCS / name for name in ("metrics.md", "which_lve.md"))
+METRICS, WHICH, PARAMETERS = (DOCS / name for name in ("metrics.md", "which_lve.md", "parameters.md"))
+OF_VERTICES = [name for name, setting in fm.PROTOCOLS.items() if not setting.of_parameters]
 BASES = {"ExactMetric", "LipMetric", "OpeningMetric", "SamplesMetric", "SequenceMetric", "SpeechLipMetric"}
 BASES |= {"RatioMetric", "VertexError"}
 Array = NDArray[np.float64]
@@ -54,7 +55,9 @@ def test_every_metric_is_in_the_table_with_its_function_and_options() -> None:
 
 def test_the_table_of_protocols_is_that_of_the_code() -> None:
     table = rows(METRICS, "| protocol |")
-    assert [row[0].strip("`") for row in table] == list(fm.PROTOCOLS)
+    assert [row[0].strip("`") for row in table] == OF_VERTICES
+    of_parameters = [row[0].strip("`") for row in rows(PARAMETERS, "| protocol |")]
+    assert sorted(of_parameters) == sorted(set(fm.PROTOCOLS) - set(OF_VERTICES))
     for name, _, mve, lve, fdd, pooling, lengths in table:
         setting = fm.PROTOCOLS[name.strip("`")]
         assert {"mean": "mean", "largest of a frame": "max", "": None}[mve] == setting.mve
@@ -87,6 +90,7 @@ def scores(truths: list[Array], predictions: list[Array]) -> dict[str, dict[str,
         "facediffuser": {"mve": mean, "lve": squared, "fdd": signed, "fdd_absolute": absolute},
         "diffspeaker": {"lve": float(np.mean([(m**2).mean() for m in lips])), "fdd": signed},
         "meshtalk": {"lve": plain},
+        "unitalker": {"mve": mean, "lve": squared},
     }
 
 
@@ -96,12 +100,12 @@ def test_the_worked_example_is_right() -> None:
     calm, lively = (1, 1, 0, 0), (1, 1, 2, 2)
     one = [along_x((3, 1, 0, 0), (3, 1, 0, 0)), along_x(calm, lively, calm, lively, (9, 9, 9, 9))]
     two = [along_x(*[(2, 2, 0, 0)] * frames) for frames in (2, 4)]
-    printed = re.findall(r"^protocol +(mve.*)\n((?:\w+ .*\n){6})", WHICH.read_text(), re.MULTILINE)
+    printed = re.findall(r"^protocol +(mve.*)\n((?:\w+ .*\n){7})", WHICH.read_text(), re.MULTILINE)
     assert len(printed) == 2
     for (head, body), prediction in zip(printed, (one, two), strict=True):
         expected = scores(truths, prediction)
         lines = [line.split() for line in body.splitlines()]
-        assert [line[0] for line in lines] == list(expected) == list(fm.PROTOCOLS)
+        assert [line[0] for line in lines] == list(expected) == OF_VERTICES
         for name, *cells in lines:
             shown = {key: cell for key, cell in zip(head.split(), cells, strict=True) if cell != "-"}
             assert shown == {key: f"{value:.4f}" for key, value in expected[name].items()}

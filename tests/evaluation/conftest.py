@@ -13,13 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from facediff.evaluation import EvaluationReport, evaluate
-from facediff.metrics import Region
+from facediff.metrics import PROTOCOLS, Region
 from facediff.utils.pickles import load_pickle
 
 VERTICES = 20
 LIPS = (1, 2, 7, 11)
 UPPER = (0, 5, 13, 18, 19)
 LENGTHS = {"A_e01": 9, "A_e02": 1, "A_e03": 14, "B_C_e01": 6, "B_C_e02": 11}
+OF_VERTICES = [name for name, setting in PROTOCOLS.items() if not setting.of_parameters]
 Array = NDArray[Any]
 # How files in the wild differ, one form a clip.
 FORMS = (
@@ -136,6 +137,8 @@ def expected(truths: list[Array], predictions: list[Array], templates: list[Arra
         "diffspeaker/lve": np.mean(each),
         "diffspeaker/fdd": np.mean(signed),
         "meshtalk/lve": np.sqrt(lips).mean(),
+        "unitalker/mve": distances.mean(),
+        "unitalker/lve": lips.mean(),
     }
 
 

@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.metrics import PROTOCOLS
 from facediff.reporting.statistics import BLOCK, Bootstrap, draws, pooled
-from tests.evaluation.conftest import LENGTHS, Files, scores_of
+from tests.evaluation.conftest import LENGTHS, OF_VERTICES, Files, scores_of
 
 
 def test_equal_sequences_leave_no_doubt() -> None:
@@ -54,10 +53,10 @@ def test_intervals_cover_about_as_often_as_they_say() -> None:
 
 
 def test_intervals_are_reproducible_and_hold_the_score(shared_files: Files) -> None:
-    one = shared_files.evaluate(protocols=list(PROTOCOLS), bootstrap=300, seed=1)
-    assert one.methods == shared_files.evaluate(protocols=list(PROTOCOLS), bootstrap=300, seed=1, workers=1).methods
-    assert one.methods != shared_files.evaluate(protocols=list(PROTOCOLS), bootstrap=300, seed=2).methods
-    wide, narrow = one, shared_files.evaluate(protocols=list(PROTOCOLS), bootstrap=300, seed=1, level=0.5)
+    one = shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=1)
+    assert one.methods == shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=1, workers=1).methods
+    assert one.methods != shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=2).methods
+    wide, narrow = one, shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=1, level=0.5)
     for outer, inner in zip(wide.methods[0].scores, narrow.methods[0].scores, strict=True):
         assert outer.interval is not None
         assert inner.interval is not None
@@ -84,7 +83,7 @@ def test_a_method_differs_from_itself_by_exactly_nothing(shared_files: Files) ->
 
 
 def test_methods_are_compared_over_the_sequences_that_both_have(files: Files) -> None:
-    report = files.evaluate("ours", "theirs", protocols=list(PROTOCOLS), bootstrap=200)
+    report = files.evaluate("ours", "theirs", protocols=OF_VERTICES, bootstrap=200)
     differences = {f"{each.protocol}/{each.metric}": each for each in report.comparisons}
     ours, theirs = scores_of(report, 0), scores_of(report, 1)
     for name, found in differences.items():

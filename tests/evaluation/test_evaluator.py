@@ -45,6 +45,9 @@ NO_CLIP_VALUES = {
 PHONEMES = "start,end,ipa,viseme\n0.00,0.08,m,PP\n0.08,0.2,a,aa\n0.2,0.28,ˈb,PP\n"
 
 
+OF_CHANNELS = {name for name in registry.metric.names() if parse(name).of_channels}
+
+
 @pytest.fixture
 def corpus(tmp_path: Path) -> Files:
     """A corpus with speech, phonemes, pairs of lip vertices and a frame rate; each clip predicted in two styles."""
@@ -87,6 +90,10 @@ def batches(files: Files) -> list[dict[str, Any]]:
 def test_every_registered_metric_is_computed_or_refused_with_the_reason(corpus: Files, name: str) -> None:
     if name in OF_A_MODEL:
         with pytest.raises(FaceDiffError, match=rf"metric {name}: needs .*facediff test --model.metrics"):
+            scored(corpus, name)
+        return
+    if name in OF_CHANNELS:
+        with pytest.raises(FaceDiffError, match=rf"metric {name}: needs motion in parameters"):
             scored(corpus, name)
         return
     identity = "all" if name == "identity_diversity" else "own"

@@ -12,8 +12,18 @@ import torch
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation import evaluate
-from facediff.metrics import PROTOCOLS, Region, protocol
-from tests.evaluation.conftest import LENGTHS, LIPS, UPPER, VERTICES, Files, expected, scores_of, write_corpus
+from facediff.metrics import Region, protocol
+from tests.evaluation.conftest import (
+    LENGTHS,
+    LIPS,
+    OF_VERTICES,
+    UPPER,
+    VERTICES,
+    Files,
+    expected,
+    scores_of,
+    write_corpus,
+)
 
 
 def subject(clip: str) -> str:
@@ -30,14 +40,14 @@ def expected_of(files: Files, clips: list[str], method: str = "ours") -> dict[st
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_every_protocol_gives_what_the_released_scripts_give(shared_files: Files, workers: int) -> None:
-    report = shared_files.evaluate(protocols=list(PROTOCOLS), workers=workers)
+    report = shared_files.evaluate(protocols=OF_VERTICES, workers=workers)
     assert scores_of(report) == pytest.approx(expected_of(shared_files, list(LENGTHS)), rel=1e-6)
     assert {(score.frames, score.sequences) for score in report.methods[0].scores} == {(sum(LENGTHS.values()), 5)}
 
 
 def test_the_pooled_numbers_are_those_of_protocol_metrics_to_the_last_digits(shared_files: Files) -> None:
-    found = scores_of(shared_files.evaluate(protocols=list(PROTOCOLS)))
-    for name in PROTOCOLS:
+    found = scores_of(shared_files.evaluate(protocols=OF_VERTICES))
+    for name in OF_VERTICES:
         metrics = protocol(name).build(Region.from_indices("lips", LIPS), Region.from_indices("upper", UPPER))
         for clip in LENGTHS:
             paths = (
@@ -52,9 +62,9 @@ def test_the_pooled_numbers_are_those_of_protocol_metrics_to_the_last_digits(sha
 
 
 def test_digits_depend_neither_on_workers_nor_on_the_other_protocols(shared_files: Files) -> None:
-    one = scores_of(shared_files.evaluate(protocols=list(PROTOCOLS), workers=1))
-    assert scores_of(shared_files.evaluate(protocols=list(PROTOCOLS)[::-1], workers=2)) == one
-    for name in PROTOCOLS:
+    one = scores_of(shared_files.evaluate(protocols=OF_VERTICES, workers=1))
+    assert scores_of(shared_files.evaluate(protocols=OF_VERTICES[::-1], workers=2)) == one
+    for name in OF_VERTICES:
         alone = scores_of(shared_files.evaluate(protocols=[name]))
         assert alone == {key: value for key, value in one.items() if key.startswith(f"{name}/")}
 
@@ -105,7 +115,7 @@ def test_conditions_are_chosen_or_averaged(files: Files) -> None:
     for clip in clips:
         motion = files.read(files.truth / f"{clip}.npy")
         files.write(files.method() / f"{clip}_condition_B_C.npy", motion + 0.1 * rng.standard_normal(motion.shape))
-    own = files.evaluate(protocols=list(PROTOCOLS))
+    own = files.evaluate(protocols=OF_VERTICES)
     assert scores_of(own) == pytest.approx(expected_of(files, list(LENGTHS)), rel=1e-6)
     assert own.methods[0].missing.unused == [f"{clip}_condition_B_C.npy" for clip in clips]
     truths = [files.read(files.truth / f"{clip}.npy") for clip in clips]
@@ -120,9 +130,9 @@ def test_conditions_are_chosen_or_averaged(files: Files) -> None:
     }
     for clip in set(LENGTHS) - set(clips):
         (files.method() / f"{clip}_condition_{subject(clip)}.npy").unlink()
-    named = files.evaluate(protocols=list(PROTOCOLS), identity="B_C")
+    named = files.evaluate(protocols=OF_VERTICES, identity="B_C")
     assert scores_of(named) == pytest.approx(by_condition["B_C"], rel=1e-6)
-    every = files.evaluate(protocols=list(PROTOCOLS), identity="all")
+    every = files.evaluate(protocols=OF_VERTICES, identity="all")
     mean = {key: (by_condition["A"][key] + by_condition["B_C"][key]) / 2 for key in by_condition["A"]}
     assert scores_of(every) == pytest.approx(mean, rel=1e-6)
     assert every.methods[0].sequences[0].conditions == ("A", "B_C")
@@ -147,12 +157,12 @@ def test_frames_cut_are_counted_and_a_protocol_may_refuse(files: Files) -> None:
 
 
 def test_truth_at_a_higher_frame_rate_is_thinned(files: Files) -> None:
-    wanted = scores_of(files.evaluate(protocols=list(PROTOCOLS)))
+    wanted = scores_of(files.evaluate(protocols=OF_VERTICES))
     for clip in LENGTHS:
         path = files.truth / f"{clip}.npy"
         frames = files.read(path)
         np.save(path, np.stack([frames, frames + 1], 1).reshape(-1, VERTICES, 3))
-    assert scores_of(files.evaluate(protocols=list(PROTOCOLS), truth_stride=2)) == pytest.approx(wanted, rel=1e-12)
+    assert scores_of(files.evaluate(protocols=OF_VERTICES, truth_stride=2)) == pytest.approx(wanted, rel=1e-12)
 
 
 @pytest.fixture

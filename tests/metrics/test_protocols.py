@@ -20,6 +20,7 @@ SCORES = {
     "facediffuser": ["mve", "lve", "fdd", "fdd_absolute"],
     "diffspeaker": ["lve", "fdd"],
     "meshtalk": ["lve"],
+    "unitalker": ["mve", "lve"],
 }
 
 
@@ -53,8 +54,8 @@ def test_scores_follow_the_definitions(
     assert found == pytest.approx({score: expected[score] for score in SCORES[name]}, rel=1e-6)
 
 
-def test_there_are_six_and_paper_is_the_default() -> None:
-    assert list(PROTOCOLS) == list(SCORES)
+def test_there_are_these_of_vertices_and_paper_is_the_default() -> None:
+    assert [name for name, setting in PROTOCOLS.items() if not setting.of_parameters] == list(SCORES)
     assert protocol() is PROTOCOLS["paper"]
     with pytest.raises(ValueError, match=r'unknown protocol .codtalker.: did you mean "codetalker".*meshtalk'):
         protocol("codtalker")
