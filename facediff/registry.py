@@ -274,7 +274,7 @@ model = Kind(
     "facediff.models.style_content "
     "facediff.models.published.artalk "
     "facediff.models.published.codetalker facediff.models.published.codetalker_checkpoints "
-    "facediff.models.published.diffposetalk "
+    "facediff.models.published.diffposetalk facediff.models.published.diffposetalk_checkpoints "
     "facediff.models.published.diffspeaker "
     "facediff.models.published.emotalk "
     "facediff.models.published.facediffuser "

@@ -32,6 +32,9 @@ MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are 
 OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
 
 
+WITHOUT_FACE = "none, a point stands for each channel"
+"""Metadata ``face`` of motion in parameters that no face is known for."""
+
 MOTION = "facediff.pipelines.motion"  # What shows, changes and writes animations
 
 
@@ -151,6 +154,11 @@ class Animation:
         """What :attr:`values` mean; that of vertices where there are none."""
         return VERTICES if self.values is None or self.channels is None else self.channels.space
 
+    @property
+    def without_face(self) -> bool:
+        """Whether it is channels alone: each of its points then stands for one of them."""
+        return self.metadata.get("face") == WITHOUT_FACE and self.values is not None
+
     def made_of(self, space: Space, values: npt.NDArray[np.float32]) -> Self:
         """The same with the channels that its vertices were made of."""
         return replace(self, channels=Channels(space, values, self.vertices))
@@ -167,6 +175,11 @@ class Animation:
         Raises:
             FaceDiffError: if there are none.
         """
+        if self.without_face:
+            raise FaceDiffError(
+                f"{self.name}: its motion is {len(self.space.channels)} channels ({self.space.kind}), which no rig "
+                f"turns into vertices; import the model with --mesh, or write the channels to .npz or .npy"
+            )
         if self.faces is None or not len(self.faces):
             raise OptionError.naming(
                 f"{self.name}: comes without a mesh (triangles); give one with {{mesh}}, or write .npy, .npz, .pc2 or "

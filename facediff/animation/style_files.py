@@ -65,9 +65,20 @@ def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
     return parts
 
 
+def with_layout(word: str) -> tuple[Path, str | None]:
+    """A file of parameters and the layout that is stated for it.
+
+    >>> with_layout("clip.npy@flame_artalk")
+    (PosixPath('clip.npy'), 'flame_artalk')
+    """
+    name, at, layout = word.rpartition("@")
+    return (Path(name), layout) if at and name and not Path(word).is_file() else (Path(word), None)
+
+
 def style_paths(words: str | None) -> list[Path]:
     """The files among the words of ``--style``; if one of them has changed, so has the style."""
-    return [Path(part.name) for part in split_styles(words) if Path(part.name).is_file()] if words else []
+    paths = [with_layout(part.name)[0] for part in split_styles(words)] if words else []
+    return [path for path in paths if path.is_file()]
 
 
 def normalised(words: str, weights: Sequence[float | None]) -> list[float]:

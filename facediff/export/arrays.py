@@ -17,7 +17,7 @@ from facediff.registry import export_format
 
 @export_format.register("npy")
 class Vertices(Format):
-    """NumPy: absolute vertices (frames, vertices, 3), float32."""
+    """NumPy: absolute vertices (frames, vertices, 3), float32; channels (frames, channels) where there is no face."""
 
     next_step = "numpy.load gives the vertices; `facediff evaluate` scores them"
     needs_mesh = False
@@ -25,6 +25,11 @@ class Vertices(Format):
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write frame by frame."""
         (animation,) = animations
+        if animation.without_face and animation.values is not None:
+            channels = MotionWriter(path, animation.values.shape[1:])
+            channels.write(animation.values)
+            channels.close()
+            return
         writer = MotionWriter(path, animation.template.shape)
         try:
             for frame in FileSpace.of(animation, options).frames(animation):

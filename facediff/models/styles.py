@@ -20,6 +20,7 @@ from facediff.animation.style_files import (
     split_styles,
     stillness_of,
     stride_of,
+    with_layout,
 )
 from facediff.errors import FaceDiffError, OptionError, choices
 
@@ -31,8 +32,10 @@ if TYPE_CHECKING:
     from facediff.animation import Animation
     from facediff.data import Assets, Reference
     from facediff.models import AnimationModel, Style
+    from facediff.spaces.files import ParameterClip
 
-    StyleLike = str | Path | Mapping[str, float] | Animation | npt.NDArray[np.floating] | Tensor | Reference | Style
+    Recorded = Animation | ParameterClip | npt.NDArray[np.floating] | Tensor
+    StyleLike = str | Path | Mapping[str, float] | Recorded | Reference | Style
     """What a style may be given as in Python, see :func:`style_from`."""
 
 MEDIAN = "median"
@@ -88,8 +91,9 @@ def style_from(
 
     Args:
         given: the words of ``--style``; a path; names or paths with their weights, ``{"F1_e03": 0.4, "M2_e05": 0.6}``;
-            a motion as an animation or as an array (T, V, 3) of absolute vertices; a style vector (S,) of
-            :func:`extract_style`; or what this function has returned.
+            a motion as an animation or as an array (T, V, 3) of absolute vertices; of a model of channels also one of
+            :func:`facediff.spaces.files.read_parameters`; a style vector (S,) of :func:`extract_style`; or what this
+            function has returned.
         identity: whose face is animated; also whose motion an array holds, unless a template is given.
         model: gives the style vectors.
         template: as :func:`read_styles` takes it.
@@ -102,6 +106,7 @@ def style_from(
     from facediff.animation import Animation
     from facediff.data import Reference
     from facediff.models import Style
+    from facediff.spaces.files import ParameterClip
 
     if isinstance(given, Reference | Style):
         return given
@@ -113,6 +118,11 @@ def style_from(
         raise OptionError.naming(
             "{style}: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
         )
+    if isinstance(given, ParameterClip):
+        return style_of_channels(given, identity, model)
+    if isinstance(given, Animation) and given.values is not None and not model.assets.space.is_vertices:
+        values = ParameterClip(given.name, given.values, given.space, given.frame_rate)
+        return style_of_channels(values, identity, model)
     if isinstance(given, Animation):
         motion = StyleFile(Path(given.name), given.vertices, given.template, given.frame_rate, given.unit)
         return style_of(motion, identity, model)
@@ -182,7 +192,8 @@ def read_style(
 
     A file holds a style vector that ``facediff style extract`` wrote, or a motion in absolute vertices: an animation
     (``.npz``), which has its own template, or a bare array (``.npy``). An array's speaker follows from its name
-    (``F1_e03.npy``), else it is ``identity``, unless a template is given. A file in the ``vertices_npy`` of a corpus
+    (``F1_e03.npy``), else it is ``identity``, unless a template is given. A model of channels takes motion in
+    parameters, see :func:`recorded_parameters`. A file in the ``vertices_npy`` of a corpus
     folder comes with that folder's templates and frame rate. A model that has styles by name takes only those.
 
     Args:
@@ -208,6 +219,10 @@ def read_style(
         for reference in model.assets.references.values():
             if reference.clip == style:
                 return reference
+    if not model.assets.space.is_vertices:
+        recorded = recorded_parameters(style, model.assets.frame_rate)
+        if recorded is not None:
+            return style_of_channels(recorded, identity, model)
     opened = open_style(Path(style)) if is_file else corpus_clip(style, model)
     return style_of(opened, identity, model, template=template if is_file else None)
 
@@ -243,12 +258,104 @@ def style_of(
     return Reference(path.stem, offsets)
 
 
+PARAMETER_FILES = (".csv", ".json", ".npy", ".npz", ".pt")
+"""Suffixes of motion in parameters; ``.pt`` are ARTalk's style clips."""
+
+
+def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
+    """Motion in parameters from the words of a style: ``clip.json``, or ``clip.npy@flame_artalk`` with its layout.
+
+    None if the words are none: a name, a style vector, or an animation of vertices.
+
+    Args:
+        words: a file, with ``@`` and its layout if it does not say that itself.
+        frame_rate: frames a second of an array whose layout has no rate of its own.
+
+    Raises:
+        FaceDiffError: if there is no such file, or it is not of that layout.
+    """
+    import numpy as np
+
+    from facediff.spaces.files import ParameterClip, read_parameters
+    from facediff.spaces.layouts import LAYOUTS, find_layout
+    from facediff.utils.arrays import read_arrays
+
+    path, stated = with_layout(words)
+    if path.suffix not in PARAMETER_FILES or (stated is None and not path.is_file()):
+        return None
+    if not path.is_file():
+        raise OptionError.naming(f"{{style}} {path}: no such file")
+    if path.suffix == ".npz" and stated is None:
+        from facediff.animation import read_archive
+
+        if "template" in read_arrays(path, {"template"}):
+            animation = read_archive(path)
+            if animation.values is None:
+                return None
+            return ParameterClip(animation.name, animation.values, animation.space, animation.frame_rate)
+    if path.suffix == ".npy" and open_style(path).array.ndim == 1:
+        return None
+    if path.suffix == ".pt":
+        import torch
+
+        from facediff.utils.torch_files import load_tensors, open_checkpoint
+
+        entry = find_layout(stated or "flame_artalk", f"--style {path}")
+        with open_checkpoint(path) as (stream, source):
+            content = load_tensors(stream, source)
+        values: npt.NDArray[np.floating] = np.zeros(0, np.float32)
+        if isinstance(content, torch.Tensor) and content.is_floating_point():
+            values = content.float().numpy()
+        if values.ndim != 2 or values.shape[1] != len(entry.space.channels) or not np.isfinite(values).all():
+            raise OptionError.naming(
+                f"{{style}} {path}: holds no tensor of finite numbers (frames, {len(entry.space.channels)}); expected "
+                f"a style clip such as ARTalk's, or state its layout: {path.name}@LAYOUT"
+            )
+        return ParameterClip(path.stem, values, entry.space, entry.frame_rate or 25.0)
+    if stated is None and path.suffix in (".npy", ".npz"):
+        try:
+            return read_parameters(path)  # which says what layouts fit
+        except FaceDiffError as error:
+            raise OptionError.naming(f"{{style}} {error}, as in {path.name}@LAYOUT") from error
+    without_rate = path.suffix == ".npy" and stated in LAYOUTS and LAYOUTS[stated].frame_rate is None
+    return read_parameters(path, layout=stated, frame_rate=frame_rate if without_rate else None)
+
+
+def style_of_channels(recorded: ParameterClip, identity: str, model: AnimationModel) -> Reference:
+    """Motion in parameters as a reference of a model of channels: in its order, at its rate, from the person's rest.
+
+    Raises:
+        FaceDiffError: if the model takes vertices, or the motion lacks one of its channels.
+    """
+    import torch
+
+    from facediff.data import Reference
+    from facediff.spaces.operations import permuted, resampled
+
+    assets = model.assets
+    if assets.space.is_vertices:
+        raise OptionError.naming(
+            f"{{style}} {recorded.name}: is motion in parameters, and this model takes vertices; give such a motion"
+        )
+    values, space = permuted(recorded.values, recorded.space, assets.space)
+    own = [name for name in space.absent if name in assets.space.channels and name not in assets.space.absent]
+    if own:
+        raise OptionError.naming(
+            f"{{style}} {recorded.name}: lacks {', '.join(own[:4])}{' …' if len(own) > 4 else ''}; give a motion with "
+            f"the model's channels"
+        )
+    if abs(recorded.frame_rate - assets.frame_rate) > 1e-6:
+        values = resampled(values, assets.space, recorded.frame_rate, assets.frame_rate)
+    motion = torch.from_numpy(values.astype("float32"))[..., None]
+    return Reference(recorded.name, motion - assets.template(identity))
+
+
 def refuse_vertices(source: object, model: AnimationModel) -> None:
     """Refuse motion of vertices as the style of a model that takes channels."""
     if not model.assets.space.is_vertices:
         raise OptionError.naming(
-            f"{{style}} {source}: motion files hold vertices, and this model takes channels; name a speaker of the "
-            f"checkpoint, or a style vector of this model"
+            f"{{style}} {source}: holds vertices, and this model takes channels; give motion in parameters, a speaker "
+            f"of the checkpoint, or a style vector of this model"
         )
 
 

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from facediff.animation.animation import WITHOUT_FACE
 from facediff.animation.options import AnimationOptions
 from facediff.editing.direction import Direction
 from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
+from facediff.spaces.rigs import LinearRig
 from facediff.utils.files import valid_text
 from facediff.utils.hub import model_name
 from facediff.utils.licences import licence_metadata
@@ -199,6 +201,8 @@ class TrainedPipeline(AnimationPipeline):
             "seed": str(seed),
             "precision": "bfloat16 and float32" if is_half else "float32",
         }
+        if self.model.assets.rig is None and self.model.assets.space.kind not in ("vertices", "arkit"):
+            metadata["face"] = WITHOUT_FACE
         if self.options.condition is not None:
             metadata["condition"] = self.options.condition
         if sampler is not None:
@@ -264,13 +268,24 @@ class FirstSample:
 
 
 def with_rig(assets: Assets) -> Assets:
-    """Assets whose channels are ARKit's with the shapes of the built-in face, where they have no rig of their own."""
-    if assets.space.kind != "arkit" or assets.rig is not None:
+    """Assets whose channels have no rig of their own with one that can be shown.
+
+    ARKit's channels get the shapes of the built-in face. Others, such as FLAME's without the user's model, get a point
+    for each channel, so that their values can be written; such animations have no face to draw.
+    """
+    if assets.space.is_vertices or assets.rig is not None:
         return assets
     from facediff.data.batch import Rig
     from facediff.data.puppet import built_in_rig
 
-    return replace(assets, rig=Rig.of(built_in_rig(), assets))
+    if assets.space.kind == "arkit":
+        return replace(assets, rig=Rig.of(built_in_rig(), assets))
+    names = tuple(assets.space.channels[channel] for channel in assets.space.face)
+    places = np.zeros((len(names), 3))
+    places[:, 0] = np.arange(len(names))
+    moves = np.zeros((len(names), len(names), 3))
+    moves[range(len(names)), range(len(names)), 1] = 1.0
+    return replace(assets, rig=Rig.of(LinearRig(names, places, moves, None, "m", WITHOUT_FACE), assets))
 
 
 def channel_rest(space: Space) -> Array:

@@ -16,8 +16,12 @@ from facediff.animation import Animation, write_archive
 from facediff.animation.style_files import Weighted, split_styles, style_paths
 from facediff.data import Reference
 from facediff.errors import FaceDiffError
-from facediff.models import DualPathDiffusion, Style
-from facediff.models.styles import read_style, read_styles
+from facediff.models import DiffPoseTalk, DualPathDiffusion, Style, import_checkpoint
+from facediff.models.styles import extract_style, read_style, read_styles, style_from
+from facediff.spaces.files import ParameterClip
+from facediff.spaces.layouts import layout
+from tests.fakes import published_parameters
+from tests.fakes.published import AUDIO_CONFIG
 from tests.fakes.tiny import Tiny
 
 
@@ -182,3 +186,72 @@ def test_templates_that_do_not_fit(
         read_style(str(path), "A", model, template=tmp_path / "far.npy")
     with pytest.raises(FaceDiffError, match="no such mesh file"):
         read_style(str(path), "A", model, template=tmp_path / "none.obj")
+
+
+# Models of channels take motion in parameters.
+
+
+@pytest.fixture(scope="module")
+def of_channels(tmp_path_factory: pytest.TempPathFactory) -> DiffPoseTalk:
+    folder = tmp_path_factory.mktemp("channels")
+    model = import_checkpoint(
+        published_parameters.write_diffposetalk(folder, head=True),
+        audio_config=AUDIO_CONFIG,
+        statistics=published_parameters.statistics(),
+    )
+    assert isinstance(model, DiffPoseTalk)
+    return model
+
+
+def values_of(columns: int, frames: int = 12) -> np.ndarray:
+    return np.random.default_rng(columns).normal(size=(frames, columns)).astype(np.float32)
+
+
+def test_motion_in_parameters_is_a_style_by_its_layout(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
+    values, person = values_of(56), of_channels.identities[0]
+    np.savez(tmp_path / "clip.npz", exp=values[:, :50], pose=values[:, 50:], shape=np.zeros(100, np.float32))
+    np.save(tmp_path / "clip.npy", values)
+    for name in ("clip.npz", "clip.npy"):
+        style = read_styles(f"{tmp_path / name}@flame_diffposetalk", person, of_channels)
+        assert isinstance(style, Reference)
+        assert np.array_equal(style.motion[..., 0], values)
+        with pytest.raises(FaceDiffError, match="flame_diffposetalk"):
+            read_styles(str(tmp_path / name), person, of_channels)
+    with pytest.raises(FaceDiffError, match="no such file"):
+        read_styles("missing.npy@flame_artalk", person, of_channels)
+
+
+def test_another_layouts_channels_are_taken_by_name(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
+    """ARTalk's clips have 100 expressions, of which the model knows 50, then head and jaw."""
+    values = values_of(106)
+    torch.save(torch.from_numpy(values), tmp_path / "natural.pt")
+    np.save(tmp_path / "natural.npy", values)
+    expected = np.concatenate([values[:, :50], values[:, 100:]], 1)
+    for words in (str(tmp_path / "natural.pt"), f"{tmp_path / 'natural.npy'}@flame_artalk"):
+        style = read_styles(words, of_channels.identities[0], of_channels)
+        assert isinstance(style, Reference)
+        assert np.array_equal(style.motion[..., 0], expected)
+    torch.save({"x": torch.zeros(3)}, tmp_path / "other.pt")
+    with pytest.raises(FaceDiffError, match=r"other.pt"):
+        read_styles(str(tmp_path / "other.pt"), of_channels.identities[0], of_channels)
+
+
+def test_parameters_are_resampled_and_mixed_as_vectors(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
+    space, person = layout("flame_diffposetalk"), of_channels.identities[0]
+    clip = ParameterClip("quick", np.repeat(values_of(56), 2, 0), space, 50.0)
+    style = style_from(clip, person, of_channels)
+    assert isinstance(style, Reference)
+    assert np.allclose(style.motion[..., 0], values_of(56), atol=1e-6)
+    np.save(tmp_path / "a.npy", values_of(56))
+    np.save(tmp_path / "b.npy", 2 * values_of(56))
+    words = [f"{tmp_path / name}@flame_diffposetalk" for name in ("a.npy", "b.npy")]
+    mixed = read_styles(f"{words[0]}:0.25,{words[1]}:0.75", person, of_channels)
+    assert isinstance(mixed, Style)
+    first, second = (extract_style([word], person, of_channels) for word in words)
+    torch.testing.assert_close(mixed.vector, 0.25 * first + 0.75 * second)
+
+
+def test_motion_without_the_models_channels_is_refused(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
+    np.save(tmp_path / "weights.npy", values_of(52))
+    with pytest.raises(FaceDiffError, match="arkit"):
+        read_styles(f"{tmp_path / 'weights.npy'}@arkit", of_channels.identities[0], of_channels)

@@ -8,19 +8,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 import torch
 from lightning.pytorch import Trainer
 
 from facediff.animation import Animation
 from facediff.animation.files import read_animation
 from facediff.animation.options import AnimationOptions, ExportOptions
+from facediff.cli.app import main
+from facediff.data import Reference
 from facediff.errors import FaceDiffError
 from facediff.export import check_export
-from facediff.models import DualPathDiffusion, load_model
+from facediff.models import DiffPoseTalk, DualPathDiffusion, import_checkpoint, load_model
+from facediff.models.published.importing import save_model
 from facediff.pipelines.trained import TrainedPipeline, channel_rest
 from facediff.spaces.rotations import convert
+from facediff.speech.audio import read_speech
 from facediff.synthetic.known_faces import built_in_rig
+from tests.fakes import published_parameters
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
+from tests.fakes.published import AUDIO_CONFIG
 
 SPEECH = np.sin(np.arange(16_000) / 9).astype(np.float32)
 
@@ -107,3 +114,33 @@ def test_arkit_channels_without_a_rig_move_the_built_in_face(
     decoded = rig.only(CHANNELS.channels[:3]).decode(animation.values[:, :3])
     np.testing.assert_allclose(animation.still().vertices, decoded, atol=1e-5)
     assert {"lips", "upper_face"} <= animation.regions.keys()
+
+
+def test_channels_without_a_face_are_written_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """FLAME's coefficients without FLAME, from the command line, in the style of a clip of a stated layout."""
+    monkeypatch.chdir(tmp_path)
+    model = import_checkpoint(
+        published_parameters.write_diffposetalk(tmp_path, head=True),
+        audio_config=AUDIO_CONFIG,
+        statistics=published_parameters.statistics(),
+    )
+    assert isinstance(model, DiffPoseTalk)
+    save_model(model, tmp_path / "dpt.ckpt")
+    values = np.random.default_rng(0).normal(size=(12, 56)).astype(np.float32)
+    np.savez(tmp_path / "clip.npz", exp=values[:, :50], pose=values[:, 50:])
+    soundfile.write(tmp_path / "a.wav", SPEECH[:13_000], 16_000)
+    words = ["animate", "a.wav", "--checkpoint", "dpt.ckpt", "--seed", "3", "--style", "clip.npz@flame_diffposetalk"]
+    for name in ("x.npz", "x.npy"):
+        assert main([*words, "--quiet", "-o", name]) == 0
+    heard = torch.from_numpy(read_speech(tmp_path / "a.wav"))
+    clip = Reference("clip", torch.from_numpy(values)[..., None])
+    expected = model.animate(heard, identity=model.identities[0], style=clip, seed=3).vertices[..., 0].numpy()
+    written = read_animation(tmp_path / "x.npz")
+    assert written.values is not None
+    assert written.without_face
+    assert np.allclose(written.values, expected, atol=1e-5)
+    assert np.array_equal(np.load(tmp_path / "x.npy"), written.values)
+    assert main([*words, "--quiet", "-o", "x.glb"]) == 2
+    assert "--mesh" in capsys.readouterr().err

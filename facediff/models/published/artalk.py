@@ -28,7 +28,7 @@ from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStrea
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style
-from facediff.models.published.diffposetalk import count_layers
+from facediff.models.published.diffposetalk_checkpoints import count_layers
 from facediff.models.published.parametric import ParametricModel, window_at
 from facediff.models.published.recognition import (
     AuthorsWeights,

@@ -4,8 +4,9 @@ Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head 
 2024.
 
 Diffusion over windows of FLAME's parameters, each of which continues the one before it; the style comes from a clip.
-From top to bottom: the model, training, sampling, the authors' checkpoints. The network and the process stand in
-:mod:`facediff.models.published.diffposetalk_network`; docs/methods.md says what of the published code is an option.
+From top to bottom: the model, training, sampling, streams. The network and the process stand in
+``diffposetalk_network.py``, the authors' checkpoints are read in ``diffposetalk_checkpoints.py``; docs/methods.md says
+what of the published code is an option.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -24,15 +25,14 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, OptionError, choices
+from facediff.errors import ArgumentError, FaceDiffError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Progress
+from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.clip_style import (
     TABLE_ROWS,
     ClipStyleEncoder,
     StylePositions,
-    convert_style,
     style_contrast,
 )
 from facediff.models.published.diffposetalk_network import (
@@ -45,13 +45,10 @@ from facediff.models.published.diffposetalk_network import (
     clamped,
     guided,
 )
-from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.parametric import ParametricModel, statistics_of, window_at
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, FaceFacts, Recogniser, register
+from facediff.models.published.parametric import ParametricModel, window_at
 from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.spaces.layouts import layout
+from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.ranges import Range
 
 Weight = Annotated[float, Range(0, 1e9)]
@@ -333,16 +330,35 @@ class DiffPoseTalk(ParametricModel):
         style, shapes = self.given_style(batch), self.shapes_of(batch)
         rows = []
         for i, seed in enumerate(seeds):
-            stream = torch.Generator(self.device).manual_seed(seed)
-
-            def draw(like: Tensor, stream: torch.Generator = stream) -> Tensor:
-                return torch.randn(like.shape, device=like.device, dtype=like.dtype, generator=stream)
-
-            audio = batch.audio[i, : int(batch.audio_lengths[i])]
+            audio, draw = batch.audio[i, : int(batch.audio_lengths[i])], self.noise_of(seed)
             motion = self.sample(audio, shapes[i : i + 1], None if style is None else style[i : i + 1], draw, progress)
             rows.append(self.absolute(motion))
         motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)
         return F.pad(motion, (0, 0, 0, 0, 0, max(0, int(frames.max()) - motion.shape[1])))[:, : int(frames.max())]
+
+    def noise_of(self, seed: int) -> Draw:
+        """The noise of a seed, whatever the clip."""
+        stream = torch.Generator(self.device).manual_seed(seed)
+
+        def draw(like: Tensor) -> Tensor:
+            return torch.randn(like.shape, device=like.device, dtype=like.dtype, generator=stream)
+
+        return draw
+
+    @property
+    def window_samples(self) -> int:
+        """Samples of a window's speech."""
+        return round(SAMPLE_RATE / self.frame_rate * self.window_frames)
+
+    def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
+        """Animate speech of any length while it arrives, in the method's own windows; see the base class.
+
+        Where other windows were chosen, such as those of low latency, speech is cut into these.
+        """
+        whole = super().stream(plan=plan, **choices)
+        if not math.isinf((plan or self.windows).above):
+            return whole
+        return WindowStream(self, whole.clip, seeds=whole.seeds, plan=plan)
 
     def sample(
         self,
@@ -368,7 +384,7 @@ class DiffPoseTalk(ParametricModel):
         size, unit = self.window_frames, SAMPLE_RATE / self.frame_rate
         audio = self.standard_speech(audio)
         windows = max(1, math.ceil(self.frames_of(len(audio)) / size))
-        missing = round(unit * size) * windows - len(audio)
+        missing = self.window_samples * windows - len(audio)
         if missing > 0:
             audio = F.pad(audio, (0, missing), value=float(audio[-1]) if self.padding == "replicate" else 0.0)
         filled = max(0, math.ceil(missing / unit))
@@ -427,6 +443,95 @@ class DiffPoseTalk(ParametricModel):
         return noisy
 
 
+class WindowStream(SpeechStream):
+    """Animates speech that arrives in pieces in the method's own windows, each of which continues the one before it.
+
+    A frame is certain a window after its moment at most. Of a recording as a whole the speech network hears all windows
+    in one pass and standardises them by the level of all; here it hears each by itself, at the level of the speech so
+    far, since later speech is not known yet.
+
+    Args:
+        model: the animating model.
+        clip: as :class:`~facediff.models.inference.SpeechStream` takes it.
+        seeds: as there.
+        plan: as there; the windows are the model's own.
+    """
+
+    model: DiffPoseTalk
+
+    def __init__(
+        self, model: DiffPoseTalk, clip: Batch, *, seeds: Sequence[int] = (0,), plan: WindowPlan | None = None
+    ) -> None:
+        super().__init__(model, clip, seeds=seeds, plan=plan)
+        with torch.inference_mode():
+            self._style, self._shape = model.given_style(self.clip), model.shapes_of(self.clip)
+        self._draws = [model.noise_of(seed) for seed in self.seeds]
+        like = self._shape.new_empty(1, model.window_frames, len(model.modelled))
+        self._starts = [draw(like) for draw in self._draws]
+        self._before: list[tuple[Tensor, Tensor]] = [(model.start_motion, model.start_audio) for _ in self.seeds]
+        self._wave = self._shape.new_zeros(0)
+        self._sums = (0, 0.0, 0.0)  # samples of all speech so far, their sum and that of their squares
+
+    @torch.inference_mode()
+    def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
+        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames.
+
+        Raises:
+            FaceDiffError: if the stream was finished.
+        """
+        self._refuse_finished()
+        self._wave = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)])
+        size, parts = self.model.window_samples, []
+        while len(self._wave) >= size:
+            parts.append(self._next(self._wave[:size], self.model.window_frames))
+            self._wave = self._wave[size:]
+        return self._counted(parts)
+
+    @torch.inference_mode()
+    def finish(self, frames: int | None = None) -> Motion:
+        """Give the motion that is left; arguments and errors are those of the base class.
+
+        Raises:
+            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
+                the stream was finished.
+        """
+        self._refuse_finished()
+        self._finished = True
+        left = self.model.frames_of(self._sums[0] + len(self._wave)) - self.frames
+        total = self.frames + left if frames is None else frames
+        if self.frames + left < 1 or total < self.frames:
+            raise FaceDiffError(
+                f"frames: {total} are none, or fewer than the {self.frames} that were given out already"
+            )
+        wanted = total - self.frames
+        motion = self._counted([self._next(self._wave, left)[:, :wanted]] if left > 0 else [])
+        return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
+
+    def _next(self, wave: Float[Tensor, " samples"], frames: int) -> Motion:
+        """The motion of the next window, of which so many frames are of speech."""
+        model, (count, total, squares) = self.model, self._sums
+        numbers = wave.double()
+        self._sums = (count + len(wave), total + float(numbers.sum()), squares + float(numbers.square().sum()))
+        mean, deviation = level_of(*self._sums)
+        wave = F.pad((wave - mean) / deviation, (0, model.window_samples - len(wave)))
+        heard = model.hear_wave(wave, model.window_frames)[None]
+        wanted = wave.new_ones(1, model.window_frames)
+        wanted[:, frames:] = 0
+        motions = []
+        for number, (draw, start) in enumerate(zip(self._draws, self._starts, strict=True)):
+            before = self._before[number]
+            motion = model.sample_window(heard, self._shape, self._style, before, start, wanted, draw)
+            self._before[number] = (motion[:, -model.context :], heard[:, -model.context :])
+            motions.append(model.absolute(motion[0, :frames]))
+        return torch.stack(motions)
+
+
+def level_of(count: int, total: float, squares: float) -> tuple[float, float]:
+    """What speech is standardised by, of its samples, their sum and that of their squares: mean, deviation + 1e-5."""
+    mean = total / count
+    return mean, math.sqrt(max(0.0, squares - count * mean**2) / max(1, count - 1)) + 1e-5
+
+
 def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
     """Speech with its ends mirrored, so that HuBERT gives exactly 50 steps a second: 320·n + 80 samples."""
     missing = 320 * (len(wave) // 320) + 80 - len(wave)
@@ -438,147 +543,3 @@ def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
     for _ in range(2):
         padded = F.pad(padded, (side // 2, side // 2), mode="reflect")
     return F.pad(padded, (side % 2, side % 2), mode="replicate")[0]
-
-
-# The authors' checkpoints.
-
-RENAMES = (
-    ("PE", "positions"),
-    ("person_proj.", "person_in."),
-    ("diff_step_map.", "step_map."),
-    ("feature_proj.", "motion_in."),
-    ("transformer.", "transformer."),
-    ("motion_dec.", "motion_out."),
-)
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """DiffPoseTalk's tensors under the names of this file, and its options."""
-    said = weights.arguments("start_motion_feat")
-    _, context, channels = weights.shape("start_motion_feat", 3)
-    _, positions, dim = weights.shape("denoising_net.PE", 3)
-    _, person_dim = weights.shape("denoising_net.person_proj.weight")
-    _, frame_dim = weights.shape("denoising_net.feature_proj.weight")
-    style_dim = weights.shape("null_style_feat", 3)[2]
-    if str(said.get("target", "sample")) != "sample":
-        raise OptionError.naming(f"{weights.source}: it predicts {said['target']}; expected a model of clean motion")
-    kind: Literal["wav2vec2", "hubert"] = "wav2vec2" if said.get("audio_model") == "wav2vec2" else "hubert"
-    encoder = weights.backbone("audio_encoder.", kind=kind, facts=facts, **DiffPoseTalk.encoder_settings())
-    for old, new in RENAMES:
-        weights.move_all(f"denoising_net.{old}", f"network.{new}")
-    for old, new in (
-        ("start_audio_feat", "start_audio"),
-        ("start_motion_feat", "start_motion"),
-        ("null_audio_feat", "no_audio"),
-        ("null_style_feat", "no_style"),
-        ("diffusion_sched.alphas", "process.alphas"),
-        ("diffusion_sched.alpha_bars", "process.signal"),
-        ("diffusion_sched.sigmas_inflex", "process.deviations"),
-    ):
-        weights.move(old, new)
-    weights.move_all("audio_feature_map.", "audio_map.")
-    weights.ignore("denoising_net.TE.pe", "sinusoids, which the authors make anew as well")
-    weights.ignore("diffusion_sched.betas", "follows from the other variances")
-    weights.ignore("diffusion_sched.sigmas_flex", "deviations of a sampler with more noise, which nothing uses")
-    mask = "denoising_net.alignment_mask"
-    width = int((~weights.get(mask).bool())[1].sum()) if mask in weights else 0
-    weights.ignore(mask, "follows from the number of frames")
-    for name, value in facts.details.items():
-        weights.add(name, value)
-    style_said = weights.arguments(next(name for name in weights.tensors if name.endswith("motion_proj.weight")))
-    rows = convert_style(weights, "", "style_encoder.")
-    options: dict[str, Any] = {
-        "audio_encoder": encoder,
-        "dim": dim,
-        "num_layers": count_layers(weights, "denoising_net.transformer.layers."),
-        "feed_forward_dim": weights.shape("denoising_net.transformer.layers.0.linear1.weight")[0],
-        "style_dim": style_dim,
-        "style_layers": count_layers(weights, "transformer.layers.", "encoder.transformer.layers."),
-        "style_rows": rows,
-        "window_frames": positions - context - 1,
-        "context": context,
-        "diffusion_steps": weights.shape("diffusion_sched.alphas", 1)[0] - 1,
-        "indicator": frame_dim > channels,
-        "memory_width": width,
-        "head": channels >= 54,
-        "shape_dim": person_dim - style_dim,
-    }
-    for theirs, ours, where in (
-        ("n_heads", "num_heads", said),
-        ("n_heads", "style_heads", style_said),
-        ("pad_mode", "padding", said),
-        ("cfg_mode", "guidance", said),
-    ):
-        if where.get(theirs) is not None:
-            options[ours] = where[theirs]
-    guiding = said.get("guiding_conditions")
-    if isinstance(guiding, str):
-        options["conditions"] = [name for name in ("audio", "style") if name in guiding.split(",")]
-    return options
-
-
-def faces_of(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
-    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised.
-
-    Raises:
-        FaceDiffError: if a file cannot be read, or does not fit.
-    """
-    _, person_dim = weights.shape("denoising_net.person_proj.weight")
-    count = person_dim - weights.shape("null_style_feat", 3)[2]
-    statistics, given = options.statistics, options.templates
-    if statistics is None:
-        raise OptionError.naming(
-            f"{{statistics}}: {weights.source} lacks the statistics of its training motion; give its authors' "
-            f"stats_train.npz"
-        )
-    if not isinstance(statistics, Mapping):
-        statistics = read_arrays(Path(statistics), STATISTICS, remedy="expected stats_train.npz of DiffPoseTalk")
-    motion, deviation = statistics_of(statistics, ("exp", "pose"))
-    mean_shape, shape_deviation = statistics_of(statistics, ("shape",))
-    if len(motion) != 56 or len(mean_shape) != count:
-        raise OptionError.naming(
-            f"{{statistics}}: has {len(motion)} numbers of motion and {len(mean_shape)} of shape; expected 56 (exp 50, "
-            f"pose 6) and {count}"
-        )
-    if given is None:
-        shapes = {"speaker": torch.zeros(count)}
-    elif isinstance(given, Mapping):
-        shapes = {str(name): torch.as_tensor(value).float() for name, value in given.items()}
-    else:
-        path = Path(given)
-        content = open_array(path) if path.suffix == ".npy" else read_arrays(path, ("shape",))["shape"]
-        shapes = {path.stem: torch.tensor(np.asarray(content)).float()}
-    rows = {name: value[0] if value.dim() == 2 else value for name, value in shapes.items()}
-    if not rows or any(row.shape != (count,) for row in rows.values()):
-        raise OptionError.naming(f"{{templates}}: expected {count} coefficients of FLAME's shape for every speaker")
-    space = layout("flame_diffposetalk")
-    rest = torch.zeros(len(space.channels), 1)
-    details = {
-        "motion_mean": motion,
-        "motion_std": deviation,
-        "shapes": (torch.stack([*rows.values()]) - mean_shape) / shape_deviation,
-    }
-    return FaceFacts("HDTF_TFHP", space, 25.0, list(rows), len(rest), dict.fromkeys(rows, rest), details=details)
-
-
-STATISTICS = tuple(f"{key}_{name}" for key in ("exp", "pose", "shape") for name in ("mean", "std"))
-
-
-def count_layers(weights: AuthorsWeights, *prefixes: str) -> int:
-    """Layers whose tensors' names begin so."""
-    return len({name.removeprefix(old).partition(".")[0] for old in prefixes for name in weights.names(old)})
-
-
-register(
-    Recogniser(
-        method="DiffPoseTalk",
-        marks=("denoising_net.person_proj.weight", "start_motion_feat", "null_style_feat"),
-        unless=(),
-        convert=convert,
-        vertices=lambda _: 56,
-        count=lambda _: 0,
-        faces=faces_of,
-        licence="none stated",
-        licence_source="github.com/DiffPoseTalk/DiffPoseTalk",
-    )
-)
