@@ -21,6 +21,7 @@ from torchmetrics import Metric
 
 from facediff.data import Batch, Clip, Sample, SpeechMotionDataModule, collate
 from facediff.data.batch import UNKNOWN_IDENTITY
+from facediff.data.conversations import channel_regions
 from facediff.data.dataset import MotionDataset
 from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import FaceDiffError
@@ -58,6 +59,9 @@ REFERENCES = {
     "another_other_mood": "another speaker's reference in another mood",
 }
 """Whose reference gives the style. Moods are equal or not by the corpus's ``reference_attributes``."""
+
+CHANNEL_GROUPS = ("expression", "jaw", "head", "eyes")
+"""Groups of channels whose liveliness is measured."""
 
 GENERATION_METRICS: dict[str, str] = {
     "liveliness_upper_face": "liveliness of the upper face (1)",
@@ -100,6 +104,9 @@ GENERATION_METRICS: dict[str, str] = {
     },
     "mve_hidden_own": "MVE with own reference, identity hidden",
     "mve_known_own": "MVE with own reference, identity known",
+    **{f"param_liveliness_{name}": f"liveliness of the channels of {name} (1)" for name in CHANNEL_GROUPS},
+    "param_spread": "spread / error, all channels (1)",
+    "param_mve": "MVE of channels, one sample",
     "real_time_factor": "real-time factor, one sample",
 }
 """Names of the metrics in files, and their titles; in parentheses what the truth itself, or a model that draws
@@ -139,25 +146,26 @@ class EvaluationCorpus:
     def __init__(self, data: SpeechMotionDataModule) -> None:
         self.data = data
         self.assets = data.assets()
-        if not self.assets.space.is_vertices:
-            raise FaceDiffError(
-                f"{data.corpus_name}: generation metrics are of vertices, and this corpus has channels; score such a "
-                f"model with `facediff test`, which decodes them"
-            )
-        self.regions = regions_of(self.assets)
+        # Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
+        self.regions = regions_of(self.assets.scored)
+        self.channels = {
+            name: region for name, region in channel_regions(self.assets.space).items() if name in CHANNEL_GROUPS
+        }
         compared = data.compared_speakers
         self.speakers = sorted(name for name in self.assets.templates if compared is None or name in compared)
         self.mean_faces = MeanFaces(data)
         self.missing: dict[str, str] = {}
         self.gallery = None
         try:
+            if not self.assets.scored.space.is_vertices:
+                raise FaceDiffError("no rig decodes the channels, and speakers are told apart by their faces")
             self.gallery = speaker_gallery(data, self.speakers, self.assets)
         except FaceDiffError as error:
             self.missing["nearest_speaker"] = str(error)
         self.eyelids = eyelid_pairs_of(data)
         if self.eyelids is None:
             self.missing["blink_ratio"] = "the corpus lists no eyelid pairs; name a file of them by data.eyelid_pairs"
-        pairs = self.assets.inner_lip_pairs
+        pairs = self.assets.scored.inner_lip_pairs
         self.lips = None if pairs is None else LipPairs.from_pairs(f"{self.assets.corpus}/inner lips", pairs)
         if self.lips is None or not (data.root / "phonemes").is_dir():
             self.missing["closures"] = "the corpus has no phonemes/, or no regions/inner_lip_pairs.txt"
@@ -242,6 +250,12 @@ class Measurement:
                 "closed": BilabialClosureRate(corpus.lips),
                 "truly_closed": BilabialClosureRate(corpus.lips, of="truth"),
             }
+        # Of the channels themselves, of motion in parameters.
+        self.of_channels: dict[str, Metric] = {
+            f"param_liveliness_{name}": MotionLiveliness(region) for name, region in corpus.channels.items()
+        }
+        if corpus.channels:
+            self.of_channels |= {"param_mve": MeanVertexError(), "param_spread": SpreadErrorRatio(n_samples=count)}
         self.of_baselines: dict[str, Metric] = {
             "still_lve": LipVertexError(lips),
             "mean_face_lve": LipVertexError(lips),
@@ -256,7 +270,7 @@ class Measurement:
             self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
             self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
         self.speed = RealTimeFactor(device_name(model.device))
-        for metrics in (self.of_samples, self.of_each, self.of_baselines, self.of_references):
+        for metrics in (self.of_samples, self.of_each, self.of_channels, self.of_baselines, self.of_references):
             for metric in metrics.values():
                 metric.to(model.device)
 
@@ -264,8 +278,15 @@ class Measurement:
     def add(self, clip: Clip, sample: Sample) -> None:
         """Generate motion for a clip, and score it."""
         batch = self.model.with_person_styles(collate([sample]).to(self.model.device))
-        motion = self._samples(batch)
-        truth, template = batch.motion[0], batch.template[0]
+        motion, truth = self._samples(batch), batch.motion[0]
+        for name, metric in self.of_channels.items():
+            if name == "param_spread":
+                metric.update(motion.expand(self.compared, -1, -1, -1), truth)
+            else:
+                for drawn in motion:
+                    metric.update(drawn, truth)
+        motion, truth = self._scored(motion, clip), self._scored(truth, clip)
+        template = self.corpus.assets.scored.template(clip.identity).to(truth)
         for metric in self.of_samples.values():
             metric.update(motion.expand(self.compared, -1, -1, -1), truth)
         closures = closures_of(self.corpus.data, clip.name) if "closed" in self.of_each else []
@@ -287,13 +308,17 @@ class Measurement:
             first = self.model.sample_clip(batch, seeds[:1])
         return torch.cat([first, self.model.sample_clip(batch, seeds[1:])]) if self.drawn > 1 else first
 
+    def _scored(self, motion: Tensor, clip: Clip) -> Tensor:
+        """Offsets of a clip (*frames, points, dims) as those of what is scored."""
+        return self.corpus.assets.to_scored(motion, clip.identity)
+
     def warm_up(self, sample: Sample) -> None:
         """Generate once without a measurement: the first call makes what later ones find."""
         with torch.inference_mode():
             self.model.sample_clip(collate([sample]).to(self.model.device), [self.sampling.seed])
 
     def _add_baselines(self, clip: Clip, truth: Tensor) -> None:
-        face = self.corpus.mean_faces.of([clip.identity]).to(truth).expand_as(truth)
+        face = self._scored(self.corpus.mean_faces.of([clip.identity]).to(truth), clip).expand_as(truth)
         for name, metric in self.of_baselines.items():
             if name == "true_nearest_speaker":
                 metric.update(truth, self._number(clip))
@@ -308,9 +333,12 @@ class Measurement:
         for seed in range(self.sampling.seed, self.sampling.seed + (self.sampling.references if self.drawn > 1 else 1)):
             if default is not None:
                 motion = self.model.generate(default, seed=seed)[0]
-                self.of_references["lve_default"].update(motion, default.motion[0])
-            for name, motion in zip(views, self.model.generate(batch, seed=seed), strict=True):
-                self.of_references[name].update(motion, batch.motion[0])
+                sides = (self._scored(motion, clip), self._scored(default.motion[0], clip))
+                self.of_references["lve_default"].update(*sides)
+            truth = self._scored(batch.motion[0], clip)
+            for name, generated in zip(views, self.model.generate(batch, seed=seed), strict=True):
+                motion = self._scored(generated, clip)
+                self.of_references[name].update(motion, truth)
                 if name == "hidden_own" and "nearest_speaker" in self.of_references:
                     self.of_references["nearest_speaker"].update(motion, self._number(clip))
 
@@ -342,7 +370,7 @@ class Measurement:
     def result(self) -> dict[str, float | None]:
         """The value of every metric, in the order of :data:`GENERATION_METRICS`; None where there is none."""
         raw: dict[str, float] = {}
-        everything = {**self.of_samples, **self.of_each, **self.of_baselines, **self.of_references}
+        everything = {**self.of_samples, **self.of_each, **self.of_channels, **self.of_baselines, **self.of_references}
         for name, metric in {**everything, "real_time_factor": self.speed}.items():
             if metric.update_called:
                 with suppress(ValueError):  # no value on any sequence

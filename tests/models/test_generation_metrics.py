@@ -17,6 +17,7 @@ from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
 from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, means_of, measure
+from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.tiny import RATE, SEEN, VERTICES, Tiny
 
 LIPS, UPPER = range(12), range(12, 24)
@@ -148,6 +149,41 @@ def test_what_animate_gives_is_scored_with_the_style_that_it_takes(tiny: Tiny) -
         still.update(torch.zeros_like(sample.motion), sample.motion)
     expected = float(found.compute()) / float(still.compute())
     assert scores.mean("test_a", "lve_default_still") == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("rigged", [True, False])
+def test_channels_are_scored_as_decoded_vertices_and_as_channels(tmp_path: Path, rigged: bool) -> None:  # noqa: FBT001
+    root = write_channels(tmp_path / "channels")
+    data: Tiny = (
+        TinyChannels(root=str(root))
+        if rigged
+        else type("Bare", (TinyChannels,), {"rig": lambda *_: None})(root=str(root))
+    )
+    assets = data.assets()
+    assert (assets.rig is None) != rigged
+
+    def shaken(batch: Batch, seed: int) -> Tensor:
+        random = torch.Generator().manual_seed(seed)
+        return batch.motion * 0.5 + 0.05 * torch.randn(batch.motion.shape[1:], generator=random)
+
+    made = type("Made", (Scripted,), {"script": staticmethod(shaken), "samples": True})
+    model = made(n_vertices=6, space=CHANNELS, identities=SEEN, frame_rate=float(RATE), motion_scale="none").eval()
+    model.adopt(assets)
+    scores = run(data, model, splits=["test_a"], sampling=SamplingOptions(samples=2, references=1))
+    lve, mve = fm.LipVertexError(assets.scored.regions["lips"]), fm.MeanVertexError()
+    jaw, spread = fm.MotionLiveliness([0]), fm.SpreadErrorRatio(n_samples=2)
+    for sample in data.dataset("test_a"):
+        drawn = torch.cat([shaken(collate([sample]), seed) for seed in (0, 1)])
+        spread.update(drawn, sample.motion)
+        for motion in drawn:
+            sides = [assets.to_scored(side, sample.identity_name) for side in (motion, sample.motion)]
+            lve.update(*sides)
+            mve.update(motion, sample.motion)
+            jaw.update(motion, sample.motion)
+    for name, metric in (("lve", lve), ("param_mve", mve), ("param_liveliness_jaw", jaw), ("param_spread", spread)):
+        assert scores.mean("test_a", name) == pytest.approx(metric.compute().item(), rel=1e-5), name
+    assert scores.mean("test_a", "param_liveliness_head") is not None
+    assert ("nearest_speaker" in scores.missing) != rigged
 
 
 def test_a_model_without_noise_has_no_spread_and_is_scored_by_its_distance(tiny: Tiny) -> None:
