@@ -307,6 +307,20 @@ class Animation:
         animation: Animation = late(f"{MOTION}:retarget")(self, target_mesh, correspondence, landmarks)
         return animation
 
+    def drive(self, avatar: str | Path, path: str | Path) -> list[Path]:
+        """Write a copy of an avatar whose own shapes and bones play the motion.
+
+        Args:
+            avatar: a .glb with shapes under names of ARKit, Oculus or VRM. Weights go by name where the motion has
+                ARKit's or is of the built-in face; :meth:`retarget` other motion to the avatar first.
+            path: the .glb to write.
+
+        Raises:
+            FaceDiffError: if the avatar has no such shapes, or the motion is on another mesh.
+        """
+        written: list[Path] = late(f"{MOTION}:drive")(self, avatar, path)
+        return written
+
     def blendshapes(
         self,
         shapes: str | Path,

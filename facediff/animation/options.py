@@ -228,15 +228,19 @@ class TargetOptions(CheckedOptions):
     Attributes:
         target_mesh: transfer the motion to this mesh
         correspondence: .npz of that mesh, to use if it exists, else to write
+        own_shapes: of a target .glb, drive its own shapes (ARKit's, VRM's or Oculus' names) and bones, and add none
     """
 
     target_mesh: Annotated[FilePath | None, Option(metavar="FILE", reads=True)] = None
     correspondence: Annotated[FilePath | None, Option(metavar="MAP", reads=True, writes="file")] = None
+    own_shapes: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.correspondence is not None and self.target_mesh is None:
             raise OptionError("correspondence", "belongs to a mesh; give {target_mesh} as well")
+        if self.own_shapes and Path(self.target_mesh or "").suffix.lower() != ".glb":
+            raise OptionError("own_shapes", "drives the shapes of an avatar; give its .glb as {target_mesh}")
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ class Setting:
         clips: split of each clip, by the plan's name of a corpus, where predictions are scored.
         truths: arguments of `facediff evaluate` for the truth (folder, frame stride), by corpus.
         classes: data module of each corpus that is no part of facediff, which a checkpoint may not import by itself.
+        models: class of each trained row's model that is no part of facediff, for the same reason.
         roots: folder of each corpus whose data config names one, for checkpoints that know none, or another machine's.
         launcher: how a facediff command is started.
     """
@@ -65,6 +66,7 @@ class Setting:
     clips: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     truths: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     classes: Mapping[str, str] = field(default_factory=dict)
+    models: Mapping[str, str] = field(default_factory=dict)
     roots: Mapping[str, str] = field(default_factory=dict)
     launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.utils.tethered", "facediff")
 
@@ -151,6 +153,7 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
         "model.protocol": setting.protocol,
         "model.metrics": metrics,
         **({"data": setting.classes[cell.corpus]} if cell.corpus in setting.classes else {}),
+        **({"model": setting.models[cell.row]} if cell.row in setting.models else {}),
         **({} if root is None else {"data.root": str(root)}),
         **cell.test_options,
     }

@@ -234,6 +234,7 @@ def check_cells(
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
     classes: dict[str, str] = {}
+    models: dict[str, str] = {}
     roots: dict[str, str] = {}
     kinds: dict[str, type[SpeechMotionDataModule]] = {}
     for cell in left:
@@ -249,7 +250,9 @@ def check_cells(
                 continue
             seen.add(mark)
             with naming(plan, cell):
-                class_path, arguments = parse_fit(command_line)
+                model_class, class_path, arguments = parse_fit(command_line)
+                if not model_class.startswith("facediff."):
+                    models[cell.row] = model_class
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
                 kinds[cell.corpus] = type(data_of(prepared, class_path, arguments, make=not dry_run))
@@ -272,7 +275,7 @@ def check_cells(
         if cell.kind == "checkpoint":
             with naming(plan, cell):
                 check_checkpoint(cell, kinds.get(cell.corpus), classes.get(cell.corpus), roots.get(cell.corpus))
-    return replace(setting, clips=clips, truths=truths, classes=classes, roots=roots)
+    return replace(setting, clips=clips, truths=truths, classes=classes, models=models, roots=roots)
 
 
 @contextmanager

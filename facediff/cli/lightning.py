@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import difflib
+import importlib
 import json
 import os
 import re
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.configs import as_parts, bundled_config, check_config, keys_of, loggers_of
+from facediff.cli.configs import as_parts, bundled_config, check_config, keys_of, loggers_of, model_class_of
 from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.registry import defaults, plain
@@ -99,11 +100,11 @@ def keep_freed_memory() -> bool:
     return bool(tell_malloc(mmap_max, 0) and tell_malloc(trim_threshold, 2**31 - 1))
 
 
-def parse_fit(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
+def parse_fit(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
     """Check the words of ``facediff fit`` without running it: names, options and values of model, data and trainer.
 
     Returns:
-        class and options of the data module.
+        class of the model, class and options of the data module.
     """
     check_options("fit", arguments)
     options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
@@ -201,6 +202,30 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
         )
 
 
+def import_model(arguments: Sequence[str]) -> str | None:
+    """Import the model's class that the user names by ``--model`` or in a config; it may be a file of this folder.
+
+    Like a corpus's, it is never imported because a checkpoint names it.
+
+    Returns:
+        the class; None if none is named.
+    """
+    from facediff.cli.data import find_own_module
+    from facediff.utils.plain_options import is_path
+
+    named = [value_of(arguments, "--model"), *map(model_class_of, config_files(arguments))]
+    chosen = next((name for name in named if is_path(name)), None)
+    if chosen is not None:
+        find_own_module(chosen)
+        try:
+            importlib.import_module(chosen.rpartition(".")[0])
+        except Exception as error:  # a module can fail in any way while it is imported
+            raise FaceDiffError(
+                f"--model {chosen}: cannot be imported ({error}); expected package.module.Class"
+            ) from error
+    return chosen
+
+
 def tell_folder(path: Path, options: Mapping[str, Any]) -> None:
     """Say which folder is read because a checkpoint, which may come from anybody, names it."""
     if options.get("root") is not None:
@@ -291,6 +316,11 @@ def experiment_name(arguments: Sequence[str]) -> str | None:
 
     Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it.
     """
+    return next((Path(file).stem for file in config_files(arguments) if {"model", "data"} & keys_of(file)), None)
+
+
+def config_files(arguments: Sequence[str]) -> list[str]:
+    """The files of all ``--config`` options."""
     files: list[str] = []
 
     def note(flag: str, value: str) -> str:
@@ -299,7 +329,7 @@ def experiment_name(arguments: Sequence[str]) -> str | None:
         return value
 
     change_values(arguments, note)
-    return next((Path(file).stem for file in files if {"model", "data"} & keys_of(file)), None)
+    return files
 
 
 def fresh_component(flag: str, value: str) -> str:
@@ -324,17 +354,21 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.models.checkpoint import build_model, corpus_of, read_checkpoint
 
+    own = import_model(arguments)
     checkpoint = read_checkpoint(path)
     build_model(path, checkpoint)  # what Lightning would stumble over is reported before it starts
     if name == "fit":
         return []
+    hparams = checkpoint["hyper_parameters"]
+    # The checkpoint's own class says no more than whose code may be imported.
+    same = ("--model", f"--model={own}") if own == hparams["_class_path"] else ()
     changes = [word for word in arguments if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
+    changes = [word for word in changes if word not in same]
     if changes:
         raise FaceDiffError(
             f"{changes[0]}: the checkpoint {path} decides the model, and its weights fit no other; omit the option "
             f"(only {', '.join(f'--model.{option}' for option in FREE)} may change)"
         )
-    hparams = checkpoint["hyper_parameters"]
     options = {key: value for key, value in hparams.items() if not key.startswith("_") and key not in LINKS}
     config = {"seed_everything": 0, "model": {"class_path": hparams["_class_path"], "init_args": options}}
     chosen = value_of(arguments, "--data")

@@ -128,8 +128,8 @@ def parsing(arguments: Sequence[str], experiment: Callable[..., str]) -> Iterato
         sys.argv = argv
 
 
-def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
-    """Parse the words of ``fit`` and make nothing of them; class and options of the data module."""
+def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
+    """Parse the words of ``fit`` and make nothing of them; class of the model, class and options of the data module."""
     try:
         with parsing(arguments, lambda *, _root_: "benchmark"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -140,7 +140,7 @@ def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
             raise
         raise ours from error
     data = parsed.config["data"]
-    return str(data["class_path"]), dict(data.get("init_args") or {})
+    return str(parsed.config["model"]["class_path"]), str(data["class_path"]), dict(data.get("init_args") or {})
 
 
 def restores(error: BaseException) -> bool:

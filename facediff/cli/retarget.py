@@ -38,6 +38,8 @@ def retarget(
     accept_poor: bool = False,
     add_to_mesh: bool = False,
     bare_face: bool = False,
+    own_shapes: bool = False,
+    quiet: bool = False,
     host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[ranges.Port, Option(metavar="N")] = 0,
     open: bool = False,  # noqa: A002 - the option's name
@@ -61,6 +63,10 @@ def retarget(
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
             (default for a .glb from a .glb that has textures, skins or targets)
         bare_face: write the animated surface alone, without what else the target .glb has
+        own_shapes: of a target .glb, drive its own shapes (ARKit's, VRM's or Oculus' names) and its bones for head,
+            eyes and jaw, and add none. Weights go by name where the motion has ARKit's or is of the built-in face,
+            without any search; else they are solved for on the target
+        quiet: print the files and warnings alone
         host: address at which the page of --pick is served; by default nobody but this machine reaches it
         port: its port; 0 for any free one
         open: open the page of --pick in the browser
@@ -68,9 +74,13 @@ def retarget(
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
-    if add_to_mesh and (output.suffix != ".glb" or target_mesh.suffix.lower() != ".glb" or output == target_mesh):
-        raise FaceDiffError(f"--add-to-mesh: expected two different .glb, not {target_mesh} and {output}; name them so")
+    both_glb = output.suffix == ".glb" and target_mesh.suffix.lower() == ".glb" and output != target_mesh
+    for option, chosen in (("--add-to-mesh", add_to_mesh), ("--own-shapes", own_shapes)):
+        if chosen and not both_glb:
+            raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
     refuse_idle("has no effect with --bare-face", add_to_mesh=add_to_mesh and bare_face)
+    if own_shapes:
+        refuse_idle("has no effect with --own-shapes", add_to_mesh=add_to_mesh, bare_face=bare_face)
     check_source(source, [animation])
     for option, file in (("--target-mesh", target_mesh), ("--landmarks", landmarks)):
         if file is not None and not file.is_file():
@@ -82,18 +92,32 @@ def retarget(
     else:
         refuse_idle("is for --pick", host=host != "127.0.0.1", port=port != 0, open=open)
 
+    from facediff.editing.blendshapes import has_arkit_weights
     from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
+    from facediff.export.glb_own_shapes import own_shapes as own_shapes_of
     from facediff.export.pictures import draw_correspondence
     from facediff.mesh.glb import wears_more
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    dressed = not add_to_mesh and not bare_face and output.suffix == ".glb" and wears_more(target_mesh)
-    if dressed and output.exists() and output.samefile(target_mesh):
+    dressed = add_to_mesh or (not bare_face and output.suffix == ".glb" and wears_more(target_mesh))
+    if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
+    driven = own_shapes_of(target_mesh).summary if own_shapes else ""
     own = SourceReader(source).read(animation)
+    if own_shapes and has_arkit_weights(own):
+        idle = {"correspondence": correspondence, "landmarks": landmarks, "part": part, "show": show}
+        refuse_idle(
+            "has no effect, since the motion's weights go by name to --own-shapes",
+            **{name: value is not None for name, value in idle.items()},
+            pick=pick,
+            accept_poor=accept_poor,
+        )
+        written = write_animations(output, [own], ExportOptions(), into=target_mesh, own_shapes=True)
+        tell(*written, *([] if quiet else [driven]))
+        return
     if pick:
         pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
         landmarks = picked
@@ -108,18 +132,16 @@ def retarget(
 
     made, found = transfer(own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge)
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
-    if dressed:
+    if own_shapes:
+        notes.append(driven)
+    elif dressed and not add_to_mesh:
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
-    if add_to_mesh or dressed:
-        from facediff.export.glb_added import add_to_glb
-
-        add_to_glb(output, target_mesh, made, ExportOptions().tolerance)
-        written = [output]
-    else:
-        written = write_animations(output, [made], ExportOptions())
+    into = target_mesh if dressed or own_shapes else None
+    written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes)
     if show is not None:
         written.append(show)
-    tell(*written, *remarks(own, made, found, reports[-1]), *notes)
+    lines = [*remarks(own, made, found, reports[-1]), *notes]
+    tell(*written, *(line for line in lines if not quiet or line.startswith("WARNING")))
 
 
 PICKED = ".landmarks.json"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.bounded import Problem, minimise, minimise_sparse
-from facediff.editing.shapes import ShapeSet
+from facediff.editing.shapes import BUILT_IN, ShapeSet, read_shapes
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.mesh.mesh import triangle_areas
 from facediff.spaces.arkit import ARKIT, absent_from, beyond_arkit, mirror_pairs
@@ -232,6 +232,26 @@ def own_weights(animation: Animation) -> Weights:
     )
 
 
+def has_arkit_weights(animation: Animation) -> bool:
+    """Whether an animation has weights of ARKit's shapes, or is of the built-in face, which has such shapes."""
+    from facediff.synthetic.known_faces import edition_of_mesh
+
+    faces = animation.faces
+    built_in = faces is not None and edition_of_mesh(len(animation.template), faces) is not None
+    return built_in or (animation.values is not None and animation.space.kind == "arkit")
+
+
+def arkit_weights(animation: Animation) -> Weights:
+    """Weights of ARKit's shapes of an animation that :func:`has_arkit_weights`: its own, or solved for.
+
+    Raises:
+        FaceDiffError: as :func:`solve`.
+    """
+    if animation.values is not None and animation.space.kind == "arkit":
+        return own_weights(animation)
+    return solve(animation, read_shapes(Path(BUILT_IN), animation.template, animation.unit))
+
+
 def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None = None) -> Weights:
     """Weights w_t that bring the shapes nearest to an animation.
 
@@ -252,7 +272,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
 
     Example:
         >>> from facediff.animation import Animation
-        >>> from facediff.editing.shapes import ShapeSet
+        >>> from facediff.editing.shapes import BUILT_IN, ShapeSet, read_shapes
         >>> rest = np.random.default_rng(0).normal(size=(9, 3))
         >>> shapes = ShapeSet(("jawOpen",), rest, np.full((1, 9, 3), 0.01))
         >>> half_open = Animation("hello", (rest + 0.005)[None], rest, frame_rate=30.0)

@@ -40,7 +40,12 @@ FORMATS: Mapping[str, Format] = _Formats()
 
 
 def write_animations(
-    path: Path, animations: Sequence[Animation], options: ExportOptions | None = None, *, into: Path | None = None
+    path: Path,
+    animations: Sequence[Animation],
+    options: ExportOptions | None = None,
+    *,
+    into: Path | None = None,
+    own_shapes: bool = False,
 ) -> list[Path]:
     """Write animations in the format that the suffix chooses; either all files appear, each complete, or none.
 
@@ -51,6 +56,7 @@ def write_animations(
         animations: at least one.
         options: what the user chose; the defaults if None.
         into: the .glb of the animations' mesh, to whose copy each is added; surfaces alone are written if None.
+        own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
 
     Returns:
         The written files and folders: first the animations, then what was written next to them.
@@ -82,6 +88,10 @@ def write_animations(
                 staged = hidden / target.name
                 if into is None:
                     form.write(staged, group, replace(options, speech_file=speech_file))
+                elif own_shapes:
+                    from facediff.export.glb_own_shapes import drive_avatar
+
+                    drive_avatar(staged, into, group[0])
                 else:
                     from facediff.export.glb_added import add_to_glb
 

@@ -73,7 +73,7 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
         ValueError: if the file is damaged.
         FaceDiffError: if it is larger than the budget.
     """
-    materials, nodes = glb.entries("materials"), _placed_nodes(glb)
+    materials, nodes = glb.entries("materials"), placed_nodes(glb)
     read: dict[int, list[tuple[dict[str, Any], Array, npt.NDArray[np.int64]]]] = {}  # several nodes may show a mesh
     skins: dict[int, Array] = {}
     before, triangles = 0, 0
@@ -144,7 +144,7 @@ def _shown(glb: Glb, nodes: dict[int, Array | None]) -> list[tuple[int, int]]:
     return [(whole(entry, "mesh"), index) for index in nodes if "mesh" in (entry := glb.entry("nodes", index))]
 
 
-def _placed_nodes(glb: Glb) -> dict[int, Array | None]:
+def placed_nodes(glb: Glb) -> dict[int, Array | None]:
     """The scene's nodes, and the matrices (4, 4) that place them, None for one that stays."""
     scenes, nodes = glb.entries("scenes"), glb.entries("nodes")
     if scenes:
@@ -163,7 +163,7 @@ def _placed_nodes(glb: Glb) -> dict[int, Array | None]:
         assert isinstance(index, int)  # noqa: S101 - for type checkers: glb.entry refuses anything else
         if index in placed:
             raise ValueError(f"its node {index} is below two others, or below itself")
-        own = _matrix(node)
+        own = node_matrix(node)
         placed[index] = own if parent is None else parent if own is None else parent @ own
         queue += [(child, placed[index]) for child in _list(node.get("children", []))]
     return placed
@@ -216,7 +216,7 @@ def _list(value: object) -> list[Any]:
     return value
 
 
-def _matrix(node: dict[str, Any]) -> Array | None:
+def node_matrix(node: dict[str, Any]) -> Array | None:
     """A node's transform (4, 4); None if it has none."""
     if not {"matrix", "translation", "rotation", "scale"} & node.keys():
         return None

@@ -81,7 +81,7 @@ def _joined(glb: Glb, parts: list[Placed]) -> Targets:
     columns: dict[str, int] = {}
     named = []
     for part in parts:
-        names = _names(glb, part)
+        names = _names(glb, part.mesh, part.primitive)
         named.append(names)
         for name in names:
             columns.setdefault(name, len(columns))
@@ -104,10 +104,16 @@ def _joined(glb: Glb, parts: list[Placed]) -> Targets:
     return Targets(tuple(columns), neutral, deltas, np.concatenate(faces))
 
 
-def _names(glb: Glb, part: Placed) -> list[str]:
-    """Names of a part's targets: its mesh's, or its own where an exporter wrote them there."""
-    count = len(glb.entries("targets", part.primitive))
-    holders: list[dict[str, Any]] = [glb.entry("meshes", part.mesh), part.primitive]
+def target_names(glb: Glb, mesh: int) -> list[str]:
+    """Names of a mesh's targets: its own, or those of its first primitive that has targets."""
+    primitives = glb.primitives(mesh)
+    return _names(glb, mesh, next((one for one in primitives if glb.entries("targets", one)), {}))
+
+
+def _names(glb: Glb, mesh: int, primitive: dict[str, Any]) -> list[str]:
+    """Names of a primitive's targets: its mesh's, or its own where an exporter wrote them there."""
+    count = len(glb.entries("targets", primitive))
+    holders: list[dict[str, Any]] = [glb.entry("meshes", mesh), primitive]
     for holder in holders if count else []:
         extras = holder.get("extras")
         names = extras.get("targetNames") if isinstance(extras, dict) else None

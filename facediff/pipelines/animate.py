@@ -64,6 +64,10 @@ def check_options(options: AnimationOptions) -> None:
         raise OptionError("style_template", "belongs to a motion; give {style} as well")
     if options.target_mesh is not None and not Path(options.target_mesh).is_file():
         raise OptionError("target_mesh", "no such file", options.target_mesh)
+    if options.own_shapes:
+        from facediff.export.glb_own_shapes import own_shapes
+
+        own_shapes(Path(str(options.target_mesh)))
 
 
 def expressivity_of(options: AnimationOptions) -> dict[str, float]:
@@ -236,8 +240,11 @@ class AnimationPipeline(ABC):
         if output.suffix == ".glb" and self.options.target_mesh is not None and export.output_unit is None:
             target = Path(self.options.target_mesh)
             into = target if wears_more(target) else None  # else its textures, skins and targets would be lost
+        own_shapes = self.options.own_shapes
+        if own_shapes and into is None:
+            raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
         with self.animations(speech, name, output, seed=seed) as animations:
-            return write_animations(output, animations, export, into=into), animations[0]
+            return write_animations(output, animations, export, into=into, own_shapes=own_shapes), animations[0]
 
     @contextmanager
     def animations(
@@ -387,7 +394,9 @@ class AnimationPipeline(ABC):
                 acted = act(self.acting, animation, self._acting_seed(seed))
             animation = self.face.apply(animation, seed=seed, acted=acted)
         animation = self.posed(animation, points)
-        if self.options.target_mesh is None:
+        from facediff.editing.blendshapes import has_arkit_weights
+
+        if self.options.target_mesh is None or (self.options.own_shapes and has_arkit_weights(animation)):
             return animation
         from facediff.editing.fit_check import FitReport, refuse_poor
         from facediff.editing.retargeting import carry, retarget

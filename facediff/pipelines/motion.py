@@ -80,6 +80,13 @@ def retarget(
     return transfer(animation, Path(mesh), *files)[0]
 
 
+def drive(animation: Animation, avatar: str | Path, path: str | Path) -> list[Path]:
+    """A copy of an avatar that plays the motion: :meth:`Animation.drive`."""
+    from facediff.export import write_animations
+
+    return write_animations(Path(path), [animation], into=Path(avatar), own_shapes=True)
+
+
 def blendshapes(animation: Animation, shapes: str | Path, *, carry: bool, only_arkit: bool, **options: Any) -> Weights:  # noqa: ANN401 - fields of SolveOptions
     """Weights of blendshapes: :meth:`Animation.blendshapes`."""
     from facediff.editing.blendshapes import SolveOptions

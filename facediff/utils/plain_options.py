@@ -99,9 +99,10 @@ def read_component(source: str, name: str, value: object, components: Components
 def unknown_class(source: object, role: str, named: object) -> FaceDiffError:
     """The error for a class that is neither registered nor imported."""
     shown = quoted(named).strip("'\"")
+    own = f", or add --model={shown} to `facediff test`, `validate` or `predict`" if role == "model" else ""
     return FaceDiffError(
         f'{source}: its {role} is "{shown}", which is not known; it was not loaded. If you trust the file, install or '
-        f"import the package that the {role} comes from"
+        f"import the package that the {role} comes from{own}"
     )
 
 

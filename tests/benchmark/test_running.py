@@ -87,6 +87,13 @@ def test_every_cell_is_trained_and_tested_once_with_its_seed(folder: Path) -> No
     assert result.measured["fit"]["memory"]
 
 
+def test_a_model_of_ones_own_is_named_to_the_test(folder: Path) -> None:
+    (folder / "plan.yaml").write_text(ONE_SEED)
+    left = pending(cells_of(read_plan(folder / "plan.yaml")), folder / "out", retry_failed=False)
+    list(run_cells(left, setting(folder, models={"one": "mine.Net"}), workers=1))
+    assert [call.get("model") for call in calls(folder) if call["command"] == "test"] == ["mine.Net", None]
+
+
 def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path) -> None:
     (folder / "plan.yaml").write_text(ONE_SEED)
     run(folder)

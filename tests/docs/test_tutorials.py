@@ -14,7 +14,9 @@ import pytest
 import torch
 
 from facediff.benchmark.plan import read_plan
+from facediff.cli.lightning import words_of_checkpoint
 from facediff.data import collate
+from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.audio_encoders import MelEncoder
 from tests.fakes.tiny import Tiny
@@ -66,3 +68,24 @@ def test_the_class_of_the_page_trains_and_generates(
 def test_the_plan_of_the_tutorial_is_valid() -> None:
     plan = read_plan(Path("plan.yaml"))
     assert [*plan.methods] == ["mine", "faceformer", "selftalk", "facediffuser"]
+
+
+@pytest.mark.usefixtures("workplace")
+def test_a_model_of_the_working_folder_is_scored_where_its_user_names_it(
+    tiny: Tiny, tmp_path: Path, make_trainer: Callable[..., pl.Trainer]
+) -> None:
+    trainer = make_trainer(max_steps=1, limit_val_batches=0)
+    trainer.fit(importlib.import_module("my_method").SpeechGRU.for_data(tiny, dim=16), datamodule=tiny)
+    checkpoint = tmp_path / "last.ckpt"
+    trainer.save_checkpoint(checkpoint)
+    del sys.modules["my_method"]
+    with pytest.raises(FaceDiffError, match="--model=my_method.SpeechGRU"):
+        words_of_checkpoint("test", checkpoint, [])
+    assert "my_method" not in sys.modules
+    with pytest.raises(FaceDiffError, match="--model.dim"):
+        words_of_checkpoint("test", checkpoint, ["--model=my_method.SpeechGRU", "--model.dim=8"])
+    for words in (["--model", "my_method.SpeechGRU"], ["--config", "mine.yaml"]):
+        sys.modules.pop("my_method", None)
+        option, config = words_of_checkpoint("test", checkpoint, words)
+        assert option == "--config"
+        assert "class_path: my_method.SpeechGRU" in config

@@ -1,0 +1,347 @@
+"""An animation played by an avatar's own shapes and bones: tracks added to a .glb from elsewhere; all else in it stays.
+
+Shapes are ARKit's, Oculus' visemes, or the vowels and blinks of VRM: by the names of targets, as exporters write them
+into ``mesh.extras.targetNames``, or as VRM's extensions (``VRM`` 0.x and ``VRMC_vrm`` 1.0) bind expressions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.animation import Animation
+from facediff.editing.blendshapes import SolveOptions, Weights, arkit_weights, has_arkit_weights, solve
+from facediff.editing.shapes import ShapeSet
+from facediff.errors import FaceDiffError
+from facediff.export.glb_writer import GlbWriter
+from facediff.mesh.glb import POSITIONS, Glb, open_glb, whole
+from facediff.mesh.glb_scene import node_matrix, placed_nodes, placed_parts
+from facediff.mesh.glb_shapes import target_names
+from facediff.spaces.arkit import ARKIT, arkit_name, plain
+from facediff.spaces.files.tables import gaze
+from facediff.spaces.rotations import convert, matrices
+from facediff.spaces.visemes import OCULUS, VRM
+from facediff.utils.limits import check_array
+
+Array = npt.NDArray[np.float64]
+Kind = Literal["ARKit", "Oculus", "VRM"]
+
+JAW = np.deg2rad(25.0)
+"""Turn of a jaw's bone at a weight of 1 of jawOpen, where no shape opens the mouth."""
+ENOUGH = {"Oculus": 8, "VRM": 3}
+"""So many visemes of a set must be there for the set to be the avatar's."""
+BONES = {
+    "head": r"head",
+    "neck": r"neck",
+    "left_eye": r"lefteye|eyeleft|leye|eyel|lfaceeye",
+    "right_eye": r"righteye|eyeright|reye|eyer|rfaceeye",
+    "jaw": r"jaw",
+}
+"""What bones are called, without case and punctuation, between a rig's prefix and ``joint``, ``jnt`` or ``bone``."""
+VOWELS = {"aa": "A", "ih": "I", "ou": "U", "ee": "E", "oh": "O", **{name.lower(): name for name in VRM}}
+RENAMED = {"i": "ih", "o": "oh", "u": "ou"}  # Ready Player Me's spelling of Oculus' vowels
+LIDS = {"": ("blink", "eyesclosed", "fcleyeclose"), "Left": ("blinkl", "blinkleft", "fcleyeclosel")}
+LIDS["Right"] = ("blinkr", "blinkright", "fcleyecloser")
+BLINK = "blink"  # Both lids, where an avatar has no shape for one
+
+
+@dataclass(frozen=True)
+class Bind:
+    """A target that a shape moves: of which mesh, its number, and its weight when the shape's is 1."""
+
+    mesh: int
+    target: int
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class OwnShapes:
+    """What of an avatar an animation can drive.
+
+    Attributes:
+        kind: whose names the shapes of the mouth have.
+        binds: targets by shape: ARKit's names, visemes, and ``blink`` for both lids.
+        bones: numbers of nodes by what they turn.
+        names: names of these nodes.
+    """
+
+    kind: Kind
+    binds: dict[str, list[Bind]]
+    bones: dict[str, int]
+    names: dict[str, str]
+
+    @property
+    def summary(self) -> str:
+        """What is driven, in a sentence."""
+        meshes = {bind.mesh for binds in self.binds.values() for bind in binds}
+        bones = ", ".join(self.names.values())
+        return (
+            f"{len(self.binds)} shapes of its own ({self.kind}) in {len(meshes)} meshes play it; bones for head, jaw "
+            f"and gaze: {bones or 'none'}"
+        )
+
+
+def own_shapes(target: Path) -> OwnShapes:
+    """The shapes and bones of an avatar by their names.
+
+    Args:
+        target: the .glb.
+
+    Raises:
+        FaceDiffError: if it is no readable .glb, or has no shapes for a mouth.
+    """
+    try:
+        return _own_shapes(open_glb(target))
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        raise _unreadable(target, error) from error
+
+
+def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
+    """Write a copy of an avatar whose own shapes and bones play an animation.
+
+    Weights go by name where the animation has ARKit's, or is of the built-in face, which has shapes under these names;
+    else the avatar's own shapes are solved for, for which the animation must be on the avatar's mesh. Visemes are
+    computed from ARKit's weights. A head's motion turns the bone of the head, or else of the neck; eyes turn by their
+    bones where no shape lets them look, a jaw where no shape opens the mouth.
+
+    Args:
+        path: the file to write.
+        target: the avatar, whose face looks along +z as glTF has it.
+        animation: of any face with ARKit's shapes, or on the avatar's mesh.
+
+    Raises:
+        FaceDiffError: as :func:`own_shapes`, or if the animation is on another mesh.
+    """
+    try:
+        glb = open_glb(target)
+        for kind in ("buffers", "bufferViews", "accessors"):
+            glb.entries(kind)  # refuses what is no list, to which the writer could not append
+        own = _own_shapes(glb)
+        weights = arkit_weights(animation) if has_arkit_weights(animation) else _solved(glb, own, animation)
+        writer = GlbWriter(glb.content, glb.binary)
+        _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        raise _unreadable(target, error) from error
+    writer.write(path)
+
+
+def _unreadable(target: Path, error: Exception) -> FaceDiffError:
+    return FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again")
+
+
+def _own_shapes(glb: Glb) -> OwnShapes:
+    targets: list[tuple[int, int, str]] = []
+    for mesh in range(len(glb.entries("meshes"))):
+        targets += [(mesh, index, name) for index, name in enumerate(target_names(glb, mesh))]
+    arkit: dict[str, list[Bind]] = defaultdict(list)
+    oculus: dict[str, list[Bind]] = defaultdict(list)
+    vrm: dict[str, list[Bind]] = defaultdict(list)
+    lids: dict[str, list[Bind]] = defaultdict(list)
+    for mesh, index, name in targets:
+        bind, short = Bind(mesh, index), re.split(r"[_.:| ]", name)[-1]
+        if (shape := arkit_name(name)) is not None:
+            arkit[shape].append(bind)
+        elif re.search(r"(?i)viseme|v_", name) or short in OCULUS:
+            viseme = next((n for n in OCULUS if n.lower() == RENAMED.get(short.lower(), short.lower())), None)
+            if viseme is not None:
+                oculus[viseme].append(bind)
+        elif short.lower() in VOWELS and (len(name) == len(short) or re.search(r"(?i)mth|mouth|vowel", name)):
+            vrm[VOWELS[short.lower()]].append(bind)
+        for side, spellings in LIDS.items():
+            if plain(name) in spellings:
+                lids[f"eyeBlink{side}" if side else BLINK].append(bind)
+    bound = _expressions(glb)
+    for name, bound_targets in bound.items():
+        (vrm if name in VRM else lids)[name] = bound_targets
+    bones = _bones(glb)
+    sets: dict[Kind, dict[str, list[Bind]]] = {"ARKit": arkit, "Oculus": oculus, "VRM": vrm}
+    has_mouth: dict[Kind, bool] = {
+        "ARKit": "jawOpen" in arkit or ("jaw" in bones and len(arkit) > len(ARKIT) // 3),
+        "Oculus": len(oculus) >= ENOUGH["Oculus"],
+        "VRM": len(vrm) >= ENOUGH["VRM"],
+    }
+    kind = next((one for one in sets if has_mouth[one]), None)
+    if kind is None:
+        raise FaceDiffError(
+            f"{glb.source}: has no shapes for a mouth under names of ARKit (jawOpen …), Oculus (viseme_aa …) or VRM "
+            f"(A, I, U, E, O); rename them, or omit --own-shapes"
+        )
+    # Lids and brows under ARKit's names belong to any avatar's face; its mouth is one set's.
+    upper = {name: binds for name, binds in arkit.items() if name.startswith(("eye", "brow"))}
+    binds = {**sets[kind], **upper}
+    sides = [name for name in ("eyeBlinkLeft", "eyeBlinkRight") if name not in binds]
+    if sides and all(name in lids for name in sides):
+        binds |= {name: lids[name] for name in sides}
+    elif sides and BLINK in lids:
+        binds[BLINK] = lids[BLINK]
+    looks = any(name.startswith("eyeLook") for name in binds)
+    unused = {"left_eye", "right_eye"} if looks else set()
+    unused |= {"jaw"} if kind != "ARKit" or "jawOpen" in binds else set()
+    unused |= {"neck"} if "head" in bones else set()
+    bones = {name: node for name, node in bones.items() if name not in unused}
+    return OwnShapes(kind, binds, bones, {name: str(glb.entry("nodes", node)["name"]) for name, node in bones.items()})
+
+
+def _expressions(glb: Glb) -> dict[str, list[Bind]]:
+    """Targets of VRM's vowels and blinks as the extension of either version binds them."""
+    extensions = glb.content.get("extensions", {})
+    lids = {"blink": BLINK, "blinkl": "eyeBlinkLeft", "blinkr": "eyeBlinkRight"}
+    lids |= {"blinkleft": "eyeBlinkLeft", "blinkright": "eyeBlinkRight"}
+    result: dict[str, list[Bind]] = {}
+    for group in extensions.get("VRM", {}).get("blendShapeMaster", {}).get("blendShapeGroups", []):
+        name = plain(str(group.get("presetName", "")))
+        if shape := VOWELS.get(name) or lids.get(name):
+            # Version 0.x counts weights from 0 to 100, and names meshes.
+            result[shape] = [Bind(b["mesh"], b["index"], float(b["weight"]) / 100) for b in group.get("binds", [])]
+    for preset, expression in extensions.get("VRMC_vrm", {}).get("expressions", {}).get("preset", {}).items():
+        if shape := VOWELS.get(plain(preset)) or lids.get(plain(preset)):
+            result[shape] = [
+                Bind(whole(glb.entry("nodes", b["node"]), "mesh"), b["index"], float(b["weight"]))
+                for b in expression.get("morphTargetBinds", [])
+            ]
+    return {name: binds for name, binds in result.items() if binds}
+
+
+def _bones(glb: Glb) -> dict[str, int]:
+    """Numbers of the scene's nodes by what they turn; joints of skins go first, and nodes that show a mesh never."""
+    joints = {joint for skin in glb.entries("skins") for joint in skin.get("joints", []) if type(joint) is int}
+    scene = placed_nodes(glb)
+    order = sorted(scene, key=lambda node: (node not in joints, node))
+    result: dict[str, int] = {}
+    for node in order:
+        entry = glb.entry("nodes", node)
+        name = plain(str(entry.get("name", "")))
+        for bone, pattern in BONES.items():
+            fits = re.fullmatch(rf".*(?<!fore)(?:{pattern})(?:joint|jnt|bone)?", name)
+            if fits and "mesh" not in entry and bone not in result:
+                result[bone] = node
+    return result
+
+
+def _solved(glb: Glb, own: OwnShapes, animation: Animation) -> Weights:
+    """Weights of the avatar's own shapes that come nearest to an animation of its mesh."""
+    parts = list(placed_parts(glb))
+    total = sum(len(part.local) for part in parts)
+    if total != len(animation.template):
+        raise FaceDiffError(
+            f"{glb.source}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
+            f"animation was carried to"
+        )
+    check_array(glb.source, (2, len(own.binds), total, 3), 8)
+    deltas, first = np.zeros((len(own.binds), total, 3)), 0
+    for part in parts:
+        targets = glb.entries("targets", part.primitive)
+        for k, binds in enumerate(own.binds.values()):
+            for bind in binds:
+                if bind.mesh == part.mesh and "POSITION" in (target := targets[bind.target] if targets else {}):
+                    moves = glb.numbers(target["POSITION"], "VEC3", POSITIONS, len(part.local)).astype(np.float64)
+                    deltas[k, first : first + len(part.local)] += bind.share * part.turned(moves)
+        first += len(part.local)
+    shapes = ShapeSet(tuple(own.binds), np.asarray(animation.template, np.float64), deltas)
+    return solve(animation, shapes, SolveOptions(residual_limit=1.0))
+
+
+def _for_avatar(own: OwnShapes, weights: Weights) -> dict[str, Array]:
+    """Weights (T,) of the avatar's shapes, by their names."""
+    tracks = dict(zip(weights.names, weights.values.T, strict=True))
+    if own.kind != "ARKit" and not any(name in tracks for name in own.binds if name in (*OCULUS, *VRM)):
+        visemes = weights.tracks("oculus" if own.kind == "Oculus" else "vrm")
+        tracks |= dict(zip(visemes.names, visemes.values.T, strict=True))
+    lids = [tracks[name] for name in ("eyeBlinkLeft", "eyeBlinkRight") if name in tracks]
+    if BLINK not in tracks and lids:
+        tracks[BLINK] = np.mean(lids, axis=0)
+    return {name: np.clip(tracks[name], 0.0, 1.0) for name in own.binds if name in tracks}
+
+
+def _animate(
+    glb: Glb, writer: GlbWriter, own: OwnShapes, tracks: dict[str, Array], weights: Weights, name: str
+) -> None:
+    frames = len(weights.values)
+    times = writer.add((np.arange(frames) / weights.frame_rate).astype(np.float32), bounds=True)
+    motion: dict[str, Any] = {"name": name, "samplers": [], "channels": []}
+    samplers: dict[bytes, int] = {}  # Head, teeth and lashes often have the same targets
+
+    def add(node: int, path: str, values: npt.NDArray[np.float32]) -> None:
+        key = path.encode() + values.tobytes()
+        if key not in samplers:
+            output = writer.add(values.ravel() if path == "weights" else values)
+            motion["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
+            samplers[key] = len(motion["samplers"]) - 1
+        motion["channels"].append({"sampler": samplers[key], "target": {"node": node, "path": path}})
+
+    by_mesh: dict[int, list[tuple[str, Bind]]] = defaultdict(list)
+    for shape in tracks:
+        for bind in own.binds[shape]:
+            by_mesh[bind.mesh].append((shape, bind))
+    for node, entry in enumerate(glb.entries("nodes")):
+        if entry.get("mesh") not in by_mesh:
+            continue
+        binds, mesh = by_mesh[entry["mesh"]], glb.entry("meshes", entry["mesh"])
+        count = max(len(glb.entries("targets", primitive)) for primitive in glb.primitives(entry["mesh"]))
+        rest = np.array(entry.get("weights", mesh.get("weights", [0.0] * count)), np.float64)
+        rows = np.tile(rest, (frames, 1))
+        rows[:, [bind.target for _, bind in binds]] = 0.0
+        for shape, bind in binds:
+            rows[:, bind.target] += bind.share * tracks[shape]
+        add(node, "weights", np.clip(rows, 0.0, 1.0).astype(np.float32))
+    for node, turns in _turns(own, weights):
+        add(node, "rotation", _local(glb, node, turns))
+    if motion["channels"]:
+        glb.content["animations"] = [*glb.entries("animations"), motion]
+
+
+def _turns(own: OwnShapes, weights: Weights) -> list[tuple[int, Array]]:
+    """Nodes and the quaternions (T, 4) by which they turn about the scene's axes."""
+    none = np.zeros(len(weights.values))
+    result = []
+    for bone in ("head", "neck"):
+        if bone in own.bones and weights.head is not None:
+            result.append((own.bones[bone], convert(weights.head, "axis_angle", "quaternion")))
+    eyes = weights.eyes
+    if eyes is None and any(name.startswith("eyeLook") for name in weights.names):
+        eyes = gaze(weights.names, weights.values)
+    for k, bone in enumerate(("left_eye", "right_eye")):
+        if bone in own.bones and eyes is not None:
+            result.append((own.bones[bone], convert(eyes[:, 3 * k : 3 * k + 3], "euler", "quaternion")))
+    if "jaw" in own.bones and "jawOpen" in weights.names:
+        opening = JAW * weights.values[:, weights.names.index("jawOpen")]
+        result.append((own.bones["jaw"], convert(np.stack([opening, none, none], 1), "axis_angle", "quaternion")))
+    return result
+
+
+def _local(glb: Glb, node: int, turns: Array) -> npt.NDArray[np.float32]:
+    """Rotations (T, 4) x, y, z, w of a node which turn it by some (T, 4) w, x, y, z about the scene's axes."""
+    nodes, placed = glb.entries("nodes"), placed_nodes(glb)
+    parent = next((index for index, entry in enumerate(nodes) if node in entry.get("children", [])), None)
+    above = None if parent is None else placed[parent]
+    own = node_matrix(nodes[node])
+    frame, rest = (np.eye(3) if matrix is None else _rotation(matrix[:3, :3]) for matrix in (above, own))
+    if "matrix" in nodes[node]:  # which a node must not have where its rotation is animated
+        assert own is not None  # noqa: S101 - for type checkers
+        del nodes[node]["matrix"]
+        scale = np.linalg.norm(own[:3, :3], axis=0)
+        nodes[node] |= {"translation": own[:3, 3].tolist(), "scale": scale.tolist(), "rotation": _quaternion(rest)}
+    local = frame.T @ matrices(turns) @ frame @ rest
+    quaternions = convert(np.concatenate([local[..., 0], local[..., 1]], axis=-1), "six_d", "quaternion")
+    # One rotation has two quaternions: the one nearer to the frame before it keeps players on the short way.
+    signs = np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0, -1.0, 1.0)
+    quaternions[1:] *= np.cumprod(signs)[:, None]
+    return np.roll(quaternions, -1, axis=1).astype(np.float32)
+
+
+def _rotation(matrix: Array) -> Array:
+    """The rotation (3, 3) nearest to a matrix, without its scale."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right)
+
+
+def _quaternion(rotation: Array) -> list[float]:
+    """X, y, z, w of a matrix."""
+    six = np.concatenate([rotation[:, 0], rotation[:, 1]])
+    return [float(value) for value in np.roll(convert(six[None], "six_d", "quaternion")[0], -1)]
