@@ -240,6 +240,7 @@ def pack(
     exact: Literal["test", "none"] = "test",
     unit: Annotated[str | None, Option(metavar="U")] = None,
     chunk_seconds: Annotated[ranges.ChunkLength, Option(metavar="S")] = 0.5,
+    codec: Literal["zstd", "lz4"] = "zstd",
     work: WorkOptions = USUAL_WORK,
 ) -> None:
     """Pack a corpus into one Zarr store, about a sixth of its size, that can also be read from an address.
@@ -257,6 +258,7 @@ def pack(
         unit: the corpus's unit of length, m, cm, mm or a number of metres (default: that of its manifest.json, or the
             corpus's own)
         chunk_seconds: motion is read in pieces of this length
+        codec: how motion is compressed; lz4 is read faster and takes an eighth more room
         work: where the work is done
     """
     require_folder(root, "a corpus folder")
@@ -274,6 +276,7 @@ def pack(
             exact=exact,
             unit=unit,
             chunk_seconds=chunk_seconds,
+            codec=codec,
             **vars(work),
         )
     left_out = [f"note: left out, since it belongs to no clip: {name}" for name in report.left_out]

@@ -3,12 +3,16 @@
 Run ``python tools/benchmarks/packed.py``: makes a corpus of BIWI's size (23 370 vertices, 25 frames a second) and packs
 it. Its motion is that of the built-in corpus, each vertex a blend of two of its vertices, plus independent Gaussian
 noise at every coordinate of every frame, as capture has it; ``--noise`` gives its deviations in millimetres, since the
-size depends on them. Then random windows of 100 frames with their speech are read from both, turn by turn, in one
-process:
+size depends on them. Then batches of random windows of 100 frames with their speech are read turn by turn, in one
+process, from plain files, from packed ones by codec, and from these over HTTP:
 
-- ``in memory``: all files lie in the page cache, as for a corpus that is smaller than the machine's memory.
-- ``from disk``: every file's pages were given up before each window.
-- ``over HTTP``: from a server of this machine that answers ranges, with nothing kept on disk.
+- ``first``: all files lie in the page cache; no decoded chunk is kept, as in the first epoch, or for a corpus that is
+  larger than the cache of chunks.
+- ``again``: the same with the cache of chunks, filled before.
+- ``disk``: every file's pages were given up before each batch.
+
+Over HTTP, from a server of this machine that answers ranges, nothing is kept on disk, and each batch is announced when
+it begins, as a loader does; ``without read-ahead`` it is not.
 """
 
 from __future__ import annotations
@@ -26,13 +30,13 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 VERTICES = 23_370
 RATE = 25
 WINDOW = 100
+BATCH = 8
 
 
 def write_corpus(root: Path, source: Path, clips: int, noise: float) -> None:
@@ -93,10 +97,10 @@ class Ranges(http.server.SimpleHTTPRequestHandler):
 
 
 def serve(folder: str) -> tuple[subprocess.Popen[str], str]:
-    """A server of a folder in a process of its own, and the address of the packed corpus in it."""
+    """A server of a folder in a process of its own, and its address."""
     server = subprocess.Popen([sys.executable, __file__, "--serve", folder], stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
-    return server, f"http://127.0.0.1:{int(server.stdout.readline())}/corpus.zarr"
+    return server, f"http://127.0.0.1:{int(server.stdout.readline())}"
 
 
 def serve_forever(folder: str) -> None:
@@ -115,24 +119,55 @@ def forget(root: Path) -> None:
             os.close(descriptor)
 
 
-def clips_a_second(
-    readers: dict[str, Callable[[int, int], object]], rounds: int, before: Callable[[], None]
-) -> dict[str, float]:
-    """The median speed of each reader over the same random windows, read turn by turn; processor time is printed."""
+Window = tuple[int, int]
+Reader = Callable[[list[Window]], object]
+
+
+def reader(root: str, *, memory: float, announces: bool = True) -> Reader:
+    """Reads a batch of windows, clip and first frame, of a corpus whose cache of chunks has so many gigabytes."""
+    from facediff.data import Biwi
+    from facediff.data.packed.decoded import VARIABLE
+
+    os.environ[VARIABLE] = str(memory)
+    corpus = Biwi(root=root).corpus
+    clips = list(corpus.clips.values())
+
+    def read(windows: list[Window]) -> None:
+        stretches = [(clips[clip % len(clips)], start, start + WINDOW) for clip, start in windows]
+        if announces:
+            corpus.expect([(*stretch, True) for stretch in stretches])
+        for clip, start, stop in stretches:
+            corpus.read_audio(clip, start, stop)
+            corpus.read_motion(clip, start, stop)
+
+    for _ in range(3 if memory else 1):
+        read([(number, start) for number in range(len(clips)) for start in (0, 60)])
+    return read
+
+
+def compare(title: str, readers: dict[str, Reader], batches: int, before: Callable[[], None] = lambda: None) -> None:
+    """Print the speed of each reader over the same random batches, read turn by turn, and its ratio to the first."""
     rng = np.random.default_rng(1)
     taken: dict[str, list[float]] = {name: [] for name in readers}
     worked: dict[str, list[float]] = {name: [] for name in readers}
-    for _ in range(rounds):
-        clip, start = int(rng.integers(10**6)), int(rng.integers(61))
+    for _ in range(batches):
+        windows = [(int(rng.integers(10**6)), int(rng.integers(61))) for _ in range(BATCH)]
         for name, read in readers.items():
             before()
             began, used = time.perf_counter(), time.process_time()
-            read(clip, start)
-            taken[name].append(time.perf_counter() - began)
-            worked[name].append(time.process_time() - used)
-    shown = ", ".join(f"{name} {1000 * statistics.median(seconds):.1f} ms" for name, seconds in worked.items())
-    print(f"processor time of a window: {shown}")
-    return {name: 1 / statistics.median(seconds) for name, seconds in taken.items()}
+            read(windows)
+            taken[name].append((time.perf_counter() - began) / BATCH)
+            worked[name].append((time.process_time() - used) / BATCH)
+    names = list(readers)
+    for name in names:
+        # Of each turn the ratio, and of these the median: what else runs on the machine slows both sides of a turn.
+        ratio = statistics.median(np.divide(taken[names[0]], taken[name]))
+        work = statistics.median(np.divide(worked[names[0]], worked[name]))
+        print(
+            f"{title:6} {name:30} {1000 * statistics.median(taken[name]):6.1f} ms a window, processor "
+            f"{1000 * statistics.median(worked[name]):6.1f} ms; {names[0]} : this {ratio:.2f}, processor {work:.2f}",
+            flush=True,
+        )
 
 
 def main() -> int:
@@ -142,12 +177,12 @@ def main() -> int:
     parser.add_argument("--clips", type=int, default=16)
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 0.01, 0.02, 0.05], help="mm; the last is read")
     parser.add_argument("--chunk-seconds", type=float, default=0.5)
-    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--batches", type=int, default=15)
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.serve:
         serve_forever(asked.serve)
-    from facediff.data import Biwi
+    from facediff.data.packed.layout import CODECS
     from facediff.data.packed.packing import pack
     from facediff.data.puppet import made_root
 
@@ -159,20 +194,21 @@ def main() -> int:
         folder = Path(name)
         for noise in asked.noise:
             shutil.rmtree(folder / "corpus", ignore_errors=True)
-            shutil.rmtree(folder / "corpus.zarr", ignore_errors=True)
             write_corpus(folder / "corpus", source, asked.clips, noise)
-            for lossless in (True, False):
-                shutil.rmtree(folder / "corpus.zarr", ignore_errors=True)
+            for lossless, codec in ((True, "zstd"), (True, "lz4"), (False, "zstd"), (False, "lz4")):
+                out = folder / f"{codec}.zarr"
+                shutil.rmtree(out, ignore_errors=True)
                 began = time.perf_counter()
                 report = pack(
                     folder / "corpus",
-                    folder / "corpus.zarr",
+                    out,
                     lossless=lossless,
                     chunk_seconds=asked.chunk_seconds,
+                    codec=codec,
                     workers=1,
                 )
                 hour = report.before / 1e9 / (report.seconds / 3600)
-                kept = "lossless" if lossless else "0.01 mm "
+                kept = ("lossless" if lossless else "0.01 mm") + f", {codec}"
                 print(
                     f"noise {noise:5.3f} mm, {kept}: {report.gb_an_hour:5.2f} GB an hour of {hour:.1f}; packed at "
                     f"{report.seconds / (time.perf_counter() - began):.1f} times the speed of the recording",
@@ -180,32 +216,18 @@ def main() -> int:
                 )
         server, address = serve(name)
 
-        def reader(root: str) -> Callable[[int, int], Any]:
-            corpus = Biwi(root=root).corpus
-            clips = list(corpus.clips.values())
-
-            def read(clip: int, start: int) -> None:
-                which = clips[clip % len(clips)]
-                corpus.read_motion(which, start, start + WINDOW)
-                corpus.read_audio(which, start, start + WINDOW)
-
-            for number in range(len(clips)):
-                read(number, 0)
-            return read
-
-        readers = {"npy": reader(str(folder / "corpus")), "packed": reader(str(folder / "corpus.zarr"))}
-        far = {"npy": readers["npy"], "packed": reader(address)}
-        for title, chosen, before in (
-            ("in memory", readers, lambda: None),
-            ("over HTTP", far, lambda: None),
-            ("from disk", readers, lambda: forget(folder)),
-        ):
-            found = clips_a_second(chosen, asked.rounds, before)
-            print(
-                f"{title}: npy {found['npy']:.1f} clips/s, packed {found['packed']:.1f}, ratio "
-                f"{found['packed'] / found['npy']:.2f}",
-                flush=True,
-            )
+        plain = reader(str(folder / "corpus"), memory=0)
+        near = {codec: str(folder / f"{codec}.zarr") for codec in CODECS}
+        first = {"plain files": plain, **{codec: reader(near[codec], memory=0) for codec in CODECS}}
+        for codec in CODECS:
+            far = f"{address}/{codec}.zarr"
+            first[f"{codec}, HTTP"] = reader(far, memory=0)
+            first[f"{codec}, HTTP, without read-ahead"] = reader(far, memory=0, announces=False)
+        compare("first", first, asked.batches)
+        again = {codec: reader(near[codec], memory=0.5) for codec in CODECS}
+        compare("again", {"plain files": plain, **again}, asked.batches)
+        there = {name: read for name, read in first.items() if "HTTP" not in name}
+        compare("disk", there, asked.batches, lambda: forget(folder))
         server.terminate()
     return 0
 

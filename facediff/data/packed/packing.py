@@ -21,6 +21,7 @@ from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import (
     BLOB_CHUNK,
     BLOB_SHARD,
+    CODECS,
     CODINGS,
     EXACT,
     METADATA,
@@ -57,6 +58,8 @@ from facediff.utils.units import metres_per_unit
 if TYPE_CHECKING:
     from facediff.data.check.layouts import CorpusView
 
+Codec = Literal["zstd", "lz4"]
+"""How motion is compressed; see :data:`~facediff.data.packed.layout.CODECS`."""
 Exact = Literal["test", "none"]
 """Clips that are stored without loss: those that scores are computed from, or none."""
 
@@ -151,6 +154,7 @@ def pack(
     exact: Exact = "test",
     unit: str | None = None,
     chunk_seconds: float = 0.5,
+    codec: Codec = "zstd",
     workers: int | None = None,
     scheduler: str | None = "",
     quiet: bool = True,
@@ -170,6 +174,7 @@ def pack(
             of each, so that scores do not change; or ``none``.
         unit: the corpus's unit of length; that of its manifest or its data module if None.
         chunk_seconds: length of the pieces in which motion is read.
+        codec: of the motion: ``zstd``, or ``lz4``, which is larger and read faster.
         workers: processes; as many as there are processors if None.
         scheduler: where tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
         quiet: no progress bar.
@@ -190,7 +195,9 @@ def pack(
     require_zarr("packing a corpus")
     if exact not in get_args(Exact):
         raise FaceDiffError(f"--exact {exact}: unknown; expected one of {', '.join(get_args(Exact))}")
-    plan = PackingPlan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact)
+    if codec not in CODECS:
+        raise FaceDiffError(f"--codec {codec}: unknown; expected one of {', '.join(CODECS)}")
+    plan = PackingPlan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact, codec)
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data pack"):
         return _carry_out(plan, out, workers, scheduler, quiet)
@@ -226,7 +233,14 @@ class PackingPlan:
 
     @classmethod
     def of(
-        cls, root: Path, corpus: str | None, tolerance: float, unit: str | None, chunk_seconds: float, exact: Exact
+        cls,
+        root: Path,
+        corpus: str | None,
+        tolerance: float,
+        unit: str | None,
+        chunk_seconds: float,
+        exact: Exact,
+        codec: Codec,
     ) -> PackingPlan:
         """Scan a corpus folder."""
         from facediff.data.check.layouts import view_of
@@ -303,6 +317,7 @@ class PackingPlan:
             identities=tuple(sorted(templates)),
             clips=clips,
             arrays=arrays,
+            codec=codec,
         )
         return cls(root, record, _other_files(root), tuple(left_out), seen.hexdigest(), size)
 
@@ -312,7 +327,7 @@ class PackingPlan:
         record = self.record
         return {
             **{name: getattr(record, name) for name in ("made_by", "corpus", "n_vertices", "frame_rate")},
-            **{name: getattr(record, name) for name in ("tolerance", "unit", "chunk_seconds")},
+            **{name: getattr(record, name) for name in ("tolerance", "unit", "chunk_seconds", "codec")},
             "clips": {name: [clip.coding, clip.frames] for name, clip in record.clips.items()},
         }
 
@@ -411,15 +426,15 @@ def _finished(plan: PackingPlan, out: Path) -> PackingReport:
     if replace(plan, record=record).recipe != plan.recipe:
         raise FaceDiffError(f"{out}: holds a corpus that was packed otherwise; choose a new folder, or remove this one")
     for name, facts in record.arrays.items():
-        _check_written(out / name, facts)
+        _check_written(out / name, facts, record)
     _clear(out)
     return _report(plan, record, out, 0)
 
 
-def _check_written(folder: Path, facts: ArrayFacts) -> None:
+def _check_written(folder: Path, facts: ArrayFacts, record: Record) -> None:
     """Refuse an array with files of other sizes than were written; `data check` reads every byte."""
     sizes = {folder / shard_key(number, facts.width): size for number, size in enumerate(facts.shards)}
-    sizes[folder / METADATA] = len(encoded(facts, None))
+    sizes[folder / METADATA] = len(encoded(facts, None, _codec_of(folder.name, record)))
     for path, size in sizes.items():
         actual = path.stat().st_size if path.is_file() else 0
         if actual != size:
@@ -459,7 +474,7 @@ def _finish(plan: PackingPlan, out: Path) -> Record:
     arrays["files"] = write_blob(out, "files", read, ((plan.root / path).read_bytes() for path in plan.files))
     for name, facts in arrays.items():
         with atomic(out / name / METADATA) as temporary:
-            temporary.write_bytes(encoded(facts, None))
+            temporary.write_bytes(encoded(facts, None, _codec_of(name, plan.record)))
         count = -(-facts.rows // (facts.chunk * facts.chunks))
         sizes = tuple((out / name / shard_key(shard, facts.width)).stat().st_size for shard in range(count))
         arrays[name] = replace(facts, shards=sizes)
@@ -504,7 +519,7 @@ def _write(out: Path, root: Path, record: Record, task: PackingTask) -> None:
             # Differences between frames are small and compress well; each chunk starts with a whole row, so that it can
             # be decoded alone.
             chunk[1:] = chunk[1:] - chunk[:-1]
-        content = encoded(facts, rows)
+        content = encoded(facts, rows, record.codec)
     with atomic(out / task.target) as temporary:
         temporary.write_bytes(content)
 
@@ -603,7 +618,11 @@ def write_blob(out: Path, name: str, size: int, contents: Iterable[bytes]) -> Ar
     return facts
 
 
-def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
+def _codec_of(array: str, record: Record) -> str:
+    return record.codec if array.startswith("motion_") else "zstd"
+
+
+def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None, codec: str = "zstd") -> bytes:
     """A shard as Zarr writes it, with zeros after ``rows``; the array's ``zarr.json`` if ``rows`` is None."""
     import zarr
     from zarr.codecs import BloscCodec, Crc32cCodec
@@ -613,6 +632,7 @@ def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
     width = (facts.width,) if facts.width else ()
     files: dict[str, Any] = {}
     itemsize = np.dtype(facts.dtype).itemsize
+    compressor, level = CODECS[codec]
     array: Any = zarr.create_array(
         store=MemoryStore(files),
         shape=(facts.rows if rows is None else shard_rows, *width),
@@ -625,8 +645,8 @@ def encoded(facts: ArrayFacts, rows: npt.NDArray[Any] | None) -> bytes:
             # takes. Smaller blocks take more room; level 5 takes 5 % less room than level 1 and decodes as quickly.
             BloscCodec(
                 typesize=itemsize,
-                cname="zstd",
-                clevel=5,
+                cname=compressor,
+                clevel=level,
                 shuffle="bitshuffle",
                 blocksize=min(facts.chunk_bytes, BLOCK),
             ),

@@ -6,7 +6,7 @@ import hashlib
 import io
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.packed.decoded import USUAL_GB, VARIABLE, DecodedChunks
 from facediff.data.packed.layout import (
     DAMAGED,
     EXACT,
@@ -23,12 +24,14 @@ from facediff.data.packed.layout import (
     REMEDY,
     STATE,
     PackedClip,
+    PackedSound,
     Record,
     read_record,
 )
+from facediff.data.packed.read_ahead import Answer, ReadAhead
 from facediff.data.packed.shards import ShardedArray, chunks_of
-from facediff.data.packed.stores import ByteStore, LocalStore, address_of, open_store
-from facediff.data.storage import refuse_out_of_range, within
+from facediff.data.packed.stores import ByteStore, LocalStore, address_of, limit_bytes, open_store
+from facediff.data.storage import Stretch, refuse_out_of_range, within
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
 from facediff.utils import SAMPLE_RATE
@@ -65,12 +68,20 @@ class PackedCorpus:
         # The record holds the size and place of everything, so its hash identifies the content for caches.
         self.identity = hashlib.sha256(text).hexdigest()[:40]
         self.store: ByteStore = open_store(source, self.identity)
-        self._arrays = {name: ShardedArray(self.store, name, facts) for name, facts in self.record.arrays.items()}
+        self._ahead, self._decoded_chunks = ReadAhead(), DecodedChunks(limit_bytes(VARIABLE, USUAL_GB))
+        self._arrays = {
+            name: ShardedArray(self.store, name, facts, self._ahead) for name, facts in self.record.arrays.items()
+        }
 
     @property
     def places(self) -> list[Path]:
         """Folders that workers on other machines must see: its own, or none for an address."""
-        return [] if address_of(self.source) else [Path(self.source)]
+        return [] if self.is_remote else [Path(self.source)]
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether it lies at an address."""
+        return address_of(self.source) is not None
 
     # Its small files.
 
@@ -113,7 +124,25 @@ class PackedCorpus:
     def open(self, name: str) -> PackedMotion:
         """The motion of a clip; nothing is read yet."""
         clip = self.record.clips[name]
-        return PackedMotion(self.source, self.record, clip, self._arrays[f"motion_{clip.coding}"])
+        return PackedMotion(self.source, self.record, clip, self._arrays[f"motion_{clip.coding}"], self._decoded_chunks)
+
+    def expect(self, stretches: Sequence[Stretch]) -> None:
+        """Ask an address for the chunks of these stretches now, in their order; a disk is as quick when they are read.
+
+        Args:
+            stretches: what will be read next.
+        """
+        if not self.is_remote:
+            return
+        requests: dict[Hashable, Callable[[], Answer]] = {}
+        for stretch in stretches:
+            sound = self.record.clips[stretch.name].sound
+            if _is_read_in_parts(sound):
+                for _, first, stop in _pieces(sound, stretch.first_sample, min(stretch.stop_sample, sound.samples)):
+                    chunks = self._arrays["speech"].chunks_of_rows(first, stop)
+                    requests |= self._arrays["speech"].later(chunks.start, chunks.stop)
+            requests |= self.open(stretch.name).later(stretch.picks)
+        self._ahead.expect(requests)
 
     def version(self, name: str) -> object:
         """The hash of the whole record, which holds the size of every shard: the same for all clips."""
@@ -126,7 +155,7 @@ class PackedCorpus:
         once and cached in ``store``, like the speech of a folder.
         """
         sound = self.record.clips[name].sound
-        if sound.form == "flac" and sound.rate == SAMPLE_RATE and sound.channels == 1:
+        if _is_read_in_parts(sound):
             stop = min(first + length, sound.samples)
             samples = self.samples(name, first, stop) if stop > first else np.zeros((0, 1), np.int32)
             scale = np.float32(2.0 ** (1 - sound.bits))
@@ -152,11 +181,10 @@ class PackedCorpus:
         """Samples ``first`` to ``stop`` of a clip (samples, channels) as they were recorded, whole numbers."""
         sound = self.record.clips[name].sound
         piece_samples = PIECE_SECONDS * sound.rate
-        places = np.cumsum([sound.first, *sound.pieces])
         # libsndfile left-aligns FLAC samples in 32 bits; the shift at the end gives the recorded values back.
         samples = np.empty((stop - first, sound.channels), np.int32)
-        for number in range(first // piece_samples, -(-stop // piece_samples)):
-            encoded = self._arrays["speech"].read(int(places[number]), int(places[number + 1])).tobytes()
+        for number, begin, end in _pieces(sound, first, stop):
+            encoded = self._arrays["speech"].read(begin, end).tobytes()
             expected = min(piece_samples, sound.samples - number * piece_samples)
             low, high = max(first, number * piece_samples), min(stop, number * piece_samples + expected)
             samples[low - first : high - first] = self._decoded(
@@ -195,9 +223,13 @@ class PackedMotion:
         record: of the corpus.
         clip: the clip.
         array: that holds its rows.
+        decoded: cache of chunks.
     """
 
-    def __init__(self, source: str, record: Record, clip: PackedClip, array: ShardedArray) -> None:
+    def __init__(
+        self, source: str, record: Record, clip: PackedClip, array: ShardedArray, decoded: DecodedChunks
+    ) -> None:
+        self.decoded = decoded
         self.source = source
         self.record = record
         self.clip = clip
@@ -213,23 +245,33 @@ class PackedMotion:
         picks = within(picks, self.frames)
         motion = np.empty((len(picks), self.array.facts.width), np.float32)
         rows_by_chunk = chunks_of(picks, self.array.facts.chunk)
-        begin = self.clip.first // self.array.facts.chunk
-        tasks: list[tuple[int, memoryview]] = []
+        tasks: list[tuple[int, npt.NDArray[Any] | memoryview]] = []
+        missing = []
+        for number in sorted(rows_by_chunk):
+            chunk = self.decoded.get((self.array.name, self._begin + number))
+            if chunk is None:
+                missing.append(number)
+            else:
+                tasks.append((number, chunk))
         # Neighbouring chunks are fetched together: in a store at an address each request costs a round trip.
         try:
-            for run in _consecutive(sorted(rows_by_chunk)):
-                fetched = self.array.fetch(begin + run[0], begin + run[-1] + 1)
+            for run in _consecutive(missing):
+                fetched = self.array.fetch(self._begin + run[0], self._begin + run[-1] + 1)
                 tasks += zip(run, fetched, strict=True)
 
-            def decode(task: tuple[int, memoryview]) -> None:
-                self._decode(begin + task[0], task[1], rows_by_chunk[task[0]], motion)
+            def write(task: tuple[int, npt.NDArray[Any] | memoryview]) -> None:
+                number, chunk = task
+                rows = rows_by_chunk[number]
+                if isinstance(chunk, memoryview):
+                    chunk = self._summed(self._begin + number, chunk, max(row for row, _ in rows))
+                self._write(chunk, rows, motion)
 
             threads = min(len(tasks), _threads())
             if threads > 1:
-                list(_pool().map(decode, tasks))
+                list(_pool().map(write, tasks))
             else:
                 for task in tasks:
-                    decode(task)
+                    write(task)
         except FaceDiffError as error:
             raise FaceDiffError(f"clip {self.clip.name}: {error}") from error
         offsets = motion.reshape(len(picks), -1, 3)
@@ -238,29 +280,45 @@ class PackedMotion:
             offsets -= template
         return offsets
 
-    def _decode(self, number: int, encoded: memoryview, row_places: list[tuple[int, int]], motion: Floats) -> None:
-        """Decode a chunk, and write the requested rows to their places in ``motion``."""
+    def later(self, picks: Sequence[int]) -> dict[Hashable, Callable[[], Answer]]:
+        """Requests for the chunks that hold some frames, as :meth:`offsets` makes them."""
+        numbers = sorted(chunks_of(within(picks, self.frames), self.array.facts.chunk))
+        missing = [n for n in numbers if self.decoded.get((self.array.name, self._begin + n)) is None]
+        requests: dict[Hashable, Callable[[], Answer]] = {}
+        for run in _consecutive(missing):
+            requests |= self.array.later(self._begin + run[0], self._begin + run[-1] + 1)
+        return requests
+
+    @property
+    def _begin(self) -> int:
+        """Its first chunk in the array."""
+        return self.clip.first // self.array.facts.chunk
+
+    def _summed(self, number: int, encoded: memoryview, last: int) -> npt.NDArray[Any]:
+        """The rows of a chunk up to ``last`` at least, in memory that the thread's next call overwrites."""
         chunk = self.array.decode(number, encoded)
+        key = (self.array.name, number)
+        stores = self.decoded.stores(key, chunk.nbytes, _processes())
+        # Rows are stored as differences from the row before, in whole numbers that wrap around, so the running sum is
+        # exact. A window needs few rows of its last chunk.
+        for row in range(1, len(chunk) if stores else last + 1):
+            np.add(chunk[row], chunk[row - 1], out=chunk[row])
+        if stores:
+            self.decoded.put(key, chunk, _processes())
+        return chunk
+
+    def _write(self, chunk: npt.NDArray[Any], row_places: list[tuple[int, int]], motion: Floats) -> None:
+        """Write rows of a chunk to their places in ``motion``."""
         exact = np.dtype(self.clip.coding) if self.clip.coding in EXACT else None
         step = np.float32(self.record.step)
-        places: dict[int, list[int]] = {}
         for row, place in row_places:
-            places.setdefault(row, []).append(place)
-        # Rows are stored as differences from the row before, in whole numbers that wrap around, so the running sum is
-        # exact. It is taken row by row up to the last requested one: a window needs few rows of a chunk, and a
-        # cumulative sum over the whole chunk would write each of them to memory.
-        row = chunk[0]
-        for inner in range(max(places) + 1):
-            if inner:
-                row += chunk[inner]
-            for place in places.get(inner, ()):
-                if exact is None:
-                    # Convert, then scale in place: a fifth faster than `row * step`, which allocates an array.
-                    np.copyto(motion[place], row)
-                    motion[place] *= step
-                else:
-                    with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
-                        np.copyto(motion[place], row.view(exact), casting="same_kind")
+            if exact is None:
+                # Convert, then scale in place: a fifth faster than `row * step`, which allocates an array.
+                np.copyto(motion[place], chunk[row])
+                motion[place] *= step
+            else:
+                with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+                    np.copyto(motion[place], chunk[row].view(exact), casting="same_kind")
 
     def vertices(self) -> npt.NDArray[np.floating]:
         """All frames as they were, bit for bit (T, V, 3), of a clip that was packed without loss."""
@@ -287,12 +345,29 @@ def _consecutive(numbers: Sequence[int]) -> list[list[int]]:
     return groups
 
 
+def _is_read_in_parts(sound: PackedSound) -> bool:
+    """Whether samples are used as they are stored; other speech is converted as a whole."""
+    return sound.form == "flac" and sound.rate == SAMPLE_RATE and sound.channels == 1
+
+
+def _pieces(sound: PackedSound, first: int, stop: int) -> list[tuple[int, int, int]]:
+    """Number, first byte and last byte + 1 of the streams that hold samples ``first`` to ``stop``."""
+    length = PIECE_SECONDS * sound.rate
+    places = [int(place) for place in np.cumsum([sound.first, *sound.pieces])]
+    return [(number, places[number], places[number + 1]) for number in range(first // length, -(-stop // length))]
+
+
 def _threads() -> int:
     """Threads that may decode at the same time: this loader process's share of the processors."""
+    return max(1, min(MOST_THREADS, processors() // _processes()))
+
+
+def _processes() -> int:
+    """Loader processes that share this machine's processors and memory."""
     from torch.utils.data import get_worker_info
 
     worker: Any = get_worker_info()
-    return max(1, min(MOST_THREADS, processors() // (1 if worker is None else worker.num_workers)))
+    return 1 if worker is None else max(1, worker.num_workers)
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}

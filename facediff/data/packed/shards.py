@@ -8,15 +8,16 @@ data loader.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
-from threading import Lock, local
+from threading import local
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.data.packed.layout import DAMAGED, METADATA, ArrayFacts, check_array_metadata
+from facediff.data.packed.read_ahead import Answer, ReadAhead
 from facediff.data.packed.stores import ByteStore, Range
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.limits import LIMITS, brief
@@ -35,10 +36,12 @@ class ShardedArray:
         store: where it lies.
         name: the array's name.
         facts: its entry in the record.
+        ahead: holds chunks that were asked for early.
     """
 
-    def __init__(self, store: ByteStore, name: str, facts: ArrayFacts) -> None:
+    def __init__(self, store: ByteStore, name: str, facts: ArrayFacts, ahead: ReadAhead) -> None:
         self.store = store
+        self.ahead = ahead
         self.name = name
         self.facts = facts
         self._indices: dict[int, npt.NDArray[np.uint64]] = {}
@@ -46,14 +49,14 @@ class ShardedArray:
         self._reset()
 
     def _reset(self) -> None:
-        self._lock, self._scratch = Lock(), local()
+        self._scratch = local()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out locks, which cannot be pickled."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_lock", "_scratch", "_codecs")}
+        """Leave out memory of threads, which cannot be pickled."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_scratch", "_codecs")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make new locks."""
+        """Start without."""
         self.__dict__.update(state)
         self._reset()
 
@@ -69,14 +72,26 @@ class ShardedArray:
         blosc.use_threads = False
         return blosc, google_crc32c
 
-    def fetch(self, first: int, stop: int) -> list[memoryview]:
+    def fetch(self, first: int, stop: int) -> Answer:
         """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array."""
+        answer = self.ahead.take((self.name, first, stop))
+        return self._request(first, stop) if answer is None else answer
+
+    def later(self, first: int, stop: int) -> dict[Hashable, Callable[[], Answer]]:
+        """The same as a request for :class:`~facediff.data.packed.read_ahead.ReadAhead`."""
+        return {(self.name, first, stop): lambda: self._request(first, stop)}
+
+    def chunks_of_rows(self, first: int, stop: int) -> range:
+        """The chunks that hold rows ``first`` to ``stop``."""
+        return range(first // self.facts.chunk, -(-stop // self.facts.chunk)) if stop > first else range(0)
+
+    def _request(self, first: int, stop: int) -> Answer:
         if not self._checked:
             check_array_metadata(
                 self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.facts
             )
             self._checked = True
-        encoded: list[memoryview] = []
+        encoded: Answer = []
         per_shard = self.facts.chunks
         for shard in range(first // per_shard, -(-stop // per_shard)):
             low, high = max(first - shard * per_shard, 0), min(stop - shard * per_shard, per_shard)
@@ -117,7 +132,7 @@ class ShardedArray:
         width = (self.facts.width,) if self.facts.width else ()
         rows = np.empty((max(0, stop - first), *width), self.facts.dtype)
         chunk = self.facts.chunk
-        numbers = range(first // chunk, -(-stop // chunk)) if stop > first else range(0)
+        numbers = self.chunks_of_rows(first, stop)
         for number, encoded in zip(numbers, self.fetch(numbers.start, numbers.stop), strict=True):
             low, high = max(first, number * chunk), min(stop, (number + 1) * chunk)
             rows[low - first : high - first] = self.decode(number, encoded)[
@@ -127,8 +142,7 @@ class ShardedArray:
 
     def _index(self, shard: int) -> npt.NDArray[np.uint64]:
         """Offset and size of every chunk of a shard (chunks, 2), read once."""
-        with self._lock:
-            cached = self._indices.get(shard)
+        cached = self._indices.get(shard)
         if cached is not None:
             return cached
         size, length = self.facts.shards[shard], 16 * self.facts.chunks + CHECKSUM
@@ -141,8 +155,7 @@ class ShardedArray:
                 f"{self.store.source}/{self._key(shard)}: the checksum of its index is wrong; {DAMAGED}"
             )
         index = np.frombuffer(body, "<u8").reshape(-1, 2)
-        with self._lock:
-            self._indices[shard] = index
+        self._indices[shard] = index
         return index
 
     def _key(self, shard: int) -> str:

@@ -225,7 +225,7 @@ class ChunkCache:
     def __init__(self, folder: Path, identity: str) -> None:
         self.folder = folder
         self.identity = identity
-        self.limit = limit_bytes()
+        self.limit = limit_bytes(VARIABLE, USUAL_GB)
         # Scanning the folder is slow: it is done at first, and whenever a tenth of the limit was added.
         self._unseen = self.limit
 
@@ -281,13 +281,13 @@ class ChunkCache:
             total -= size
 
 
-def limit_bytes() -> float:
-    """Size limit of the cache in bytes, from the environment."""
-    text = os.environ.get(VARIABLE, str(USUAL_GB))
+def limit_bytes(variable: str, usual: float) -> float:
+    """Size limit of a cache in bytes: an environment variable's gigabytes, or else the usual ones."""
+    text = os.environ.get(variable, str(usual))
     try:
         limit = float(text)
     except ValueError:
         limit = -1.0
     if not 0 <= limit < float("inf"):
-        raise FaceDiffError(f"{VARIABLE}={text}: not a valid size; expected gigabytes, 0 to keep nothing")
+        raise FaceDiffError(f"{variable}={text}: not a valid size; expected gigabytes, 0 to keep nothing")
     return limit * 1e9

@@ -19,7 +19,7 @@ from facediff.data.packed.unpacking import unpack
 from facediff.data.prepare.runner import write_templates
 from facediff.errors import FaceDiffError
 from facediff.utils.checksums import describe_files
-from tests.data.packed.damage import TINY
+from tests.data.packed.damage import RECORD, TINY, change
 from tests.fakes.tiny import VERTICES, Tiny, write_tiny
 
 MM = 0.001
@@ -79,6 +79,27 @@ def test_what_scores_are_computed_from_keeps_every_bit(corpus: Path, tmp_path: P
 class MiniBiwi(Biwi):
     corpus_name = "mini-biwi"  # "biwi" with so few vertices would be found by other tests too
     n_vertices = VERTICES
+
+
+def test_every_codec_gives_the_same_motion_to_facediff_and_zarr(corpus: Path, packed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "corpus.zarr"
+    pack(corpus, out, corpus=TINY, codec="lz4", workers=1)
+    import zarr
+
+    stored = [zarr.open_group(root, mode="r")["motion_int16"][:] for root in (packed, out)]  # type: ignore[index]
+    assert np.array_equal(*stored)
+    assert (out / "motion_int16/c/0/0").read_bytes() != (packed / "motion_int16/c/0/0").read_bytes()
+    # A record of before there was a choice names none.
+    shutil.copytree(packed, tmp_path / "old.zarr")
+    change(tmp_path / "old.zarr", RECORD, lambda record: record.pop("codec"))
+    for one, other in zip(
+        Tiny(root=str(tmp_path / "old.zarr")).dataset("train"), Tiny(root=str(out)).dataset("train"), strict=True
+    ):
+        assert torch.equal(one.motion, other.motion)
+    assert pack(corpus, out, corpus=TINY, codec="lz4", workers=1).written == 0
+    for codec in ("zstd", "gzip"):
+        with pytest.raises(FaceDiffError, match=r"packed otherwise|--codec gzip"):
+            pack(corpus, out, corpus=TINY, codec=codec, workers=1)
 
 
 def test_the_unit_is_the_corpuss_own_or_the_one_that_is_given(tmp_path: Path) -> None:

@@ -105,6 +105,7 @@ def test_a_window_costs_its_chunks_only(served: tuple[Path, str]) -> None:
 
 def test_windows_share_a_connection(served: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "0")
+    monkeypatch.setenv("FACEDIFF_PACKED_MEMORY_GB", "0")
     corpus = Tiny(root=served[1]).corpus
     clip = corpus.clips["B_e04"]
     corpus.read_motion(clip, 0, 1)
