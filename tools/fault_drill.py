@@ -379,8 +379,11 @@ CLOCKS = {
     "duration",
     "versions",
     "memory",
+    "checkpoint",
 }
-"""Words in the names of what differs between two equal runs."""
+"""Words in the names of what differs between two equal runs.
+
+A checkpoint's hash is one of these: the file has times and the run's folder in it. Its content is compared itself."""
 
 
 def of_a_clock(name: object) -> bool:
