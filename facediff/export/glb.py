@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
-from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward
+from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
+from facediff.mesh.obj_surface import Surface
 from facediff.registry import export_format
+from facediff.render.rasteriser import to_linear
 
 Array = npt.NDArray[np.float32]
 
@@ -33,7 +35,7 @@ class GlbFormat(Format):
     speech = "next to it"
     units = "m"
     up_axes = ("y",)
-    uses = ("tolerance", "shapes", "key_tolerance")
+    uses = ("tolerance", "shapes", "key_tolerance", "surface")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write one animation: all of it, or what the given shapes can show of it."""
@@ -51,7 +53,7 @@ class GlbFormat(Format):
             extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
-        document = make_document(animation, space, rest, morphs, extras)
+        document = make_document(animation, space, rest, morphs, extras, surface_of(animation, options))
         if head is not None:
             add_head(document, animation.frame_rate, head * np.repeat([1.0, space.factor], 3))
         document.write(path)
@@ -189,30 +191,50 @@ def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
 
 
 def make_document(
-    animation: Animation, space: FileSpace, rest: Array, morphs: Morphs, extras: dict[str, object]
+    animation: Animation,
+    space: FileSpace,
+    rest: Array,
+    morphs: Morphs,
+    extras: dict[str, object],
+    surface: Surface | None = None,
 ) -> GlbWriter:
     """The glTF document of one animated mesh at rest (V, 3), with its arrays."""
     document = GlbWriter({"asset": {"version": "2.0", "generator": "facediff"}})
     if (licence := animation.metadata.get("licence")) is not None:
         document.content["asset"]["copyright"] = licence
 
+    faces = outward(animation)
+    if surface is None:
+        split, corners, coordinates = np.arange(len(rest)), faces, None
+    else:
+        # A vertex of glTF has one texture coordinate: at a seam it becomes several.
+        pairs = np.stack([faces, surface.turned(animation.triangles, faces)], axis=-1).reshape(-1, 2)
+        unique, places = np.unique(pairs, axis=0, return_inverse=True)
+        split, corners = unique[:, 0], places.reshape(-1, 3).astype(np.int32)
+        coordinates = (surface.uvs * [1, -1] + [0, 1])[unique[:, 1]].astype(np.float32)  # v downwards
+
     def add_vertices(positions: Array, normals: Array) -> dict[str, int]:
         return {
-            "POSITION": document.add(positions, target=ARRAY_BUFFER, bounds=True),
-            "NORMAL": document.add(normals, target=ARRAY_BUFFER),
+            "POSITION": document.add(positions[split], target=ARRAY_BUFFER, bounds=True),
+            "NORMAL": document.add(normals[split], target=ARRAY_BUFFER),
         }
 
-    faces = outward(animation)
     rest_normals = normals_of(rest, faces)
     attributes = add_vertices(rest, rest_normals)
-    surface: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
+    plain: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
     if animation.colours is None:
-        surface["baseColorFactor"] = [0.6, 0.6, 0.6, 1.0]
+        plain["baseColorFactor"] = [0.6, 0.6, 0.6, 1.0]
     else:
-        attributes["COLOR_0"] = document.add(linear_colours(animation.colours), target=ARRAY_BUFFER)
+        attributes["COLOR_0"] = document.add(linear_colours(animation.colours)[split], target=ARRAY_BUFFER)
+    if coordinates is not None:
+        attributes["TEXCOORD_0"] = document.add(coordinates, target=ARRAY_BUFFER)
     # The largest number of a type is reserved: it restarts a strip of triangles.
-    index_type = np.uint16 if len(rest) < 65_535 else np.uint32
-    indices = document.add(faces.astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
+    index_type = np.uint16 if len(split) < 65_535 else np.uint32
+    of_face = np.zeros(len(corners), int) if surface is None else surface.of_face
+    indices = [
+        document.add(corners[of_face == number].astype(index_type).ravel(), target=ELEMENT_ARRAY_BUFFER)
+        for number in range(int(of_face.max()) + 1)
+    ]
     if morphs.names:
         # Named shapes are used for other motions too, so that each has the normals of its own pose.
         normal_offsets = np.stack([normals_of(rest + shape, faces) - rest_normals for shape in morphs.shapes])
@@ -230,14 +252,17 @@ def make_document(
         "meshes": [
             {
                 "name": "face",
-                "primitives": [{"attributes": attributes, "indices": indices, "material": 0, "targets": targets}],
+                "primitives": [
+                    {"attributes": attributes, "indices": index, "material": number, "targets": targets}
+                    for number, index in enumerate(indices)
+                ],
                 "weights": [0.0] * len(targets),
                 "extras": {
                     "targetNames": list(morphs.names) or [f"{prefix}_{index:04d}" for index in range(len(targets))]
                 },
             }
         ],
-        "materials": [{"name": "face", "doubleSided": True, "pbrMetallicRoughness": surface}],
+        "materials": [{"name": "face", "doubleSided": True, "pbrMetallicRoughness": plain}],
         "animations": [
             {
                 "name": animation.name,
@@ -246,7 +271,30 @@ def make_document(
             }
         ],
     }
+    if surface is not None:
+        add_materials(document, surface)
     return document
+
+
+def add_materials(document: GlbWriter, surface: Surface) -> None:
+    """Give a document the materials of an .obj, with its pictures in the file."""
+    images: dict[Path, int] = {}
+    content, materials = document.content, []
+    for material in surface.materials:
+        look: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
+        picture = material.picture_bytes()
+        if picture is None or material.picture is None:
+            look["baseColorFactor"] = [*(float(part) for part in to_linear(material.colour)), 1.0]
+        else:
+            if material.picture not in images:
+                images[material.picture] = len(images)
+                view = document.add_bytes(picture[0])
+                entry = {"name": material.picture.stem, "mimeType": picture[1], "bufferView": view}
+                content.setdefault("images", []).append(entry)
+                content.setdefault("textures", []).append({"source": images[material.picture]})
+            look["baseColorTexture"] = {"index": images[material.picture]}
+        materials.append({"name": material.name, "doubleSided": True, "pbrMetallicRoughness": look})
+    content["materials"] = materials
 
 
 def add_head(document: GlbWriter, frame_rate: float, head: npt.NDArray[np.float64]) -> None:

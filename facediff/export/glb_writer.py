@@ -45,7 +45,7 @@ class GlbWriter:
         self._length += len(data) + len(self._parts[-1])
 
     def add(self, array: npt.NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (N,), (N, 3) or (N, 4) and return its accessor's number.
+        """Append an array (N,) or (N, 2 to 4) and return its accessor's number.
 
         Args:
             array: float32, uint16 or uint32.
@@ -53,11 +53,8 @@ class GlbWriter:
             bounds: whether the least and the greatest numbers are written, as positions and times need.
         """
         array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-        data = array.tobytes()
-        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
-        self.content["bufferViews"].append(view if target is None else {**view, "target": target})
         accessor: dict[str, Any] = {
-            "bufferView": len(self.content["bufferViews"]) - 1,
+            "bufferView": self.add_bytes(array.tobytes(), target=target),
             "componentType": COMPONENT_TYPES[array.dtype],
             "count": len(array),
             "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
@@ -66,8 +63,14 @@ class GlbWriter:
             columns = array.reshape(len(array), -1)
             accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
         self.content["accessors"].append(accessor)
-        self._append(data)
         return len(self.content["accessors"]) - 1
+
+    def add_bytes(self, data: bytes, *, target: int | None = None) -> int:
+        """Append bytes, such as a picture's, and return the number of their view."""
+        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
+        self.content["bufferViews"].append(view if target is None else {**view, "target": target})
+        self._append(data)
+        return len(self.content["bufferViews"]) - 1
 
     def write(self, path: Path) -> None:
         """Write the header, the JSON chunk and the binary chunk, each padded to four bytes.

@@ -11,10 +11,12 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
-from facediff.export.format import FileSpace, Format, facts, folder_of
+from facediff.export.format import MARK, FileSpace, Format, facts, folder_of, pictures_of, surface_of
+from facediff.mesh.obj_surface import Surface
 from facediff.registry import export_format
 from facediff.utils.plain_files import json_text
 
+LIBRARY = "materials.mtl"  # In the folder of a sequence of .obj, for all frames
 RECORD = "sequence.json"  # The file that tells a folder of frames from any other folder
 
 
@@ -31,7 +33,7 @@ class MeshSequence(Format):
         space = FileSpace.of(animation, options)
         folder = folder_of(path)
         folder.mkdir()
-        frame_bytes = self.encoder(animation, space)
+        frame_bytes = self.encoder(animation, space, self.dressed(animation, options, folder, path.stem))
         digits = max(4, len(str(len(animation.vertices) - 1)))
         for index, points in enumerate(space.frames(animation)):
             (folder / f"{path.stem}_{index:0{digits}d}{path.suffix}").write_bytes(frame_bytes(points))
@@ -41,7 +43,13 @@ class MeshSequence(Format):
             record["speech"] = options.speech_file
         (folder / RECORD).write_bytes(json_text(path, record).encode())
 
-    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Surface | None:
+        """What the frames show next to positions; files that they share are written to the folder."""
+        return None
+
+    def encoder(
+        self, animation: Animation, space: FileSpace, surface: Surface | None = None
+    ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A function that gives a file's bytes from a frame's positions (V, 3)."""
         raise NotImplementedError
 
@@ -50,11 +58,42 @@ class MeshSequence(Format):
 class ObjSequence(MeshSequence):
     """A folder with an .obj mesh for every frame."""
 
-    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    uses = ("surface",)
+
+    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Surface | None:
+        """The texture coordinates; the materials and their pictures are written once for all frames."""
+        surface = surface_of(animation, options)
+        if surface is None:
+            return None
+        pictures, lines = pictures_of(surface, stem), [f"# {MARK.decode()}"]
+        for number, material in enumerate(surface.materials):
+            lines += [f"newmtl {material.name}", "Kd {:g} {:g} {:g}".format(*material.colour)]
+            if number in pictures:
+                name, data = pictures[number]
+                (folder / name).write_bytes(data)
+                lines.append(f"map_Kd {name}")
+        (folder / LIBRARY).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return surface
+
+    def encoder(
+        self, animation: Animation, space: FileSpace, surface: Surface | None = None
+    ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """Vertices with nine digits, which give back every float32; colours follow them as sRGB from 0 to 1."""
         comment = f"# {_comment(animation, space)}\n"
         # Triangles are counted from 1 and keep the animation's order and winding.
-        faces = "".join(f"f {a} {b} {c}\n" for a, b, c in (animation.triangles + 1).tolist()).encode()
+        triangles = (animation.triangles + 1).tolist()
+        if surface is None:
+            faces = "".join(f"f {a} {b} {c}\n" for a, b, c in triangles).encode()
+        else:
+            comment += f"mtllib {LIBRARY}\n"
+            lines, last = [f"vt {u:.9g} {v:.9g}\n" for u, v in surface.uvs.tolist()], -1
+            corners = (surface.corners + 1).tolist()
+            for (a, b, c), (p, q, r), number in zip(triangles, corners, surface.of_face.tolist(), strict=True):
+                if number != last:
+                    lines.append(f"usemtl {surface.materials[number].name}\n")
+                    last = number
+                lines.append(f"f {a}/{p} {b}/{q} {c}/{r}\n")
+            faces = "".join(lines).encode()
 
         def encode(points: npt.NDArray[np.float32]) -> bytes:
             if animation.colours is None:
@@ -71,7 +110,9 @@ class ObjSequence(MeshSequence):
 class PlySequence(MeshSequence):
     """A folder with a binary .ply mesh for every frame."""
 
-    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(
+        self, animation: Animation, space: FileSpace, surface: Surface | None = None
+    ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A header, little-endian vertices with sRGB bytes, and triangles."""
         colours = animation.colours
         names = () if colours is None else ("red", "green", "blue")

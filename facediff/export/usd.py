@@ -11,8 +11,19 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError
-from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward
+from facediff.export.format import (
+    FileSpace,
+    Format,
+    facts,
+    linear_colours,
+    normals_of,
+    outward,
+    pictures_of,
+    surface_of,
+)
+from facediff.mesh.obj_surface import Surface
 from facediff.registry import export_format
+from facediff.render.rasteriser import to_linear
 
 
 class Usd(Format):
@@ -21,6 +32,7 @@ class Usd(Format):
     next_step = "Blender: File > Import > USD; other programs: docs/export.md"
     speech = "next to it"
     requires = ("pxr", "usd")
+    uses = ("surface",)
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write one animation; frame t is time code t.
@@ -57,7 +69,10 @@ class Usd(Format):
         layer.customLayerData = {"facediff": data}
         layer.documentation = f"{animation.name}, written by facediff"
         try:
-            _add_face(stage, root.AppendChild("face"), animation, space)
+            surface = surface_of(animation, options)
+            mesh = _add_face(stage, root.AppendChild("face"), animation, space)
+            if surface is not None:
+                _add_materials(stage, root, mesh, animation, surface, path)
             if not layer.Export(str(path)):
                 raise FaceDiffError(f"{path}: cannot be written; check whether the disk is full")
         except Tf.ErrorException as error:
@@ -74,7 +89,7 @@ class TextUsd(Usd):
     """USD, text: a mesh with points for every frame."""
 
 
-def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> None:  # noqa: ANN401 - usd-core has no type hints
+def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> Any:  # noqa: ANN401 - usd-core has no type hints
     """A polygon mesh without subdivision, with points, normals and extent of every frame."""
     from pxr import Sdf, UsdGeom, Vt
 
@@ -97,6 +112,52 @@ def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> 
         )
         colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(animation.colours)))
         _colour_by_vertices(stage, path, mesh)
+    return mesh
+
+
+def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surface: Surface, file: Path) -> None:  # noqa: ANN401
+    """Texture coordinates of the corners, and the materials of an .obj; pictures are written next to the file."""
+    from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
+
+    faces = outward(animation)
+    coordinates = surface.uvs[surface.turned(animation.triangles, faces)].reshape(-1, 2).astype(np.float32)
+    st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(coordinates)))
+    pictures = pictures_of(surface, file.stem)
+    for number, own in enumerate(surface.materials):
+        name = f"{Tf.MakeValidIdentifier(own.name)}_{number}"
+        material = UsdShade.Material.Define(stage, root.AppendChild(name))
+        look = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("surface"))
+        look.CreateIdAttr("UsdPreviewSurface")
+        look.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
+        colour = look.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+        colour.Set(Gf.Vec3f(*(float(part) for part in to_linear(own.colour))))
+        if number in pictures:
+            picture, data = pictures[number]
+            file.with_name(picture).write_bytes(data)
+            reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("coordinates"))
+            reader.CreateIdAttr("UsdPrimvarReader_float2")
+            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+            texture = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("picture"))
+            texture.CreateIdAttr("UsdUVTexture")
+            texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{picture}"))
+            where = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+            texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(where)
+            for wrap in ("wrapS", "wrapT"):
+                texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("repeat")
+            colour.ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+        material.CreateSurfaceOutput().ConnectToSource(look.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+        if len(surface.materials) == 1:
+            shown = mesh.GetPrim()
+        else:
+            shown = UsdGeom.Subset.CreateGeomSubset(
+                mesh,
+                name,
+                UsdGeom.Tokens.face,
+                Vt.IntArray.FromNumpy(np.flatnonzero(surface.of_face == number).astype(np.int32)),
+                "materialBind",
+            ).GetPrim()
+        UsdShade.MaterialBindingAPI.Apply(shown).Bind(material)
 
 
 def _colour_by_vertices(stage: Any, path: Any, mesh: Any) -> None:  # noqa: ANN401

@@ -13,9 +13,10 @@ from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
+from facediff.mesh.obj_surface import PICTURE_SUFFIXES, has_uvs
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
-OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance")
+OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
 """Options that some formats use."""
 
 
@@ -55,7 +56,8 @@ def write_animations(
             ``hello_obj/``).
         animations: at least one.
         options: what the user chose; the defaults if None.
-        into: the .glb of the animations' mesh, to whose copy each is added; surfaces alone are written if None.
+        into: the file of the animations' mesh: to the copy of a .glb each animation is added, and of an .obj the
+            texture coordinates and materials are written where the format has them; surfaces alone are written if None.
         own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
 
     Returns:
@@ -72,6 +74,10 @@ def write_animations(
     options = options or ExportOptions()
     check_export(path, options, len(animations), weights=have_weights(animations))
     form = FORMATS[path.suffix]
+    if into is not None and into.suffix.lower() == ".obj":
+        if "surface" in form.uses and options.surface is None and has_uvs(into):
+            options = replace(options, surface=into)
+        into = None
     for animation in animations:
         check_animation(animation, needs_mesh=form.needs_mesh)
     targets = _targets(path, form, len(animations))
@@ -105,6 +111,8 @@ def write_animations(
         for file in written:
             if (goal := path.with_name(file.name)).exists() and goal.is_dir() != file.is_dir():
                 raise FaceDiffError(f"{goal}: is in the way; move it, or choose another -o")
+            if file.suffix in PICTURE_SUFFIXES and file not in [hidden / target.name for target in targets]:
+                check_free(goal)  # a material's picture has not been named by the user
         for file in written:
             put_in_place(file, path.with_name(file.name))
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]

@@ -235,13 +235,15 @@ class AnimationPipeline(ABC):
         """
         from facediff.export import write_animations
         from facediff.mesh.glb import wears_more
+        from facediff.mesh.obj_surface import has_uvs
 
-        into = None
-        if output.suffix == ".glb" and self.options.target_mesh is not None and export.output_unit is None:
-            target = Path(self.options.target_mesh)
-            into = target if wears_more(target) else None  # else its textures, skins and targets would be lost
+        into, target = None, Path(self.options.target_mesh or "")
+        # What a surface alone lacks would be lost: textures, skins and targets of a .glb, coordinates of an .obj.
+        is_dressed = output.suffix == ".glb" and export.output_unit is None and wears_more(target)
+        if is_dressed or has_uvs(target):
+            into = target
         own_shapes = self.options.own_shapes
-        if own_shapes and into is None:
+        if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
         with self.animations(speech, name, output, seed=seed) as animations:
             return write_animations(output, animations, export, into=into, own_shapes=own_shapes), animations[0]

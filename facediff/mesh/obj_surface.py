@@ -1,0 +1,176 @@
+"""Texture coordinates and materials of an .obj, as the export formats write them; the reader of meshes needs neither.
+
+The .obj names a material file, and that names pictures. Both are looked for in the folder of the .obj alone, so that a
+file from elsewhere opens nothing outside of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.utils.limits import LIMITS
+
+PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
+"""How pictures begin that programs for glTF and USD read, their type and suffix."""
+PICTURE_SUFFIXES = tuple(suffix for _, suffix in PICTURES.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A material: its name, its colour (sRGB from 0 to 1), and the picture that colours it instead."""
+
+    name: str
+    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    picture: Path | None = None
+
+    def picture_bytes(self) -> tuple[bytes, str, str] | None:
+        """The picture, its type, and the suffix for it."""
+        if self.picture is None:
+            return None
+        data = self.picture.read_bytes()
+        return next((data, *about) for start, about in PICTURES.items() if data.startswith(start))
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What an .obj says of its surface.
+
+    Attributes:
+        uvs: (M, 2) texture coordinates, v upwards.
+        corners: (F, 3) which of them each corner of each triangle has, in the order of :func:`facediff.mesh.read_mesh`.
+        materials: those that triangles have.
+        of_face: (F,) number of each triangle's material.
+        lost: what is not carried over, a sentence each.
+    """
+
+    uvs: npt.NDArray[np.float64]
+    corners: npt.NDArray[np.int64]
+    materials: tuple[Material, ...]
+    of_face: npt.NDArray[np.int64]
+    lost: tuple[str, ...] = ()
+
+    def turned(self, triangles: npt.NDArray[np.integer], outward: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """The corners for triangles (F, 3) whose vertices come in another order."""
+        order = (outward[:, :, None] == triangles[:, None, :]).argmax(axis=2)
+        return np.take_along_axis(self.corners, order, axis=1)
+
+
+def has_uvs(path: Path) -> bool:
+    """Whether a file is an .obj with texture coordinates."""
+    if path.suffix.lower() != ".obj" or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return any(line.startswith(b"vt ") for line in stream)
+
+
+def read_surface(path: Path, n_triangles: int) -> Surface:
+    """Texture coordinates and materials of an .obj.
+
+    Args:
+        path: the file.
+        n_triangles: of the mesh that it is of.
+
+    Raises:
+        FaceDiffError: if it has no texture coordinates, is damaged, or is another mesh.
+    """
+    if not has_uvs(path):
+        raise FaceDiffError(f"{path}: has no texture coordinates; expected an .obj with lines `vt u v`")
+    LIMITS.check("bytes", path.stat().st_size, path)
+    uvs: list[tuple[float, float]] = []
+    corners: list[tuple[int, int, int]] = []
+    libraries: list[str] = []
+    names, of_face, current = {"": 0}, [], 0
+    try:
+        for line in path.read_bytes().decode("utf-8", errors="replace").splitlines():
+            word, _, rest = line.replace("\t", " ").partition(" ")
+            if word == "vt":
+                u, v = rest.split()[:2]
+                uvs.append((float(u), float(v)))
+            elif word == "f":
+                listed = [corner.split("/") for corner in rest.split()]
+                numbers = [int(corner[1]) if len(corner) > 1 and corner[1] else 0 for corner in listed]
+                places = [number - 1 if number > 0 else len(uvs) + number if number else -1 for number in numbers]
+                # Polygons become fans, as in the mesh itself.
+                corners += [(places[0], b, c) for b, c in zip(places[1:-1], places[2:], strict=True)]
+                of_face += [current] * (len(places) - 2)
+            elif word == "usemtl":
+                current = names.setdefault(rest.strip(), len(names))
+            elif word == "mtllib":
+                libraries.append(rest.strip())
+    except (ValueError, IndexError) as error:
+        raise FaceDiffError(f"{path}: not a readable OBJ mesh ({error}); export it again") from error
+    if len(corners) != n_triangles:
+        raise FaceDiffError(
+            f"{path}: has {len(corners)} triangles and the animation's mesh {n_triangles}; give the .obj of that mesh"
+        )
+    table, coordinates = np.array(corners, np.int64), np.array(uvs, np.float64)
+    if table.max() >= len(uvs) or table.min() < -1 or not np.isfinite(coordinates).all():
+        raise FaceDiffError(f"{path}: a face names a texture coordinate that does not exist; export it again")
+    if (table < 0).any():  # corners without a coordinate get one of their own
+        table[table < 0] = len(coordinates)
+        coordinates = np.concatenate([coordinates, np.zeros((1, 2))])
+    lost: list[str] = []
+    library = _materials(path, libraries, lost)
+    used = np.unique(np.array(of_face))
+    every = list(names)
+    materials = tuple(library.get(every[number], Material(every[number] or "surface")) for number in used)
+    return Surface(coordinates, table, materials, np.searchsorted(used, of_face), tuple(lost))
+
+
+def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, Material]:
+    """Materials by their names; adds what is missing to ``lost``."""
+    result: dict[str, Material] = {}
+    for library in libraries:
+        file = _beside(path, library)
+        if file is None:
+            lost.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
+            continue
+        LIMITS.check("bytes", file.stat().st_size, file)
+        name = ""
+        for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
+            word, _, rest = line.strip().partition(" ")
+            if word == "newmtl":
+                name = rest.strip()
+                result[name] = Material(name)
+            elif word == "Kd" and name:
+                result[name] = Material(name, _colour(rest), result[name].picture)
+            elif word == "map_Kd" and name:
+                # Options such as -o 0 0 0 stand before the name, which may have spaces.
+                text = rest.split()[-1] if rest.strip().startswith("-") else rest.strip()
+                picture = _beside(path, text)
+                if picture is None or not _is_picture(picture):
+                    lost.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
+                else:
+                    result[name] = Material(name, result[name].colour, picture)
+    return result
+
+
+def _colour(text: str) -> tuple[float, float, float]:
+    try:
+        red, green, blue = (min(max(float(number), 0.0), 1.0) for number in text.split()[:3])
+    except ValueError:
+        return Material("").colour
+    return red, green, blue
+
+
+def _beside(path: Path, name: str) -> Path | None:
+    """A file that an .obj names, if it lies in its folder or below; by its name alone where folders have changed."""
+    folder = path.resolve().parent
+    relative = PurePosixPath(name.replace("\\", "/"))
+    for candidate in (relative, PurePosixPath(relative.name)):
+        file = (folder / candidate).resolve()
+        if file.is_relative_to(folder) and file.is_file():
+            return file
+    return None
+
+
+def _is_picture(path: Path) -> bool:
+    LIMITS.check("bytes", path.stat().st_size, path)
+    with path.open("rb") as stream:
+        start = stream.read(8)
+    return any(start.startswith(magic) for magic in PICTURES)

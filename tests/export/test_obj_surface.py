@@ -1,0 +1,175 @@
+"""Texture coordinates, materials and pictures of an .obj in what is written, as other programs read it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from facediff.animation import Animation
+from facediff.animation.options import ExportOptions
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.export import write_animations
+from facediff.mesh import read_mesh
+from facediff.mesh.obj_surface import read_surface
+
+FRAMES = 3
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """A box of quadrangles unwrapped with seams, half of it with a picture and half with a colour."""
+    folder = tmp_path / "mine"
+    (folder / "maps").mkdir(parents=True)
+    box = trimesh.creation.box()
+    quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = ["mtllib mine.mtl", *(f"v {x} {y} {z}" for x, y, z in box.vertices)]
+    lines += [f"vt {k / 24:.6f} {(5 * k) % 24 / 24:.6f}" for k in range(24)]
+    for k, quad in enumerate(quads):
+        lines += ["usemtl skin"] if k == 0 else ["usemtl cloth"] if k == 3 else []
+        # The second half counts back from the end, as some exporters do.
+        places = [4 * k + j + 1 if k < 3 else 4 * k + j - 24 for j in range(4)]
+        lines.append("f " + " ".join(f"{v}/{t}" for v, t in zip(quad, places, strict=True)))
+    (folder / "mine.obj").write_text("\n".join(lines) + "\n")
+    (folder / "mine.mtl").write_text(
+        "newmtl skin\nKd 1 1 1\nmap_Kd -s 1 1 1 C:\\art\\skin.png\nnewmtl cloth\nKd 0.2 0.4 0.6\n"
+    )
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "skin.png")
+    return folder / "mine.obj"
+
+
+@pytest.fixture
+def animation(source: Path) -> Animation:
+    mesh = read_mesh(source)
+    rest = mesh.vertices.astype(np.float32)
+    moves = np.linspace(1, 1.5, FRAMES)[:, None, None].astype(np.float32)
+    return Animation("box", rest * moves, rest, 25.0, faces=mesh.faces)
+
+
+def corners(points: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Place and texture coordinate of each corner of each triangle (F, 3, 5), in an order that says nothing."""
+    table = np.concatenate([points[faces], uvs.reshape(len(faces), 3, 2)], axis=2).round(5)
+    return np.array(sorted(sorted(map(tuple, triangle)) for triangle in table.tolist()))
+
+
+@pytest.fixture
+def truth(source: Path, animation: Animation) -> np.ndarray:
+    uvs = np.array([[k / 24, (5 * k) % 24 / 24] for k in range(24)])
+    fans = np.array([[4 * k + j for j in part] for k in range(6) for part in ((0, 1, 2), (0, 2, 3))])
+    return corners(animation.template.astype(float), np.asarray(animation.triangles), uvs[fans])
+
+
+def parts_of(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
+    return {part.visual.material.name: part for part in scene.geometry.values()}
+
+
+def both(parts: dict[str, trimesh.Trimesh]) -> np.ndarray:
+    tables = [corners(part.vertices, part.faces, part.visual.uv[part.faces]) for part in parts.values()]
+    return np.array(sorted(np.concatenate(tables).tolist()))
+
+
+def test_glb_has_seams_materials_and_the_picture(
+    tmp_path: Path, source: Path, animation: Animation, truth: np.ndarray
+) -> None:
+    (written,) = write_animations(tmp_path / "a.glb", [animation], into=source)
+    parts = parts_of(trimesh.load(written, process=False))
+    assert both(parts) == pytest.approx(truth, abs=1e-5)
+    assert sorted(parts) == ["cloth", "skin"]
+    picture = np.asarray(parts["skin"].visual.material.baseColorTexture.convert("RGB"))
+    assert (picture == np.asarray(Image.open(source.parent / "skin.png"))).all()
+    assert len(parts["skin"].faces) == len(parts["cloth"].faces) == 6
+    # Colours of glTF are linear light.
+    linear = ((np.array([0.2, 0.4, 0.6]) + 0.055) / 1.055) ** 2.4
+    assert np.asarray(parts["cloth"].visual.material.baseColorFactor)[:3] / 255 == pytest.approx(linear, abs=0.01)
+
+
+def test_obj_frames_share_materials_and_may_be_written_again(
+    tmp_path: Path, source: Path, animation: Animation, truth: np.ndarray
+) -> None:
+    for _ in range(2):
+        folder, *_ = write_animations(tmp_path / "a.obj", [animation], ExportOptions(surface=source))
+    scene = trimesh.load(folder / "a_0000.obj", process=False, split_object=False, group_material=True, force="scene")
+    parts = parts_of(scene)
+    assert both(parts) == pytest.approx(truth, abs=1e-5)
+    again = read_surface(folder / "a_0002.obj", 12)
+    assert [material.name for material in again.materials] == ["skin", "cloth"]
+    assert again.materials[1].colour == (0.2, 0.4, 0.6)
+    assert np.array_equal(read_mesh(folder / "a_0002.obj").vertices, animation.vertices[2])
+    assert np.array_equal(again.uvs[again.corners], read_surface(source, 12).uvs[read_surface(source, 12).corners])
+
+
+def test_usd_has_coordinates_materials_and_the_picture(
+    tmp_path: Path, source: Path, animation: Animation, truth: np.ndarray
+) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    first = write_animations(tmp_path / "a.usda", [animation], into=source)
+    assert sorted(path.name for path in first) == ["a.usda", "a_0.png"]
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/box/face"))
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    assert st.GetInterpolation() == "faceVarying"
+    assert corners(np.array(mesh.GetPointsAttr().Get()), faces, np.array(st.Get())) == pytest.approx(truth, abs=1e-5)
+    subsets = UsdGeom.Subset.GetAllGeomSubsets(mesh)
+    assert sorted(len(subset.GetIndicesAttr().Get()) for subset in subsets) == [6, 6]
+    bound = [UsdShade.MaterialBindingAPI(s.GetPrim()).ComputeBoundMaterial()[0].GetPath().name for s in subsets]
+    assert bound == ["skin_0", "cloth_1"]
+    texture = UsdShade.Shader(stage.GetPrimAtPath("/box/skin_0/picture"))
+    assert (tmp_path / texture.GetInput("file").Get().path).is_file()
+    write_animations(tmp_path / "a.usda", [animation], into=source)
+    (tmp_path / "a_0.png").write_bytes(b"mine")
+    with pytest.raises(FaceDiffError, match=r"a_0\.png"):
+        write_animations(tmp_path / "a.usda", [animation], into=source)
+
+
+@pytest.mark.parametrize("form", ["PNG", "JPEG"])
+def test_a_picture_with_the_programs_mark_is_the_same_picture(tmp_path: Path, source: Path, form: str) -> None:
+    from facediff.export.format import pictures_of
+
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(source.parent / "skin.png", form)
+    ((name, data),) = pictures_of(read_surface(source, 12), "a").values()
+    assert name == ("a_0.png" if form == "PNG" else "a_0.jpg")
+    assert (np.asarray(Image.open(io.BytesIO(data))) == np.asarray(Image.open(source.parent / "skin.png"))).all()
+    assert b"facediff" in data[:200]
+
+
+def test_what_is_missing_or_lies_elsewhere_is_left_out_and_said(tmp_path: Path, source: Path) -> None:
+    secret = tmp_path / "secret.png"
+    (source.parent / "skin.png").rename(secret)
+    for name in ("../secret.png", str(secret), "none.png", "mine.mtl"):
+        (source.parent / "mine.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
+        surface = read_surface(source, 12)
+        assert surface.materials[0].picture is None
+        assert any(name in sentence for sentence in surface.lost)
+    (source.parent / "mine.mtl").unlink()
+    assert "mine.mtl" in read_surface(source, 12).lost[0]
+    text = source.read_text()
+    for broken in (
+        text.replace("2/2", "2/99"),
+        text.replace("2/2", "2/x"),
+        text.replace("f 1/1", "f 1/1 1/1"),
+        "v 0 0 0",
+    ):
+        source.write_text(broken)
+        with pytest.raises(FaceDiffError, match=r"mine\.obj"):
+            read_surface(source, 12)
+
+
+def test_the_commands_take_the_surface(
+    tmp_path: Path, source: Path, animation: Animation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from facediff.animation import write_archive
+
+    write_archive(tmp_path / "a.npz", animation)
+    assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "b.glb"), "--surface", str(source)]) == 0
+    assert b"TEXCOORD_0" in (tmp_path / "b.glb").read_bytes()
+    assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "b.ply"), "--surface", str(source)]) == 2
+    assert "--surface" in capsys.readouterr().err
