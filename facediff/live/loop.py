@@ -20,7 +20,7 @@ import numpy.typing as npt
 from facediff.live.frames import LiveFrame, Receiver
 from facediff.live.model import LiveModel
 from facediff.live.sources import Speech, SpeechSource
-from facediff.live.timing import Lags, Pacer, SpokenClock
+from facediff.live.timing import Lags, Pacer, SpokenClock, Thinning
 from facediff.speech.audio import samples_for
 from facediff.utils import SAMPLE_RATE
 
@@ -35,6 +35,9 @@ has: with long windows, buffering is better than dropping speech."""
 HURRIED = 0.25
 """The same for a model that is too slow: speech that waits would only make all frames late."""
 
+THINNED = 3.0
+"""The same while frames can still be left out, which gives the model time: speech goes last."""
+
 RECENT = 3.0
 """Seconds of speech over which a model's speed is measured."""
 
@@ -45,7 +48,7 @@ class LiveSummary:
 
     Attributes:
         frames: that were sent.
-        dropped: frames that came too late to be sent.
+        dropped: frames that came too late to be sent, or were left out to give the model time.
         speech: seconds that were received.
         lost: seconds of speech that were dropped because the model was too slow.
         busy: seconds that the model has computed.
@@ -85,7 +88,7 @@ def dropped_text(frames: int, speech: float) -> str:
     """What was dropped, said alike while a performance runs and at its end.
 
     Args:
-        frames: that came too late to be sent.
+        frames: that came too late to be sent, or were left out.
         speech: seconds that were never animated.
     """
     return f"{frames} frames dropped" + (f", {speech:.1f} s of speech" if speech else "")
@@ -117,6 +120,11 @@ class Backlog:
             if self._waiting > self.limit * SAMPLE_RATE:
                 self._drop(self._waiting - round(self.limit / 2 * SAMPLE_RATE))
             self._changed.notify()
+
+    @property
+    def waiting(self) -> float:
+        """Seconds of speech that wait."""
+        return self._waiting / SAMPLE_RATE
 
     def _drop(self, least: int) -> None:
         """Drop the oldest samples: frames that they last as a whole."""
@@ -195,6 +203,8 @@ class Loop:
         self._solve, self._seconds, self._report, self._every = solve, seconds, report, every
         self._patience = min(max(PATIENCE[0], model.look_ahead), PATIENCE[1])
         self._backlog = Backlog(model.frame_rate, model.hop + self._patience)
+        self._thinning = Thinning(model.frame_rate)
+        self._slow = False
         self._stopped = threading.Event()
         self._changed = threading.Condition()
         self._frames: deque[_Ready] = deque()
@@ -264,12 +274,19 @@ class Loop:
                 if self.hearing:
                     self._spoken.append((samples, start))
                     self._changed.notify()
+            self._relieve()
             self._backlog.put(samples)
             if heard >= most:
                 self._stopped.set()
                 self._backlog.end()  # the source may wait long before it notices
 
         self.source.run(deliver, self._stopped)
+
+    def _relieve(self) -> None:
+        """Send fewer frames while speech waits, and let none of it be dropped before."""
+        self._thinning.waiting(behind=self._backlog.waiting > self.model.hop + HURRIED)
+        allowed = THINNED if not self._thinning.at_most else HURRIED if self._slow else self._patience
+        self._backlog.limit = self.model.hop + allowed
 
     # The model's thread.
 
@@ -294,6 +311,7 @@ class Loop:
             self._measure(recent)
             ready = self._ready(vertices, ready, gaps, now)
         if fed and not self._abandoned:
+            self._thinning.stride = 1  # nothing waits any more, and the last frame shuts the mouth
             before, began = stream.made, time.monotonic()
             vertices = stream.finish()
             now = time.monotonic()
@@ -303,7 +321,7 @@ class Loop:
             self._ready(vertices, ready, gaps, now)
 
     def _measure(self, recent: deque[tuple[float, float]]) -> None:
-        """Find out whether the model is fast enough, and how much speech may therefore wait for it."""
+        """Find out whether the model is fast enough; if not, little speech may wait for it once frames are left out."""
         computed, heard = recent[-1][0], sum(speech for _, speech in recent)
         self.summary.busy += computed
         hop = self.model.hop
@@ -313,14 +331,13 @@ class Loop:
         # A process that was stopped for a while has one long window: it counts as the next longest.
         longest = sorted((seconds for seconds, _ in recent), reverse=True)
         factor = (sum(longest) - longest[0] + longest[min(1, len(longest) - 1)]) / max(heard, 1e-9)
-        slow = heard > 0.9 * enough and factor > 1
-        self._backlog.limit = hop + (HURRIED if slow else self._patience)
-        if slow and not self._slow_reported:
+        self._slow = heard > 0.9 * enough and factor > 1
+        if self._slow and not self._slow_reported:
             self._slow_reported = True
             self._report(
-                f"the model takes {factor:.2f} s for a second of speech on this machine, so that speech is dropped: "
-                f"export it with fewer --steps and --quick-steps, choose a longer --window or a shorter --overlap, or "
-                f"end other programs"
+                f"the model takes {factor:.2f} s for a second of speech on this machine, so that frames and then "
+                f"speech are dropped: export it with fewer --steps and --quick-steps, choose a longer --window or a "
+                f"shorter --overlap, or end other programs"
             )
 
     def _ready(self, vertices: Array, first: int, gaps: deque[tuple[int, int]], now: float) -> int:
@@ -350,6 +367,9 @@ class Loop:
             with self._changed:
                 while not (self._frames or self._spoken or self._ended):
                     self._changed.wait()
+                while self._frames and not self._thinning.sends(self._frames[0].index):
+                    self._frames.popleft()
+                    self.summary.dropped += 1
                 speech, frame = list(self._spoken), self._frames[0] if self._frames else None
                 self._spoken.clear()
                 if frame is None and self._ended and not speech:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from time import monotonic
 
 import numpy as np
 
@@ -111,6 +112,45 @@ class Pacer:
     def due(self, spoken: float) -> float:
         """When a frame is due whose speech was spoken at a time."""
         return spoken + (self.delay or 0.0)
+
+
+class Thinning:
+    """Which frames are sent while the model falls behind: every one, every second, fourth … as speech goes on waiting.
+
+    A frame that is not sent costs neither blendshapes nor receivers' time, and is hardly missed; speech that is not
+    animated is a syllable without a mouth. So frames go first, until so few are left that a face would be a slide show.
+
+    Args:
+        frame_rate: of the motion.
+    """
+
+    FEWEST = 6.0  # Frames a second that are always sent
+    SETTLING = 0.4  # Seconds that a step must have before the next one
+    CALM = 3.0  # Seconds without waiting speech after which more frames are sent
+
+    def __init__(self, frame_rate: float) -> None:
+        self.stride = 1
+        self._most = max(1, int(frame_rate / self.FEWEST))
+        self._changed = self._behind = -math.inf
+
+    @property
+    def at_most(self) -> bool:
+        """Whether no more frames can be spared, and the last step has had its time."""
+        return self.stride == self._most and monotonic() > self._changed + self.SETTLING
+
+    def waiting(self, *, behind: bool) -> None:
+        """Take note of whether more speech waits than usual."""
+        now = monotonic()
+        if behind:
+            self._behind = now
+            if self.stride < self._most and now > self._changed + self.SETTLING:
+                self.stride, self._changed = min(2 * self.stride, self._most), now
+        elif self.stride > 1 and now > max(self._changed, self._behind) + self.CALM:
+            self.stride, self._changed = self.stride // 2, now
+
+    def sends(self, index: int) -> bool:
+        """Whether the frame of a number is sent."""
+        return index % self.stride == 0
 
 
 class Lags:
