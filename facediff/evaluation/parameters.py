@@ -18,7 +18,7 @@ from facediff.mesh.flame import Flame
 from facediff.metrics import PROTOCOLS, Protocol, Region
 from facediff.spaces import Space
 from facediff.spaces.files import ParameterClip, even, read_parameters
-from facediff.spaces.files.reading import SUFFIXES
+from facediff.spaces.files.reading import ARRAYS, SUFFIXES
 from facediff.spaces.operations import permuted, with_rotations
 from facediff.spaces.rigs import LinearRig, decode_flame
 
@@ -185,7 +185,7 @@ def parameter_files(
 
 
 def _read(path: Path, layout: str | None) -> ParameterClip:
-    return read_parameters(path, layout=layout if path.suffix.lower() in (".npy", ".npz") else None)
+    return read_parameters(path, layout=layout if path.suffix.lower() in ARRAYS else None)
 
 
 def refuse_vertex_protocols(protocols: Sequence[Protocol]) -> None:

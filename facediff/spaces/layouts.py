@@ -36,6 +36,7 @@ class Layout:
         arrays: of an archive, each array's name and the columns of it that are motion, in the space's order.
         identity_array: name of the array of an archive that has the person's coefficients.
         source: whose layout it is.
+        flat: whether it occurs as one array too; else as an archive only.
     """
 
     space: Space
@@ -44,6 +45,7 @@ class Layout:
     arrays: Mapping[str, slice] | None = None
     identity_array: str = ""
     source: str = ""
+    flat: bool = True
 
     @property
     def width(self) -> int:
@@ -130,6 +132,14 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "flame_emote": _flame("expression 100", JAW, source="EMOTE, FLINT"),
     "flame_3dmead": _flame("expression 100", JAW, leading=300, source="3DMEAD's flat form: shape 300 goes first"),
+    "flame_3dmead_release": _flame(
+        *("expression 100", HEAD, JAW),
+        shape=300,
+        arrays={"exp": slice(0, 100), "global_pose": slice(0, 3), "jaw": slice(0, 3)},
+        identity_array="shape",
+        source="3DMEAD's shape_pose_cam.hdf5 (EMOTE); the camera is left out",
+        flat=False,
+    ),
     "flame_beat2": _flame(
         *("expression 100", JAW),
         frame_rate=30.0,
@@ -192,4 +202,4 @@ def layouts_of_width(width: int) -> tuple[str, ...]:
         >>> layouts_of_width(56)
         ('flame_diffposetalk', 'flame_dualtalk', 'flame_dualtalk_truth', 'flame_emoca')
     """
-    return tuple(name for name, entry in LAYOUTS.items() if entry.width == width)
+    return tuple(name for name, entry in LAYOUTS.items() if entry.flat and entry.width == width)

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import FLAME_WIDTH, HDF5_SUFFIXES, read_parameters
+from facediff.data.prepare.motion import FLAME_WIDTH, read_parameters
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.flame import Flame
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import reserve_room
+from facediff.utils.hdf5 import HDF5_SUFFIXES
 from facediff.utils.progress import track
 
 Array = npt.NDArray[np.float64]

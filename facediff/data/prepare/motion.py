@@ -6,19 +6,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.mesh.flame import EXPRESSIONS, SHAPES
 from facediff.utils.arrays import open_array
-from facediff.utils.limits import check_array
-
-if TYPE_CHECKING:
-    import h5py
-
+from facediff.utils.hdf5 import HDF5_SUFFIXES, as_frames, read_frames
 
 # Changing the frame rate of motion without aliasing.
 
@@ -125,8 +120,6 @@ def _reflected(
 
 WIDTHS = {"shape": SHAPES, "exp": EXPRESSIONS, "jaw": 3}
 FLAME_WIDTH = sum(WIDTHS.values())
-MOST_FRAMES = 1_000_000
-HDF5_SUFFIXES = (".hdf5", ".h5")
 
 Array = npt.NDArray[np.float64]
 
@@ -148,7 +141,7 @@ def read_parameters(path: Path) -> FlameParameters:
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected FLAME parameters, .hdf5 or .npy")
-    parts = _read_hdf5(path) if path.suffix.lower() in HDF5_SUFFIXES else _read_array(path)
+    parts = read_frames(path, WIDTHS) if path.suffix.lower() in HDF5_SUFFIXES else _read_array(path)
     for name, values in parts.items():
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
@@ -170,58 +163,6 @@ def _read_array(path: Path) -> dict[str, Array]:
             f"{path}: holds {array.dtype} {array.shape}; expected floats of shape (1, frames, {FLAME_WIDTH}), FLAME "
             f"parameters"
         )
-    joined = _as_frames(array, FLAME_WIDTH, f"{path}: the array")
+    joined = as_frames(array, FLAME_WIDTH, f"{path}: the array", exact=True)
     ends = np.cumsum(list(WIDTHS.values()))
     return dict(zip(WIDTHS, np.split(joined, ends[:-1], axis=1), strict=True))
-
-
-def _read_hdf5(path: Path) -> dict[str, Array]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingExtraError("h5py", "prepare", "reading FLAME reconstructions (.hdf5)") from error
-    try:
-        with h5py.File(path, "r") as file:
-            holder = file if "exp" in file else file.get("data", file)
-            if holder.file.filename != file.filename:
-                raise FaceDiffError(f"{path}: its data lie in another file; expected a file that holds its own data")
-            # hickle keeps the quotes of a key as part of its name.
-            names = {name.strip("\"'"): name for name in holder} if isinstance(holder, h5py.Group) else {}
-            absent = [name for name in WIDTHS if name not in names]
-            if absent:
-                raise FaceDiffError(
-                    f"{path}: has no {', '.join(absent)} (it has {', '.join(sorted(names)) or 'nothing'}); expected "
-                    f"shape, exp and jaw, as shape_pose_cam.hdf5 has them"
-                )
-            return {name: _dataset(holder, names[name], width, path) for name, width in WIDTHS.items()}
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
-        raise FaceDiffError(f"{path}: not a readable HDF5 file, perhaps truncated ({error}); get it again") from error
-
-
-def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
-    import h5py
-
-    where = f"{path}: {name}"
-    link, dataset = holder.get(name, getlink=True), holder.get(name)
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
-        raise FaceDiffError(f"{where} holds no numbers; expected floats of shape (1, frames, up to {most})")
-    # A file from elsewhere must not make facediff read other files of this machine.
-    elsewhere = isinstance(link, h5py.ExternalLink) or dataset.file.filename != holder.file.filename
-    if elsewhere or dataset.external or dataset.is_virtual:
-        raise FaceDiffError(f"{where} lies in another file; expected a file that holds its own data")
-    if max(dataset.shape, default=0) > MOST_FRAMES:
-        raise FaceDiffError(f"{where} has shape {dataset.shape}; expected at most {MOST_FRAMES} frames")
-    check_array(where, dataset.shape, max(8, dataset.dtype.itemsize))
-    return _as_frames(dataset[()], most, where)
-
-
-def _as_frames(values: npt.NDArray[np.generic], most: int, where: str) -> Array:
-    """(T, D) from (1, T, D), the way in which these projects keep a batch of one."""
-    exact = most in (WIDTHS["jaw"], FLAME_WIDTH)  # of shape and expression, the last coefficients may be left out
-    frames = values[0] if values.ndim == 3 and len(values) == 1 else values
-    if frames.ndim != 2 or not len(frames) or not (most if exact else 1) <= frames.shape[1] <= most:
-        raise FaceDiffError(
-            f"{where} has shape {values.shape}; expected (1, frames, {'' if exact else 'up to '}{most}) with at least "
-            f"one frame"
-        )
-    return frames.astype(np.float64)

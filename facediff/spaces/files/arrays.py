@@ -13,19 +13,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.spaces.files.clips import ParameterClip, checked
 from facediff.spaces.layouts import LAYOUTS, Layout, find_layout, layouts_of_width
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.files import atomic
+from facediff.utils.hdf5 import HDF5_SUFFIXES, read_frames
 from facediff.utils.limits import FRAME_RATES, check_number
+
+RELEASE = "flame_3dmead_release"
+RELEASE_WIDTHS = {"shape": 300, "exp": 100, "global_pose": 3, "jaw": 3}
+"""The layout of 3DMEAD's ``shape_pose_cam.hdf5``, and the datasets that are read of it."""
 
 RATES = ("mocap_frame_rate", "fps", "frame_rate")
 """Arrays of an archive that state the frames a second."""
 
 
 def read_array(path: Path, layout: str | None, frame_rate: float | None = None) -> ParameterClip:
-    """Read a ``.npy`` (T, width) or (1, T, width), or a ``.npz`` with the arrays of a layout.
+    """Read a ``.npy`` or ``.pt`` (T, width) or (1, T, width), or a ``.npz`` or ``.hdf5`` with the arrays of a layout.
 
     Args:
         path: the file.
@@ -35,9 +40,10 @@ def read_array(path: Path, layout: str | None, frame_rate: float | None = None) 
     Raises:
         FaceDiffError: without a layout, naming those that fit; or if the file does not have what the layout says.
     """
-    if path.suffix.lower() == ".npz":
+    suffix = path.suffix.lower()
+    if suffix == ".npz" or suffix in HDF5_SUFFIXES:
         return _read_archive(path, layout, frame_rate)
-    array = open_array(path, kinds="fiu")
+    array = _read_tensor(path) if suffix == ".pt" else open_array(path, kinds="fiu")
     if array.ndim == 3 and array.shape[0] == 1:
         array = array[0]
     if array.ndim != 2:
@@ -55,17 +61,40 @@ def read_array(path: Path, layout: str | None, frame_rate: float | None = None) 
     values = checked(path, numbers[:, entry.identity :], rate)
     person = None
     if entry.identity:
-        person = checked(path, numbers[:1, : entry.identity], rate)[0]
-        if (numbers[:, : entry.identity].astype(np.float32) != person).any():
+        shapes = numbers[:, : entry.identity]
+        varies = bool((shapes != shapes[0]).any())
+        # 3DMEAD's reconstructions have a shape for each frame, which is one person's all the same.
+        person = checked(path, shapes.mean(0, keepdims=True) if varies else shapes[:1], rate)[0]
+        if varies and layout != "flame_3dmead":
             raise FaceDiffError(
                 f"{path}: its {entry.space.identity} changes from frame to frame; expected one person's"
             )
     return _clip(path, values, entry, rate, layout, person)
 
 
+def _read_tensor(path: Path) -> npt.NDArray[Any]:
+    """The one tensor of a file of PyTorch's, as ARTalk keeps its style clips."""
+    from facediff.utils.torch_files import load_tensors
+
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; expected a tensor of motion (.pt)")
+    try:
+        with path.open("rb") as stream:
+            content = load_tensors(stream, path)
+    except ImportError as error:
+        raise MissingExtraError("torch", "metrics", "reading a tensor of motion (.pt)") from error
+    if not hasattr(content, "detach") or not content.is_floating_point():
+        raise FaceDiffError(f"{path}: holds a {type(content).__name__}; expected one tensor of numbers")
+    return np.asarray(content.detach().double().numpy())
+
+
 def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> ParameterClip:
     names = {key for entry in LAYOUTS.values() if entry.arrays for key in (*entry.arrays, entry.identity_array)}
-    content = read_arrays(path, {*names, *RATES})
+    if path.suffix.lower() in HDF5_SUFFIXES:
+        layout = layout or RELEASE
+        content: Mapping[str, npt.NDArray[Any]] = read_frames(path, RELEASE_WIDTHS)
+    else:
+        content = read_arrays(path, {*names, *RATES})
     fitting = [name for name, entry in LAYOUTS.items() if entry.arrays and set(entry.arrays) <= set(content)]
     if layout is None or layout not in fitting:
         stated = "has no declared layout" if layout is None else f"has not the arrays of {layout}"
@@ -97,7 +126,9 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     person = None
     if entry.identity_array in content:
         shape = np.asarray(content[entry.identity_array], np.float64)
-        person = checked(path, (shape if shape.ndim == 2 else shape.reshape(1, -1))[:1], rate)[0]
+        # A reconstruction has a shape for each frame, which is one person's all the same.
+        rows = shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape
+        person = checked(path, (rows if rows.ndim == 2 else rows.reshape(1, -1))[:1], rate)[0]
     return _clip(path, checked(path, np.concatenate(parts, axis=1), rate), entry, rate, layout, person)
 
 
@@ -122,7 +153,8 @@ def _clip(
     layout: str,
     person: npt.NDArray[np.float32] | None,
 ) -> ParameterClip:
-    return ParameterClip(path.stem, values, entry.space, rate, None, 0.0, person, layout, _remarks(values, entry))
+    name = path.parent.name if path.stem == "shape_pose_cam" else path.stem
+    return ParameterClip(name, values, entry.space, rate, None, 0.0, person, layout, _remarks(values, entry))
 
 
 def _remarks(values: npt.NDArray[np.float32], entry: Layout) -> tuple[str, ...]:

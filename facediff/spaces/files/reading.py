@@ -16,17 +16,22 @@ from facediff.spaces.files.tables import (
     write_audio2face,
     write_live_link,
 )
+from facediff.utils.hdf5 import HDF5_SUFFIXES
 from facediff.utils.plain_files import read_table
 
-SUFFIXES = (".csv", ".json", ".npy", ".npz")
+ARRAYS = (".npy", ".npz", ".pt", *HDF5_SUFFIXES)
+"""Files of arrays, whose layout is declared."""
+SUFFIXES = (".csv", ".json", *ARRAYS)
 
 
 def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: float | None = None) -> ParameterClip:
     """Read a recording in parameters.
 
     Args:
-        path: a ``.csv`` of Live Link Face or Audio2Face, a ``.json`` of BEAT or LAM, a ``.npy`` or ``.npz``.
-        layout: name of the layout of a ``.npy`` or ``.npz``, which does not say it; the other files name their columns.
+        path: a ``.csv`` of Live Link Face or Audio2Face, a ``.json`` of BEAT or LAM, a ``.npy``, ``.npz`` or
+            ``.pt``, or 3DMEAD's ``.hdf5``.
+        layout: name of the layout of a ``.npy``, ``.npz`` or ``.pt``, which does not say it; other files name their
+            columns.
         frame_rate: frames a second of an array whose layout has no rate of its own.
 
     Raises:
@@ -36,7 +41,7 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(SUFFIXES)}')
-    if suffix in (".npy", ".npz"):
+    if suffix in ARRAYS:
         return read_array(path, layout, frame_rate)
     if layout is not None:
         raise FaceDiffError(f"{path}: names its columns itself; omit the layout {layout}")
