@@ -106,6 +106,8 @@ class GenerationOptions(CheckedOptions):
         seed: seed of the noise; equal seeds give equal motion
         voice_gate: what finds the pauses, in which the mouth comes to rest: energy or webrtc, with options
             (energy:release=0.3); off for the model's own motion there (default: energy, but off for imported models)
+        frame_rate: frames a second of Audio2Face-3D, which has no rate of its own (default: 30)
+        mesh: triangles of Audio2Face-3D's face, whose folder has none: a mesh with the same vertices
     """
 
     identity: Annotated[str | None, Option(metavar="NAME")] = None
@@ -118,6 +120,8 @@ class GenerationOptions(CheckedOptions):
     guidance: Annotated[Scales | None, Option(metavar="SCALES")] = None
     seed: Annotated[ranges.Seed | None, Option(metavar="N")] = 0
     voice_gate: Annotated[str | None, Option(metavar="GATE")] = None
+    frame_rate: Annotated[ranges.FrameRate | None, Option(metavar="F")] = None
+    mesh: Annotated[FilePath | None, Option(metavar="FILE", reads=True)] = None
 
 
 @dataclass(frozen=True)
@@ -463,6 +467,8 @@ class StreamKeywords(ActingKeywords, total=False):
     guidance: Scales | None
     seed: int | None
     voice_gate: str | None
+    frame_rate: float | None
+    mesh: FilePath | None
     window: float | None
     overlap: float | None
     low_latency: bool

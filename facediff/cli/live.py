@@ -15,7 +15,7 @@ from facediff.animation.options import (
 )
 from facediff.errors import FaceDiffError
 from facediff.live.options import LiveOptions
-from facediff.utils.hub import check_animating_source, model_or_bundled
+from facediff.utils.hub import check_animating_source, is_audio2face, model_or_bundled
 from facediff.utils.option import Option
 
 SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
@@ -68,7 +68,8 @@ def live(
     check_animating_source(model)
     if speech is not None and str(speech) != "-" and not speech.is_file():
         raise FaceDiffError(f"{speech}: no such sound file; give a recording, - for standard input, or --microphone")
-    if windows.window is None and windows.overlap is None:
+    # Frames of Audio2Face-3D have a window each, and a low latency by themselves.
+    if windows.window is None and windows.overlap is None and not is_audio2face(model):
         windows = replace(windows, low_latency=True)
     options = AnimationOptions.of(generation, windows, controls, place, checkpoint=model)
     from facediff.live.command import perform, print_report
@@ -99,7 +100,7 @@ def live_model(options: AnimationOptions) -> LiveModel:
         faces=np.zeros((0, 3), np.int32) if face["faces"] is None else face["faces"],
         unit=face["unit"],
         look_ahead=pipeline.look_ahead,
-        hop=pipeline.windows.in_frames(pipeline.frame_rate).hop / pipeline.frame_rate,
+        hop=pipeline.hop,
         colours=face.get("colours"),
         metadata={name: text for name, text in pipeline.metadata(pipeline.seed).items() if text},
     )

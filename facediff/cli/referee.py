@@ -33,7 +33,7 @@ def referee(
     layout: Annotated[str | None, Option(metavar="LAYOUT")] = None,
     frame_rate: FrameRate = None,
     flame: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
-    languages: str = "en,de,es,fr,it,cmn",
+    languages: Annotated[Sequence[str] | None, Option(metavar="CODE,…")] = None,
     voices: Annotated[ranges.Samples, Option(metavar="N")] = 2,
     sentences: Annotated[ranges.Samples, Option(metavar="N")] = 3,
     write_speech: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
@@ -58,17 +58,18 @@ def referee(
         layout: layout of .npy and .npz in parameters, such as arkit or flame_artalk (docs/parameters.md)
         frame_rate: frames a second of motion that does not say it
         flame: your FLAME model file, which shows FLAME's coefficients on the face; without it, only their jaw is scored
-        languages: what is spoken: en, de, es, fr, it, cmn, joined by commas
+        languages: codes of what is spoken: en, de, es, fr, it, cmn (default: all)
         voices: voices of each language, as far as they are installed
         sentences: sentences of each voice
         write_speech: write the speech for models that run elsewhere, and do nothing else
     """
-    from facediff.synthetic.spoken_set import spoken_set, write_spoken_set
+    from facediff.synthetic.spoken_set import LANGUAGES, spoken_set, write_spoken_set
 
     if write_speech is None:
         import facediff.benchmark.referee  # noqa: F401 - what is missing is named before anybody speaks
 
-    clips = spoken_set([code.strip() for code in languages.split(",") if code.strip()], voices, sentences)
+    codes = [*LANGUAGES] if languages is None else list(languages)
+    clips = spoken_set(codes, voices, sentences)
     if write_speech is not None:
         write_spoken_set(clips, write_speech)
         tell(f"written: {len(clips)} recordings in {write_speech / 'wav'}; call motion as they are called")
@@ -90,7 +91,7 @@ def referee(
         raise FaceDiffError(f"no model could be scored, the first: {rows[0].name}: {rows[0].problem}")
     words = [*(models or []), *(f"--motion={word}" for word in motion or [])]
     words += [f"--flame={flame}"] if flame is not None else []
-    words += [f"--languages={languages}", f"--voices={voices}", f"--sentences={sentences}"]
+    words += [f"--languages={','.join(codes)}", f"--voices={voices}", f"--sentences={sentences}"]
     command = shlex.join(["facediff", "benchmark", "referee", *words])
     report = RefereeReport(clips, reference_judgement(clips), rows, command, code_of(), device_name("cpu"))
     files = write_report(report, output)

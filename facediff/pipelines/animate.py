@@ -20,6 +20,7 @@ from facediff.editing.controls import check_controls, is_procedural, keys_file, 
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import SAMPLE_RATE, ranges
 from facediff.utils.files import scratch_folder, valid_text
+from facediff.utils.hub import is_audio2face
 from facediff.utils.progress import track
 
 if TYPE_CHECKING:
@@ -60,6 +61,13 @@ def check_options(options: AnimationOptions) -> None:
         for name in ("style", "condition", "expressivity", "guidance"):
             if getattr(options, name) is not None:
                 keys.refuse_both(name)
+    for name in ("frame_rate", "mesh"):
+        if getattr(options, name) is not None and not is_audio2face(options.checkpoint):
+            raise OptionError(
+                name, "is for a folder of Audio2Face-3D, other models have their own; omit it", getattr(options, name)
+            )
+    if options.mesh is not None and not Path(options.mesh).is_file():
+        raise OptionError("mesh", "no such file", options.mesh)
     if options.style_template is not None and options.style is None:
         raise OptionError("style_template", "belongs to a motion; give {style} as well")
     if options.target_mesh is not None and not Path(options.target_mesh).is_file():
@@ -165,6 +173,11 @@ class AnimationPipeline(ABC):
     @abstractmethod
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
+
+    @property
+    def hop(self) -> float:
+        """Seconds from one window of a stream to the next."""
+        return self.windows.in_frames(self.frame_rate).hop / self.frame_rate
 
     has_weights = False
     """Whether animations have weights of ARKit's shapes by themselves."""

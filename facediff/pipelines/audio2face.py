@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from facediff.animation.options import AnimationOptions
 from facediff.editing.regularised_weights import Regularisation, RegularisedSolver, TemporalTerm, pairs_of
@@ -130,10 +132,11 @@ class Audio2FacePipeline(AnimationPipeline):
         options: AnimationOptions,
         *,
         model: Audio2Face | None = None,
-        frame_rate: float = FRAME_RATE,
+        frame_rate: float | None = None,
         weights: Audio2FaceWeights | None = None,
     ) -> None:
         refuse_fixed(options)
+        frame_rate = options.frame_rate or frame_rate or FRAME_RATE
         self.model = Audio2Face.open(options.checkpoint, threads=options.threads) if model is None else model
         self.weights = weights or Audio2FaceWeights()
         folder = self.model.folder
@@ -153,7 +156,7 @@ class Audio2FacePipeline(AnimationPipeline):
             options,
             face={
                 "template": template,
-                "faces": None,
+                "faces": None if options.mesh is None else triangles_of(Path(options.mesh), len(template)),
                 "frame_rate": float(frame_rate),
                 "unit": UNIT,
                 "regions": {"mask": folder.poses["skin"].mask} if "skin" in folder.poses else {},
@@ -164,6 +167,11 @@ class Audio2FacePipeline(AnimationPipeline):
             usual_gate=OFF,
             rest_weights=lambda: FaceAnimator(folder, frame_rate).lower[:, 0].astype(np.float32),
         )
+
+    @property
+    def hop(self) -> float:
+        """A frame: each has a window of its own."""
+        return 1 / self.frame_rate
 
     @property
     def corpus(self) -> str:
@@ -304,6 +312,20 @@ def refuse_fixed(options: AnimationOptions) -> None:
     for name in (*FIXED, "expressivity", "window", "overlap", "low_latency"):
         if name in changed and (name, changed[name]) not in (("device", "auto"), ("low_latency", False)):
             raise OptionError(name, "has no meaning for Audio2Face-3D, whose frames have a window each; omit it")
+
+
+def triangles_of(path: Path, vertices: int) -> npt.NDArray[np.int32]:
+    """The triangles of a mesh that must have so many vertices, in the folder's order."""
+    from facediff.mesh import read_mesh
+
+    mesh = read_mesh(path)
+    if len(mesh.vertices) != vertices:
+        raise OptionError(
+            "mesh",
+            f"has {len(mesh.vertices)} vertices and the folder's face {vertices}; expected the mesh that belongs to it",
+            path,
+        )
+    return np.asarray(mesh.faces, np.int32)
 
 
 def licences_of(model: Audio2Face) -> tuple[Licence, ...]:

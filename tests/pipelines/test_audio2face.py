@@ -167,3 +167,36 @@ print([name for name in ("torch", "scipy", "lightning") if name in sys.modules])
 """
     words = [sys.executable, "-c", program, str(folder), str(tmp_path / "face.csv")]
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "[]\n"  # noqa: S603
+
+
+def test_rate_and_triangles_come_from_the_command_line(
+    folder: Path, content: dict[str, Any], model: Audio2FaceAnimator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    soundfile.write(tmp_path / "a.wav", SPEECH, 16_000, subtype="FLOAT")
+    rest = model.model.folder.arrays["skin"]
+    lines = [f"v {x} {y} {z}" for x, y, z in rest] + ["f 1 2 3", "f 2 3 4"]
+    (tmp_path / "face.obj").write_text("\n".join(lines) + "\n")
+    words = ["animate", str(tmp_path / "a.wav"), "--checkpoint", str(folder), "--quiet", "--frame-rate", "60"]
+    assert main([*words, "-o", str(tmp_path / "x.npz")]) == 0
+    animation = facediff.read(tmp_path / "x.npz")
+    assert (animation.frame_rate, len(animation.vertices)) == (60.0, 75)
+    model.frame_rate = 60.0
+    np.testing.assert_allclose(animation.vertices, model.animate((SPEECH, 16_000)).vertices, atol=1e-5)
+    assert main([*words, "--mesh", str(tmp_path / "face.obj"), "-o", str(tmp_path / "x.glb")]) == 0
+    assert (tmp_path / "x.glb").stat().st_size > 1000
+    (tmp_path / "other.obj").write_text("\n".join([*lines[:3], "f 1 2 3"]) + "\n")
+    assert main([*words, "--mesh", str(tmp_path / "other.obj"), "-o", str(tmp_path / "y.glb")]) == 2
+    assert "other.obj" in capsys.readouterr().err
+    with pytest.raises(FaceDiffError, match="frame_rate"):
+        facediff.load().animate((SPEECH, 16_000), frame_rate=60.0)
+
+
+def test_live_needs_no_windows(
+    folder: Path, content: dict[str, Any], model: Audio2FaceAnimator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    soundfile.write(tmp_path / "a.wav", SPEECH, 16_000, subtype="FLOAT")
+    monkeypatch.chdir(tmp_path)
+    words = ["live", str(folder), "a.wav", "--to", "jsonl:out.jsonl?weights=false", "--quiet"]
+    assert main(words) == 0
+    lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert len(lines) >= 5  # a slow machine drops frames
