@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import torch
@@ -40,7 +41,7 @@ class EmaWithWarmup(WeightAveraging):
     ) -> None:
         self.decay = decay
         self.warmup = warmup
-        super().__init__(device=device, use_buffers=False, avg_fn=self.averaged)
+        super().__init__(device=device, use_buffers=False, multi_avg_fn=self.average)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Copy the model, whole: its own set-up, where it would make what the corpus decides, comes later."""
@@ -53,12 +54,15 @@ class EmaWithWarmup(WeightAveraging):
         """The decay after a number of averaged steps."""
         return ((1 + step) / (self.warmup + step)).clamp(max=self.decay)
 
-    def averaged(self, average: Tensor, current: Tensor, step: Tensor) -> Tensor:
-        """The new average of a weight.
+    @torch.no_grad()
+    def average(self, averages: Sequence[Tensor], weights: Sequence[Tensor], step: Tensor) -> None:
+        """Update the averages of weights of one type on one device.
 
         Args:
-            average: the average so far.
-            current: the weight after the last optimiser step.
-            step: averaged steps so far, at least 1; on the weight's device, so that nothing waits for it.
+            averages: the averages so far.
+            weights: the weights after the last optimiser step.
+            step: averaged steps so far, at least 1; on the weights' device, so that nothing waits for it.
         """
-        return torch.lerp(average, current, (1 - self.decay_at(step.float())).to(average.dtype))
+        share = (1 - self.decay_at(step.float())).to(averages[0].dtype)
+        for average, weight in zip(averages, weights, strict=True):
+            average.lerp_(weight, share)
