@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder
-from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed, confirm_cost
-from facediff.cli.process import tell
+from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed
+from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source, model_name

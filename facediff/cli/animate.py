@@ -17,13 +17,12 @@ from facediff.animation.options import (
     TargetOptions,
     WindowOptions,
 )
-from facediff.cli.options import Scheduler, Workers, check_output, confirm_cost
+from facediff.cli.options import Scheduler, Workers
 from facediff.cli.parsing import changed, refuse_idle
-from facediff.cli.process import tell
+from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import check_animating_source, model_or_bundled
-from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
 
 
@@ -115,8 +114,9 @@ def animate(
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     checkpoint = model_or_bundled(checkpoint)
     check_animating_source(checkpoint)
-    check_scheduler(batch.scheduler)
-    check_output(files, batch.suffix if several else ".npy" if stream else output.suffix)
+    from facediff.export import check_export, check_used
+
+    check_used(batch.suffix if several else ".npy" if stream else output.suffix, files.changed())
     files = replace(files, quiet=quiet)
     options = AnimationOptions.of(
         generation, windows, recording, controls, target, place, licence, checkpoint=checkpoint, quiet=quiet
@@ -128,7 +128,9 @@ def animate(
         return 0
     if several:
         from facediff.pipelines.folder import animate_folder
+        from facediff.utils.jobs import check_scheduler
 
+        check_scheduler(batch.scheduler)
         return animate_folder(
             options,
             speech,
@@ -139,10 +141,9 @@ def animate(
             scheduler=batch.scheduler,
             retry_failed=batch.retry_failed,
         )
-    from facediff.export import check_export
     from facediff.pipelines.animate import check_options, direction_for
     from facediff.pipelines.opening import open_pipeline
-    from facediff.speech.inputs import read_recording
+    from facediff.speech.audio import read_recording
     from facediff.speech.voice_activity import speech_problems
     from facediff.utils.hub import may_have_weights
 

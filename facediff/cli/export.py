@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from facediff.animation.options import AnimationControls, ExportOptions, SourceOptions
-from facediff.cli.options import Animations, Output, check_output, check_source, with_different_names
+from facediff.cli.options import Animations, Output, check_source, with_different_names
 from facediff.cli.parsing import with_more_help
 from facediff.cli.process import tell
 
@@ -42,7 +42,7 @@ def export(
     from facediff.animation import Animation
     from facediff.animation.files import has_values
     from facediff.editing.controls import check_controls
-    from facediff.export import FORMATS, check_export, write_animations
+    from facediff.export import FORMATS, check_export, check_used, write_animations
     from facediff.pipelines.motion import SourceReader
 
     footer = ""  # under a video: the corpus, and whether it is synthetic
@@ -51,7 +51,7 @@ def export(
 
         assets = read_assets(source.checkpoint)
         footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
-    check_output(files, output.suffix)
+    check_used(output.suffix, files.changed())
     options = replace(files, footer=footer, quiet=quiet)
     check_export(output, options, len(animations), weights=all(map(has_values, animations)))
     check_controls(controls)

@@ -64,7 +64,7 @@ def export_model(
     require_onnx()
     samples = None
     if speech is not None:
-        from facediff.speech.inputs import read_recording
+        from facediff.speech.audio import read_recording
 
         samples = read_recording(speech)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.animation.options import ExportOptions, SourceOptions
+    from facediff.animation.options import SourceOptions
 
 Output = Annotated[Path, Option(also="-o", metavar="OUT", writes="file")]
 OutputFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder")]
@@ -49,13 +48,6 @@ def check_source(source: SourceOptions, animations: Sequence[Path]) -> None:
             raise OptionError(option, "no such file", file)
 
 
-def check_output(output: ExportOptions, suffix: str) -> None:
-    """Refuse options that a format does not use."""
-    from facediff.export import check_used
-
-    check_used(suffix, output.changed())
-
-
 def with_different_names(animations: Sequence[Animation], paths: Sequence[Path]) -> list[Animation]:
     """The animations under their own names; where those are alike, as of one recording, under their files' names."""
     alike = len({animation.name for animation in animations}) < len(animations)
@@ -63,31 +55,6 @@ def with_different_names(animations: Sequence[Animation], paths: Sequence[Path])
         replace(animation, name=valid_text(path.stem if alike else animation.name))
         for animation, path in zip(animations, paths, strict=True)
     ]
-
-
-LONG, LARGE = 3600.0, 8 * 2**30
-"""Seconds and bytes above which a command names its cost and waits for a yes."""
-
-
-def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0.0) -> None:
-    """Name what a command is going to take where that is much, and start only if the user agrees.
-
-    Args:
-        yes: whether the user has agreed beforehand.
-        lower: the options that lower the cost.
-        seconds: roughly how long it takes on two processor cores.
-        size: bytes that it takes in memory, or on disk until it has ended.
-    """
-    if yes or (seconds <= LONG and size <= LARGE):
-        return
-    costs = [f"{seconds / 3600:.3g} hours on two processor cores"] if seconds > LONG else []
-    costs += [f"{size / 2**30:.3g} GiB of memory or disk"] if size > LARGE else []
-    cost = f"this takes about {' and '.join(costs)}"
-    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty():
-        print(f"facediff: {cost}; start? [y/N] ", end="", file=sys.stderr, flush=True)
-        if sys.stdin.readline().strip().lower() in ("y", "yes"):
-            return
-    raise FaceDiffError(f"{cost}; lower {lower}, or add --yes to start all the same")
 
 
 def check_picture_path(path: Path | None) -> None:

@@ -1,4 +1,4 @@
-"""The process of a command: standard streams, signals and exit statuses.
+"""The process of a command: standard streams, what it prints and asks, signals and exit statuses.
 
 A command is stopped by an exception in any case, so that half-written files are removed on the way out.
 """
@@ -25,6 +25,8 @@ LONGEST = 900
 """Characters of an error that are printed."""
 TRACEBACK = "FACEDIFF_TRACEBACK"
 """Environment variable that shows the traceback of an unexpected error in place of a sentence."""
+LONG, LARGE = 3600.0, 8 * 2**30
+"""Seconds and bytes above which a command names its cost and waits for a yes."""
 
 
 class StandardOutputError(FaceDiffError):
@@ -101,6 +103,27 @@ def tell(*lines: object) -> None:
     for line in lines:
         print(printable(line).encode(encoding, errors="backslashreplace").decode(encoding))
     sys.stdout.flush()
+
+
+def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0.0) -> None:
+    """Name what a command is going to take where that is much, and start only if the user agrees.
+
+    Args:
+        yes: whether the user has agreed beforehand.
+        lower: the options that lower the cost.
+        seconds: roughly how long it takes on two processor cores.
+        size: bytes that it takes in memory, or on disk until it has ended.
+    """
+    if yes or (seconds <= LONG and size <= LARGE):
+        return
+    costs = [f"{seconds / 3600:.3g} hours on two processor cores"] if seconds > LONG else []
+    costs += [f"{size / 2**30:.3g} GiB of memory or disk"] if size > LARGE else []
+    cost = f"this takes about {' and '.join(costs)}"
+    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty():
+        print(f"facediff: {cost}; start? [y/N] ", end="", file=sys.stderr, flush=True)
+        if sys.stdin.readline().strip().lower() in ("y", "yes"):
+            return
+    raise FaceDiffError(f"{cost}; lower {lower}, or add --yes to start all the same")
 
 
 def flush() -> None:

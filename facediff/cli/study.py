@@ -17,11 +17,10 @@ from facediff.cli.options import (
     View,
     Workers,
     check_folders,
-    confirm_cost,
     named_folders,
 )
 from facediff.cli.parsing import refuse_idle
-from facediff.cli.process import tell
+from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler

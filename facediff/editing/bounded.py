@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from facediff.utils.without_scipy import has_scipy, solve_block_chain
+from facediff.utils.numerics import has_scipy, solve_block_chain
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -9,9 +9,10 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.eyes import Array, smooth_step
+from facediff.editing.eyes import Array
 from facediff.editing.procedural import EDITED, copied, noted
 from facediff.errors import FaceDiffError
+from facediff.utils.numerics import smooth_step
 
 RAMP = 0.08
 """Seconds in which lips come together, and part again."""

@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import Scales, scales_text
-from facediff.editing.eyes import Array, Eyes, Indices, smooth_step
+from facediff.editing.eyes import Array, Eyes, Indices
 from facediff.editing.procedural import EDITED, in_words, noted, room_for
 from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.utils.numerics import nearest_distances, smooth_step
 from facediff.utils.ranges import Range
-from facediff.utils.without_scipy import nearest_distances
 
 ALL = "all"  # The name of all vertices that no other name is given for
 FALL_OFF = 0.06

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.limits import quoted
+from facediff.utils.numerics import smooth_step
 from facediff.utils.plain_files import load_json
 
 Array = npt.NDArray[np.float64]
@@ -262,9 +263,3 @@ def _ways(edge: Array, other: Array) -> Array:
 def _arch(edge: Array) -> Array:
     """1 in the middle of an edge, 0 at the corners (N,)."""
     return np.asarray(np.sin(np.pi * _along(edge)))
-
-
-def smooth_step(values: npt.ArrayLike) -> Array:
-    """3t² − 2t³ of values limited to 0 … 1: from 0 to 1 with flat ends."""
-    t = np.clip(np.asarray(values, np.float64), 0.0, 1.0)
-    return np.asarray(t * t * (3.0 - 2.0 * t))

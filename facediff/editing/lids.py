@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.eyes import MEET, smooth_step
+from facediff.editing.eyes import MEET
 from facediff.editing.face_features import LIDS, SAMPLES, Features, Opening, Seen
 from facediff.editing.surface import Surface
+from facediff.utils.numerics import smooth_step
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

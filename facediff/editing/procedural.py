@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.eyes import GIVE, Array, Eyes, smooth_step
+from facediff.editing.eyes import GIVE, Array, Eyes
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
 from facediff.utils.files import reserve_room
+from facediff.utils.numerics import smooth_step
 
 PROCEDURAL = "procedural"  # Metadata key: what was added by rules
 EDITED = "edited"  # Metadata key: how the animation's own motion was changed

@@ -35,10 +35,10 @@ from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.parts import mesh_parts, named_triangles
 from facediff.spaces.shape_files import read_shape_files
+from facediff.spaces.space import METRES
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
-from facediff.utils.units import METRES
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from facediff.pipelines.audio2face import Audio2FaceWeights, Part
     from facediff.runtime import RuntimeModel
     from facediff.runtime.audio2face import Audio2Face
-    from facediff.speech.inputs import Speech, Waveform
+    from facediff.speech.audio import Speech, Waveform
 
     DType = str | torch.dtype
 
@@ -224,7 +224,7 @@ class SpeechAnimator(ABC):
                     raise OptionError(option, "is for one recording; omit it, or animate them one by one")
             if name is not None:
                 raise FaceDiffError("name: is for one recording; omit it, each has its own")
-        from facediff.speech.inputs import speech_of
+        from facediff.speech.audio import speech_of
 
         animations: list[Animation | Samples] = []
         with self.open(chosen) as pipeline:
@@ -268,7 +268,7 @@ class SpeechAnimator(ABC):
             >>> for frames in model.stream(microphone(), identity="F1"):  # doctest: +SKIP
             ...     show(frames)
         """
-        from facediff.speech.inputs import stream_piece
+        from facediff.speech.audio import stream_piece
 
         rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
         with self.open(self._options(dtype, **options)) as pipeline:

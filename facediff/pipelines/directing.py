@@ -107,14 +107,14 @@ class ExpressivityShare(Share):
 
 
 def plan_runs(
-    direction: Direction | None,
+    direction: Direction,
     model: AnimationModel,
     identity: str,
     style: Reference | Style | None,
     condition: str | None,
     style_template: str | Path | None = None,
 ) -> list[ConditionedRun]:
-    """What must be generated, one run where nothing changes.
+    """What must be generated.
 
     Args:
         direction: keys over time.
@@ -124,8 +124,6 @@ def plan_runs(
         condition: what holds without keys of condition.
         style_template: as ``--style-template`` takes it.
     """
-    if direction is None:
-        return [ConditionedRun(style, condition, model.choices())]
     channels = [name for name in direction.channels if name in ("style", "condition") or name.startswith("guidance.")]
     alternatives: list[list[tuple[str, float | str, Share]]] = []
     for name in channels:

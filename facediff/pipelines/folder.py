@@ -19,7 +19,7 @@ from facediff.errors import FaceDiffError, OptionError, choices, printable
 from facediff.export import FORMATS, check_export
 from facediff.pipelines.animate import check_options
 from facediff.pipelines.opening import open_pipeline
-from facediff.speech.inputs import read_recording
+from facediff.speech.audio import read_recording
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial

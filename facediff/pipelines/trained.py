@@ -98,14 +98,16 @@ class TrainedPipeline(AnimationPipeline):
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on."""
-        from facediff.pipelines.directing import plan_runs
+        from facediff.pipelines.directing import ConditionedRun, plan_runs
 
-        options = self.options
-        if direction is not None and self.style is not None:
-            direction.refuse_both("style")
-        self.runs = plan_runs(
-            direction, self.model, self.identity, self.style, options.condition, options.style_template
-        )
+        style, condition = self.style, self.options.condition
+        if direction is None:
+            self.runs = [ConditionedRun(style, condition, self.model.choices())]
+        else:
+            if style is not None:
+                direction.refuse_both("style")
+            template = self.options.style_template
+            self.runs = plan_runs(direction, self.model, self.identity, style, condition, template)
         super().direct(direction)
 
     def frames_of(self, samples: int) -> int:
@@ -122,8 +124,6 @@ class TrainedPipeline(AnimationPipeline):
             return
         import torch
 
-        from facediff.pipelines.directing import blend
-
         audio, motions = torch.from_numpy(speech).to(self.model.device), []
         styles: dict[str, None] = {}
         for run in self.runs:
@@ -139,7 +139,12 @@ class TrainedPipeline(AnimationPipeline):
             motions.append(torch.stack([sample.vertices for sample in samples]))
             styles[samples[0].reference_name] = None
         self.style_name = ", ".join(styles)
-        yield [*blend(motions, self.runs, self.frame_rate).numpy()]
+        if len(self.runs) == 1:
+            yield [*motions[0].numpy()]
+        else:
+            from facediff.pipelines.directing import blend
+
+            yield [*blend(motions, self.runs, self.frame_rate).numpy()]
 
     def generator(self) -> FirstSample:
         """What generates vertices while speech arrives."""

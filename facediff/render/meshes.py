@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.utils.without_scipy import has_scipy
+from facediff.utils.numerics import has_scipy
 
 Faces = npt.NDArray[np.int32]
 Float64 = npt.NDArray[np.float64]

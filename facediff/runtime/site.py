@@ -23,7 +23,7 @@ from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.export.viewer.page import assemble, script_of
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, check_graphs, read_folder
 from facediff.runtime.onnxruntime_web import LICENCE
-from facediff.speech.inputs import read_recording
+from facediff.speech.audio import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
 from facediff.speech.windows import LOW_LATENCY
 from facediff.utils.files import atomic_folder

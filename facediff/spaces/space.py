@@ -1,17 +1,18 @@
 """What the numbers of a motion mean: vertices of a mesh, or the channels of a parametric face.
 
 Motion is ``(frames, points, dims)`` in every space. For vertices the points are vertices and each has three
-coordinates; for parameters the points are channels, one number each.
+coordinates; for parameters the points are channels, one number each. Units of length stand at the end.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import quoted
+from facediff.utils.limits import brief, quoted
 from facediff.utils.plain_options import is_name
 
 Kind = Literal["vertices", "arkit", "flame", "linear"]
@@ -242,3 +243,36 @@ def _is_number(value: object) -> bool:
 
 def _wrong(name: str, value: object, expected: str) -> FaceDiffError:
     return FaceDiffError(f"space: {name} is {quoted(value)}; expected {expected}")
+
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS = (1e-9, 1e9)
+"""Metres that a unit of length may have."""
+_ABOUT = re.compile(r"about ([0-9.]+) mm\b")
+
+
+def metres_per_unit(unit: str) -> float:
+    """Metres in one unit of length.
+
+    Args:
+        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", such as that of a
+            corpus whose faces were normalised.
+
+    Raises:
+        FaceDiffError: if it is none of these.
+
+    Example:
+        >>> metres_per_unit("mm"), metres_per_unit("normalised (about 185 mm)")
+        (0.001, 0.185)
+    """
+    about = _ABOUT.search(unit)
+    try:
+        value = float(about[1]) / 1000 if about else METRES.get(unit) or float(unit)
+    except ValueError:
+        value = 0.0
+    if not UNITS[0] <= value <= UNITS[1]:
+        raise FaceDiffError(
+            f'unit "{brief(unit) if unit else ""}": expected one of {", ".join(METRES)}, or a number of metres from '
+            f"{UNITS[0]:g} to {UNITS[1]:g}"
+        )
+    return value

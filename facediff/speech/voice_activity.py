@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, MissingExtraError, OptionError
 from facediff.registry import UnknownComponentError, checks_arguments, voice_gate
-from facediff.speech.filters import RecursiveFilter
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.numerics import RecursiveFilter
 from facediff.utils.ranges import Range
 
 Wave = npt.NDArray[np.floating]

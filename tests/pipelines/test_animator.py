@@ -17,7 +17,7 @@ import facediff
 from facediff.animation.options import AnimateKeywords, StreamKeywords
 from facediff.cli.app import main
 from facediff.models import Style
-from facediff.speech.inputs import speech_of
+from facediff.speech.audio import speech_of
 
 
 @pytest.fixture

@@ -27,9 +27,9 @@ import numpy as np
 
 from facediff.data.manifest import LONGEST
 from facediff.errors import FaceDiffError
+from facediff.spaces.space import metres_per_unit
 from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_array, check_format, check_nesting, check_number, quoted
 from facediff.utils.plain_files import parse_json
-from facediff.utils.units import metres_per_unit
 
 FORMAT = "facediff packed corpus 1"
 RECORD = "facediff"

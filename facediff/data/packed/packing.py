@@ -47,13 +47,13 @@ from facediff.data.packed.stores import is_packed
 from facediff.data.prepare.runner import refuse_foreign, version
 from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, motion_path, open_motion, refuse_out_of_range
 from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import open_sound
 from facediff.speech.cut_short import refuse_cut_short
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import in_order, run_tasks
 from facediff.utils.limits import LIMITS, quoted
 from facediff.utils.plain_files import load_json, parse_json, write_json
-from facediff.utils.units import metres_per_unit
 
 if TYPE_CHECKING:
     from facediff.data.check.layouts import CorpusView

@@ -10,7 +10,7 @@ import pytest
 import soundfile
 
 from facediff.errors import FaceDiffError
-from facediff.speech.inputs import speech_of
+from facediff.speech.audio import speech_of
 
 TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
 

@@ -1,0 +1,135 @@
+"""Numerical helpers in NumPy: a smooth step, and what SciPy does, which is larger than all the rest of the runtime.
+
+Where SciPy is installed, it finds nearest points in its place, which is faster.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+CHUNK = 2**22
+"""Distances that are held in memory at a time."""
+
+BLOCK = 128
+"""Samples whose response in a filter is one product of matrices."""
+
+
+def smooth_step(values: npt.ArrayLike) -> Array:
+    """3t² − 2t³ of values limited to 0 … 1: from 0 to 1 with flat ends."""
+    t = np.clip(np.asarray(values, np.float64), 0.0, 1.0)
+    return np.asarray(t * t * (3.0 - 2.0 * t))
+
+
+def has_scipy() -> bool:
+    """Whether SciPy is installed."""
+    return importlib.util.find_spec("scipy") is not None
+
+
+def nearest_distances(points: Array, others: Array, limit: float = np.inf) -> Array:
+    """Distance (P,) of each point (P, 3) to the nearest of others (Q, 3); infinite where it is ``limit`` or more."""
+    if has_scipy():
+        from scipy.spatial import cKDTree
+
+        return cast(Array, cKDTree(others).query(points, distance_upper_bound=limit)[0])
+    return nearest_by_chunks(points, others, limit)
+
+
+def nearest_by_chunks(points: Array, others: Array, limit: float = np.inf) -> Array:
+    """The same by all distances."""
+    rows = max(1, CHUNK // max(1, len(others)))
+    nearest = np.empty(len(points))
+    for begin in range(0, len(points), rows):
+        apart = points[begin : begin + rows, None] - others[None]
+        nearest[begin : begin + rows] = np.sqrt(np.square(apart).sum(-1).min(1))
+    return np.where(nearest < limit, nearest, np.inf)
+
+
+def solve_block_chain(diagonal: Array, coupling: Array, right: Array) -> Array:
+    """Solve a symmetric positive definite system whose blocks are coupled to their neighbours by diagonal matrices.
+
+    Args:
+        diagonal: (T, K, K) the blocks on the diagonal.
+        coupling: (T − 1, K) the diagonals of the blocks next to it.
+        right: (T, K).
+
+    Returns:
+        the solution (T, K).
+    """
+    frames, count = right.shape
+    solution = np.array(right, np.float64)
+    inverses = np.empty((frames, count, count))
+    for t in range(frames):  # elimination, block by block
+        block = diagonal[t]
+        if t:
+            link = coupling[t - 1]
+            block = block - link[:, None] * inverses[t - 1] * link
+            solution[t] -= link * (inverses[t - 1] @ solution[t - 1])
+        inverses[t] = np.linalg.inv(block)
+    for t in reversed(range(frames)):
+        after = coupling[t] * solution[t + 1] if t + 1 < frames else 0.0
+        solution[t] = inverses[t] @ (solution[t] - after)
+    return solution
+
+
+class RecursiveFilter:
+    """Second-order sections one after the other, as SciPy's ``sosfilt`` runs them, for samples that arrive in pieces.
+
+    Args:
+        sections: (sections, 6): b0, b1, b2, 1, a1, a2.
+
+    Example:
+        >>> RecursiveFilter([[0.5, 0.5, 0, 1, 0, 0]]).feed(np.array([1.0, 1.0, 0.0]))  # the mean of two samples
+        array([0.5, 1. , 0.5])
+    """
+
+    def __init__(self, sections: npt.ArrayLike) -> None:
+        rows = np.asarray(sections, np.float64)
+        self._sections = [_Section(row) for row in rows]
+
+    def feed(self, samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Filter more samples (n,)."""
+        filtered = np.asarray(samples, np.float64)
+        for section in self._sections:
+            filtered = section.feed(filtered)
+        return filtered
+
+
+class _Section:
+    """One second-order section in its state-space form, x' = A x + B u, y = C x + D u, by blocks of samples."""
+
+    def __init__(self, row: npt.NDArray[np.float64]) -> None:
+        b0, b1, b2, _, a1, a2 = row
+        transition = np.array([[-a1, 1.0], [-a2, 0.0]])
+        entry = np.array([b1 - a1 * b0, b2 - a2 * b0])
+        powers = [np.eye(2)]
+        for _ in range(BLOCK):
+            powers.append(transition @ powers[-1])
+        impulse = np.array([b0, *(float((powers[n] @ entry)[0]) for n in range(BLOCK - 1))])
+        lag = np.arange(BLOCK)[:, None] - np.arange(BLOCK)[None]
+        # What a block's samples give in the same block; what its state gives there; and the state after n samples.
+        self._direct = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
+        self._free = np.stack([power[0] for power in powers[:BLOCK]])
+        self._entries = np.stack([power @ entry for power in powers[:BLOCK]])
+        self._powers = powers
+        self._state = np.zeros(2)
+
+    def feed(self, samples: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        whole = len(samples) // BLOCK * BLOCK
+        blocks = samples[:whole].reshape(-1, BLOCK)
+        filtered = blocks @ self._direct.T
+        gained = blocks @ self._entries[::-1]
+        for row, gain in zip(filtered, gained, strict=True):
+            row += self._free @ self._state
+            self._state = self._powers[BLOCK] @ self._state + gain
+        rest = samples[whole:]
+        count = len(rest)
+        last = self._direct[:count, :count] @ rest + self._free[:count] @ self._state
+        if count:
+            self._state = self._powers[count] @ self._state + rest @ self._entries[:count][::-1]
+        return np.concatenate([filtered.reshape(-1), last])
