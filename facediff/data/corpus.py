@@ -23,7 +23,7 @@ from facediff.data.manifest import LONGEST
 from facediff.data.manifest import read_manifest as read_manifest
 from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
-from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, Stretch
+from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, Stretch, WeightFile
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
@@ -229,6 +229,40 @@ class Corpus:
         numbers = range(self._frames[clip.name])[start:stop]
         picks = range(numbers.start * stride, numbers.stop * stride, stride)
         return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
+
+    def mean_motion(self, clip: Clip) -> Tensor:
+        """Mean offset from the template over all frames (V, dims), float64."""
+        opened = self._open(clip)
+        if not isinstance(opened, WeightFile):
+            return self.read_motion(clip).mean(0, dtype=torch.float64)
+        # Decoding is linear, so the mean of the weights gives the mean face, for one frame's work.
+        mean = opened.checked(self._all_frames(clip)).mean(0, dtype=np.float64)
+        return torch.from_numpy(opened.decode(mean[None].astype(np.float32))[0] - self.template(clip).numpy()).double()
+
+    def read_projected(self, clip: Clip, project: Callable[[Tensor], Tensor], kept: dict[str, Tensor]) -> Tensor:
+        """An affine function of each frame of a clip, (T, K).
+
+        Args:
+            clip: the clip.
+            project: takes offsets from the template (T, V, dims) to (T, K).
+            kept: what the function makes of speakers' shapes, by speaker; filled here.
+        """
+        opened = self._open(clip)
+        if not isinstance(opened, WeightFile):
+            return project(self.read_motion(clip))
+        # Decoding is linear too: weights meet the function of 54 shapes, instead of the function meeting each frame.
+        if clip.identity not in kept:
+            shapes = torch.from_numpy(np.array(opened.rig, np.float32))
+            shapes[0] -= self.template(clip)
+            images = project(torch.cat([torch.zeros_like(shapes[:1]), shapes]))
+            kept[clip.identity] = torch.cat([images[1:2], images[2:] - images[:1]])
+        images = kept[clip.identity]
+        return torch.from_numpy(opened.checked(self._all_frames(clip))) @ images[1:] + images[0]
+
+    def _all_frames(self, clip: Clip) -> range:
+        """The stored frames of a clip that are read of it as a whole."""
+        stride = self._strides[clip.root]
+        return range(0, self.frames(clip) * stride, stride)
 
     def read_spread(self, clip: Clip, count: int, phase: float | None = None) -> Tensor:
         """Offsets from the template (at most ``count``, V, dims), float32, of evenly spread frames.

@@ -42,11 +42,13 @@ class ProjectionSlot:
     def __init__(self) -> None:
         self.project: Callable[[Tensor], Tensor] | None = None
         self._kept: dict[str, Tensor] = {}
+        self._shapes: dict[str, Tensor] = {}
 
     def choose(self, project: Callable[[Tensor], Tensor] | None) -> None:
         """Make components (T, K) of a clip's offsets (T, V, 3) from now on; None leaves them as they are."""
         self.project = project
         self._kept.clear()
+        self._shapes.clear()
 
     def read(self, corpus: Corpus, clip: Clip, start: int, stop: int) -> Tensor:
         """Some frames of a clip in the chosen form."""
@@ -54,7 +56,7 @@ class ProjectionSlot:
             return corpus.read_motion(clip, start, stop)
         if clip.name not in self._kept:
             # By whole clips, so that a frame's components do not depend on the window in which it was read first.
-            self._kept[clip.name] = self.project(corpus.read_motion(clip))
+            self._kept[clip.name] = corpus.read_projected(clip, self.project, self._shapes)
         return self._kept[clip.name][start:stop]
 
 

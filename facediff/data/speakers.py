@@ -38,12 +38,12 @@ class MeanFaces:
             raise FaceDiffError(f"{data.root}: no training clip; expected some, to compute the speakers' mean faces")
         self.faces: dict[str, Tensor] = {}
         for speaker, clips in by_speaker.items():
-            total, frames = torch.zeros(data.n_vertices, data.space.dims, dtype=torch.float64), 0
-            for clip in spread(clips):
-                motion = data.corpus.read_motion(clip)
-                total += motion.sum(0, dtype=torch.float64)
-                frames += len(motion)
-            self.faces[speaker] = (total / frames).float()
+            chosen = spread(clips)
+            frames = [data.corpus.frames(clip) for clip in chosen]
+            total = torch.zeros(data.n_vertices, data.space.dims, dtype=torch.float64)
+            for clip, count in zip(chosen, frames, strict=True):
+                total += count * data.corpus.mean_motion(clip)
+            self.faces[speaker] = (total / sum(frames)).float()
         self.of_all = torch.stack(list(self.faces.values())).mean(0)
 
     def of(self, speakers: Sequence[str]) -> Tensor:
@@ -64,7 +64,7 @@ def speaker_gallery(data: SpeechMotionDataModule, speakers: Sequence[str], asset
     for number, speaker in enumerate(speakers):
         usable = [clip for clip in candidates.get(speaker, []) if data.find_split(clip) in ("train", None)]
         for clip in spread(usable):
-            mean = data.corpus.read_motion(clip).mean(0)
+            mean = data.corpus.mean_motion(clip).float()
             means.append(assets.to_scored(mean, speaker))
             numbers.append(number)
     if len({*numbers}) < 2:

@@ -255,11 +255,21 @@ class WeightFile:
 
     def read(self, picks: Sequence[int]) -> npt.NDArray[np.float32]:
         """Absolute vertices (len(picks), V, 3) of some frames."""
-        weights = np.asarray(self.weights[np.array(picks, np.intp)], np.float32)
+        return self.decode(np.asarray(self.weights[np.array(picks, np.intp)], np.float32))
+
+    def decode(self, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Absolute vertices (T, V, 3) of some weights (T, K)."""
         shapes = np.asarray(self.rig[1:], np.float32).reshape(len(self.rig) - 1, -1)
         motion = (weights @ shapes).reshape(len(weights), -1, 3)
         motion += np.asarray(self.rig[0], np.float32)
         return motion
+
+    def checked(self, picks: Sequence[int]) -> npt.NDArray[np.float32]:
+        """The weights (at most len(picks), K) of some frames, for those who do not decode them."""
+        picks = within(picks, self.frames)
+        weights = np.asarray(self.weights[np.array(picks, np.intp)], np.float32)
+        refuse_out_of_range(weights[..., None], picks, self.path)
+        return weights
 
     def offsets(self, picks: Sequence[int], template: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Offsets from the template of some frames."""
