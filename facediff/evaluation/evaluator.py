@@ -33,10 +33,10 @@ from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, p
 from facediff.metrics.by_name import parse_all
 from facediff.reporting.statistics import Bootstrap
 from facediff.spaces.files.reading import SUFFIXES
+from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE, read_speech
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
-from facediff.utils.units import metres_per_unit
 
 
 @ranges.checked

@@ -35,9 +35,9 @@ from facediff.metrics import (
 )
 from facediff.metrics.by_name import parse_all
 from facediff.models.inference import Inference, Style
+from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
-from facediff.utils.units import metres_per_unit
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
 """Which identity unseen speakers are tested with. ``style_only``: none, with the style of their own reference.
