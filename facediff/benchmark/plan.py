@@ -43,6 +43,8 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,60}")
 OPTION = re.compile(r"(model|data|trainer)(\.\w+)*|(seed_everything|name)")
 LARGEST_SEED = 2**32 - 1
 MOST_CELLS = 10_000
+LONGEST_NAME = 180
+"""Bytes of a file's name, with room for a corpus's in it; file systems have 255."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +187,14 @@ class Section:
     def optional(self, key: str) -> str | None:
         """A text that may be missing."""
         return None if self.content.get(key) is None else self.text(key)
+
+    def file(self, key: str) -> str | None:
+        """The path of a file or folder, which may be missing."""
+        text = self.optional(key)
+        names = [] if text is None else text.encode(errors="surrogatepass").split(b"/")
+        if "\0" in (text or "") or any(len(name) > LONGEST_NAME for name in names) or len(names) > LONGEST_NAME:
+            raise FaceDiffError(f"{self.place}: {key} is {quoted(text)}; expected the path of a file, with short names")
+        return text
 
     def texts(self, key: str) -> tuple[str, ...]:
         """A list of texts; empty if it is missing."""
@@ -330,7 +340,7 @@ def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> Benchmark
 
 
 def _corpus(name: str, section: Section, roots: Mapping[str, Path], path: Path) -> CorpusEntry:
-    data, root = section.optional("data"), section.optional("root")
+    data, root = section.optional("data"), section.file("root")
     folder = roots.get(name) or (None if root is None else _beside(path, root))
     if folder is not None and not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; expected the corpus {name}, give it with --root {name}=FOLDER")
@@ -353,10 +363,10 @@ def _method(
         )
     chosen = section.names("corpora", list(corpora), "corpus")
     before = tuple(
-        Before(step, options.text("config"), options.options("options"))
+        Before(step, options.file("config") or options.text("config"), options.options("options"))
         for step, options in section.sections("before", BEFORE_KEYS).items()
     )
-    for config in [section.optional("config"), *(step.config for step in before)]:
+    for config in [section.file("config"), *(step.config for step in before)]:
         for corpus in chosen or corpora if config else ():
             find_config(str(config).replace("{corpus}", corpus), f"{section.place}: config", path)
     form = OPTION if sources[0] == "config" else re.compile(r"[a-z][\w-]*")
@@ -365,9 +375,9 @@ def _method(
     return MethodEntry(
         name=name,
         label=section.text("label", name),
-        config=section.optional("config"),
-        checkpoint=section.optional("checkpoint"),
-        predictions=section.optional("predictions"),
+        config=section.file("config"),
+        checkpoint=section.file("checkpoint"),
+        predictions=section.file("predictions"),
         options=section.options("options", form),
         test_options=section.options("test_options"),
         before=before,

@@ -120,7 +120,7 @@ def files_of(cell: Cell) -> list[Path]:
     return [path for path in named if isinstance(path, Path) and path.exists()]
 
 
-def record_failure(folder: Path, cell: Cell, problem: str) -> None:
+def record_failure(folder: Path, cell: Cell, problem: str, _result: Result | None) -> None:
     """Write why a cell failed in place of its result; a result has written itself."""
     if problem:
         Result.failed(cell, problem, machine_of(0)).write(folder)

@@ -36,8 +36,8 @@ TABLE = 40
 FEW = 20
 """Recordings of which workers of a cluster are asked beforehand whether they see them."""
 
-Animate = Callable[[Path, Path], None]
-"""Animates a recording (first) and writes a file (second), whole or not at all."""
+Animate = Callable[[Path, Path], list[Path] | None]
+"""Animates a recording (first) and writes a file (second), whole or not at all; returns all files that it wrote."""
 MakeWorker = Callable[[list[str]], Animate]
 """Takes the options and loads what all recordings have in common."""
 
@@ -192,14 +192,15 @@ def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: l
     pipeline = open_pipeline(options)
     own = directions_folder(options) is not None
 
-    def animate(recording: Path, output: Path) -> None:
+    def animate(recording: Path, output: Path) -> list[Path]:
         speech = read_recording(recording, options.max_seconds)
         if own:
             from facediff.editing.direction import read_direction
 
             file = next(iter(_own_files(options, recording)), None)
             pipeline.direct(None if file is None else read_direction(file, pipeline.frame_rate))
-        pipeline.write(speech, recording.stem, output, export, seed=seed_of_recording(recording, pipeline.seed))
+        seed = seed_of_recording(recording, pipeline.seed)
+        return list(pipeline.write(speech, recording.stem, output, export, seed=seed)[0])
 
     return animate
 
@@ -320,7 +321,7 @@ def run_folder(
     return int(any(state == "failed" for state, _ in states.values()))
 
 
-def _set_up(make_worker: MakeWorker, command: list[str]) -> Callable[[FileTask], None]:
+def _set_up(make_worker: MakeWorker, command: list[str]) -> Callable[[FileTask], list[Path] | None]:
     animate = make_worker(command)
     return lambda task: animate(task.source, task.output)
 

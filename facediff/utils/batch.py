@@ -50,7 +50,7 @@ def run_batch(
     scheduler: str | None = "",
     writes: Path | None = None,
     reads: Iterable[Path] = (),
-    record: Callable[[Task, str], None] | None = None,
+    record: Callable[[Task, str, Result | None], None] | None = None,
     survive_bugs: bool = False,
 ) -> Generator[tuple[Task, Outcome[Result]]]:
     """Do tasks in several workers past failures, as :func:`~facediff.utils.jobs.run_tasks` does them.
@@ -62,8 +62,8 @@ def run_batch(
         scheduler: where the tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
         writes: folder that tasks write to.
         reads: files and folders that tasks read.
-        record: called with each task that is done and its problem, in the worker, so that also what is finished after
-            Ctrl-C is recorded; picklable.
+        record: called with each task that is done, its problem and its result, in the worker, so that also what is
+            finished after Ctrl-C is recorded; picklable.
         survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
             task; it is raised otherwise.
 
@@ -79,7 +79,7 @@ def run_batch(
                 problem = f"{task}: killed its process, perhaps for lack of memory; try --workers 1"
                 outcome = Outcome(problem=problem)
                 if record is not None:
-                    record(task, problem)
+                    record(task, problem, None)
             if outcome.trace:  # printed here, since a worker's standard error may be a log on another machine
                 print(outcome.trace, end="", file=sys.stderr, flush=True)
             if outcome.fatal:
@@ -89,7 +89,7 @@ def run_batch(
 
 def _attempt(
     work: Callable[[Task], Result],
-    record: Callable[[Task, str], None] | None,
+    record: Callable[[Task, str, Result | None], None] | None,
     survive_bugs: bool,
     task: Task,
 ) -> Outcome[Result]:
@@ -112,7 +112,7 @@ def _attempt(
         problem = f"{task}: {type(error).__name__}: {error} (see the traceback above)"
         outcome = Outcome(problem=problem, trace=traceback.format_exc())
     if record is not None:
-        record(task, outcome.problem)
+        record(task, outcome.problem, outcome.result)
     return replace(outcome, seconds=time.monotonic() - started)
 
 
@@ -159,12 +159,19 @@ class FileTask:
     def _record_file(self) -> Path:
         return (self.records or self.output.parent) / RECORDS / f"{short_name(self.output.name, 200)}.json"
 
-    def record(self, problem: str) -> None:
-        """Record that the task is done; an empty problem means that the output is there."""
+    def record(self, problem: str, written: object = None) -> None:
+        """Record that the task is done.
+
+        Args:
+            problem: empty if the output is there.
+            written: a list of all files that the task wrote, such as the speech next to an animation.
+        """
+        paths = [path for path in written if isinstance(path, Path)] if isinstance(written, list) else []
         record = {
             "speech": _stat(self.source) | {"sha256": _digest(self.source)},
             "recipe": {"command": list(self.recipe.command), "files": dict(self.recipe.files)},
             "output_bytes": None if problem else self.output.stat().st_size,
+            "next_to": {path.name: _bytes(path) for path in paths if path != self.output and path.is_file()},
             "problem": problem,
         }
         write_json(self._record_file, record)
@@ -190,10 +197,10 @@ class FileTask:
             return "the options have changed"
         if not self._same_source(record["speech"]):
             return "the recording has changed"
-        if not record.get("problem") and not (
-            self.output.is_file() and self.output.stat().st_size == record.get("output_bytes")
-        ):
-            return "the output is missing or damaged"
+        sizes = {self.output.name: record.get("output_bytes"), **(record.get("next_to") or {})}
+        for name, size in {} if record.get("problem") else sizes.items():
+            if size is None or _bytes(self.output.parent / name) != size:
+                return f"{name} is missing or damaged"
         return ""
 
     def _read_record(self) -> dict[str, Any] | None:
@@ -201,6 +208,7 @@ class FileTask:
         recipe = {} if record is None else record.get("recipe")
         parts = [] if record is None else [record.get("speech"), recipe]
         parts += [recipe.get("files")] if isinstance(recipe, dict) else []
+        parts += [] if record is None else [record.get("next_to") or {}]
         return record if parts and all(isinstance(part, dict) for part in parts) else None
 
     def _same_source(self, recorded: Mapping[str, Any]) -> bool:
@@ -211,6 +219,11 @@ class FileTask:
         return all(recorded.get(name) == value for name, value in stat.items()) or (
             recorded.get("bytes") == stat.get("bytes") is not None and recorded.get("sha256") == _digest(self.source)
         )
+
+
+def _bytes(path: Path) -> int | None:
+    """The size of a file; None if there is none."""
+    return path.stat().st_size if path.is_file() else None
 
 
 def _digest(path: Path) -> str:

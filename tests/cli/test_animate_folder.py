@@ -46,6 +46,21 @@ def times(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder.parent / "out").glob("*.npy")}
 
 
+def test_a_damaged_file_next_to_an_output_makes_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a.wav").write_text("with sound")
+    assert run(folder) == 0
+    sound, before = folder.parent / "out" / "a.sound", times(folder)
+    assert run(folder) == 0
+    assert times(folder) == before
+    for damage in (lambda: sound.write_bytes(b""), sound.unlink):
+        damage()
+        assert run(folder) == 0
+        assert sound.read_text() == "sound"
+        assert times(folder).pop("a.npy") != before.pop("a.npy")
+        before = times(folder)
+        assert "a.sound is missing or damaged" in capsys.readouterr().out
+
+
 def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, words in (("b", "bad"), ("c", "deadly"), ("d", "bug")):
         (folder / f"{name}.wav").write_text(words)

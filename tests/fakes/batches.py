@@ -13,14 +13,14 @@ from facediff.pipelines.folder import run_folder, seed_of_recording
 from facediff.utils.files import atomic
 
 
-def worker(command: list[str]) -> Callable[[Path, Path], None]:
+def worker(command: list[str]) -> Callable[[Path, Path], list[Path]]:
     """Writes which process animated, the how many-th recording of that process it is, and the seed."""
     done: list[Path] = []
     if "no-model" in command:
         raise FaceDiffError("C.ckpt: no such checkpoint")
     pause = float(command[command.index("--pause") + 1]) if "--pause" in command else 0.0
 
-    def animate(speech: Path, output: Path) -> None:
+    def animate(speech: Path, output: Path) -> list[Path]:
         words = speech.read_text()
         if words == "deadly":
             os._exit(9)
@@ -34,6 +34,10 @@ def worker(command: list[str]) -> Callable[[Path, Path], None]:
             time.sleep(pause)
             seed = seed_of_recording(speech, 3)
             temporary.write_text(json.dumps({"pid": os.getpid(), "nth": len(done), "said": words, "seed": seed}))
+        if words != "with sound":
+            return [output]
+        output.with_suffix(".sound").write_text("sound")
+        return [output, output.with_suffix(".sound")]
 
     return animate
 

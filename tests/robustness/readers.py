@@ -123,13 +123,33 @@ def in_a_corpus(path: Path, name: str) -> Path:
 
 
 def plan(path: Path) -> None:
-    path.write_text("name: trial\nseeds: [0, 1]\noptions: &all {steps: 10, scale: 0.5}\nother: *all\n")
+    (path.parent / "one.yaml").write_text("model: {dim: 3}\n")
+    path.write_text(
+        """\
+title: Two methods
+metrics: [lve, fdd]
+seeds: [0, 1]
+baseline: one
+options: &all {trainer.max_epochs: 4, model.dim: 8}
+test_options: *all
+threads: 2
+workers: 2
+references: [still]
+corpora:
+  tiny: {label: Tiny, options: {data.window: 9}}
+methods:
+  one: {label: One, config: one.yaml}
+  two: {config: one.yaml, before: {prior: {config: one.yaml}}, options: {model.prior: "{prior}"}, seeds: [3]}
+"""
+    )
 
 
 def read_plan(path: Path) -> object:
-    from facediff.utils.yaml_files import load_yaml
+    from facediff.benchmark import cells_of
+    from facediff.benchmark import read_plan as read
 
-    return load_yaml(path, "expected a plan")
+    (path.parent / "one.yaml").write_text("model: {dim: 3}\n")
+    return cells_of(read(path))
 
 
 def benchmark_plan(path: Path) -> None:

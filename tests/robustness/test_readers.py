@@ -179,3 +179,14 @@ def test_a_message_quotes_no_megabytes() -> None:
 def test_a_name_that_is_too_long_is_refused() -> None:
     with pytest.raises(FaceDiffError, match=r"too long"):
         mesh_files.read_mesh(Path("a" * 3000 + ".obj"))
+
+
+PLANS = ("plan", "direction, json", "direction, csv")
+
+
+@pytest.mark.parametrize("count", [15, pytest.param(700, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])])
+@pytest.mark.parametrize("name", PLANS)
+def test_mutated_plans_and_directions_are_read_or_refused(name: str, count: int, tmp_path: Path) -> None:
+    law = run(name, count, 34, tmp_path)
+    assert law.broken == []
+    assert law.counts["refused"] > count / 4

@@ -163,7 +163,9 @@ def test_check_and_unpack_take_addresses(served: tuple[Path, str], tmp_path: Pat
     assert describe_files(tmp_path / "far") == describe_files(tmp_path / "near")
 
 
-@pytest.mark.parametrize("address", ["http://127.0.0.1:9/corpus.zarr", "nosuch://bucket/corpus.zarr", "/elsewhere"])
+@pytest.mark.parametrize(
+    "address", ["http://127.0.0.1:9/corpus.zarr", "nosuch://bucket/corpus.zarr", "jupyter://x", "/elsewhere"]
+)
 def test_what_cannot_be_reached_is_one_sentence(served: tuple[Path, str], address: str) -> None:
     address = served[1].rpartition("/")[0] + address if address.startswith("/") else address
     with pytest.raises(FaceDiffError, match=re.escape(address)):
