@@ -161,7 +161,7 @@ def animate(
     written, animation = pipeline.write(speech_samples, speech[0].stem, output, files)
     metadata = animation.metadata
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
-    notes += f", licence: {metadata['licence']}"
+    notes += f", licence: {metadata.get('licence', 'not stated')}"
     line = f"{len(animation.vertices)} frames, identity {metadata['identity']}, style of {metadata['style']}{notes}"
     for path in written:
         tell(f"{path}: {line}")

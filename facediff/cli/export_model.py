@@ -81,7 +81,8 @@ def export_model(
     description = export(loaded, output, precision=weights, speech=samples, identities=identities)
     megabytes = sum(description.sizes.values()) / 1e6
     check = description.check
+    unit = f" {description.unit}" if description.motion_space.is_vertices else " of a channel"
     tell(
         f"wrote {output}: {megabytes:.1f} MB, {description.precision}; largest difference from PyTorch "
-        f"{check['largest_difference']:.1e} {description.unit}, {check['share_of_range']:.1e} of the motion's range"
+        f"{check['largest_difference']:.1e}{unit}, {check['share_of_range']:.1e} of the motion's range"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +16,7 @@ from facediff.animation.options import (
 )
 from facediff.errors import FaceDiffError
 from facediff.live.options import LiveOptions
-from facediff.utils.hub import check_animating_source, is_audio2face, model_or_bundled
+from facediff.utils.hub import check_animating_source, is_audio2face, may_have_weights, model_or_bundled
 from facediff.utils.option import Option
 
 SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
@@ -77,7 +78,7 @@ def live(
 
     check_options(options)
     performance = replace(performance, speech=None if speech is None else str(speech))
-    perform(performance, lambda: live_model(options), print_report)
+    perform(performance, lambda: live_model(options), print_report, weights=may_have_weights(model))
 
 
 def live_model(options: AnimationOptions) -> LiveModel:
@@ -92,9 +93,9 @@ def live_model(options: AnimationOptions) -> LiveModel:
     if pipeline.rest is not None and pipeline.gate == USUAL_GATE:
         pipeline.rest.gate = read_gate(usual_gate(pipeline.windows.look_ahead)) or pipeline.rest.gate
     pipeline.stream()  # what cannot be streamed is refused before anything is opened
-    face = pipeline.facts
+    face, channels = pipeline.facts, pipeline.gives_channels
     return LiveModel(
-        start=pipeline.stream,
+        start=partial(pipeline.stream, channels=channels),
         frame_rate=pipeline.frame_rate,
         neutral=face["template"],
         faces=np.zeros((0, 3), np.int32) if face["faces"] is None else face["faces"],
@@ -102,5 +103,6 @@ def live_model(options: AnimationOptions) -> LiveModel:
         look_ahead=pipeline.look_ahead,
         hop=pipeline.hop,
         colours=face.get("colours"),
+        decoder=pipeline.decoder if channels else None,
         metadata={name: text for name, text in pipeline.metadata(pipeline.seed).items() if text},
     )

@@ -295,15 +295,16 @@ class Rig:
     def decode(
         self, motion: Float[Tensor, "*frames channels 1"], space: Space, identity: str
     ) -> Float[Tensor, "*frames vertices 3"]:
-        """Offsets of channels as offsets of a speaker's vertices; how the head turns as a whole is left out.
-
-        A speaker without shapes of their own moves by the mean of all others'.
-        """
-        own = self.deltas.get(identity)
-        # The mean is that of thousands of speakers in some models, so that it is taken where it is needed only.
-        deltas = (self.mean if own is None else own).to(motion)
+        """Offsets of channels as offsets of a speaker's vertices; how the head turns as a whole is left out."""
+        deltas = self.deltas_of(identity).to(motion)
         weights = motion[..., list(space.face), 0]
         return (weights @ deltas.flatten(1)).view(*weights.shape[:-1], *deltas.shape[1:])
+
+    def deltas_of(self, identity: str) -> Float[Tensor, "face vertices 3"]:
+        """A speaker's shapes; the mean of all others' where they have none of their own."""
+        own = self.deltas.get(identity)
+        # The mean is that of thousands of speakers in some models, so that it is taken where it is needed only.
+        return self.mean if own is None else own
 
     def gram(self, weights: Float[Tensor, "vertices 3"]) -> Float[Tensor, "face face"]:
         """Products D Dᵀ of the weighted deltas D, the mean over speakers, over the number of coordinates.

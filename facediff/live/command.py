@@ -18,13 +18,16 @@ from facediff.live.sources import USUAL
 Report = Callable[[str], None]
 
 
-def perform(options: LiveOptions, open_model: Callable[[], LiveModel], report: Report) -> LiveSummary:
+def perform(
+    options: LiveOptions, open_model: Callable[[], LiveModel], report: Report, *, weights: bool = False
+) -> LiveSummary:
     """Perform from the first check to the report at the end.
 
     Args:
         options: the choices.
         open_model: opens the model, after everything else has been checked.
         report: prints a sentence.
+        weights: whether the model may give weights of ARKit's shapes by itself.
 
     Raises:
         FaceDiffError: if something cannot work at all. Failures of the receiving programs are no errors once the
@@ -41,14 +44,14 @@ def perform(options: LiveOptions, open_model: Callable[[], LiveModel], report: R
 
         check_shapes(options.shapes)
     weighted = [receiver.name for receiver in receivers if receiver.needs_weights]
-    if weighted and options.shapes is None:
-        raise FaceDiffError(
-            f"{OPTION} {weighted[0]}: sends weights of blendshapes; give --shapes: a folder of meshes, a .glb, or "
-            f"puppet for the built-in face"
-        )
+    unsolved = weighted and options.shapes is None
+    if unsolved and not weights:
+        raise needs_shapes(weighted[0])
     source = options.source()
     model = open_model()
-    names, solve = ((), None) if options.shapes is None or not weighted else solver(options.shapes, model)
+    if unsolved and not model.weights:
+        raise needs_shapes(weighted[0])
+    names, solve = (model.weights, None) if options.shapes is None or not weighted else solver(options.shapes, model)
     outputs = [*receivers, *([] if sound is None else [sound])]
     performance = Performance(
         frame_rate=model.frame_rate,
@@ -83,6 +86,14 @@ def perform(options: LiveOptions, open_model: Callable[[], LiveModel], report: R
     for sentence in summary.sentences():
         report(sentence)
     return summary
+
+
+def needs_shapes(name: str) -> FaceDiffError:
+    """That a receiver sends weights, and nothing says of which shapes."""
+    return FaceDiffError(
+        f"{OPTION} {name}: sends weights of blendshapes; give --shapes: a folder of meshes, a .glb, or puppet for the "
+        f"built-in face"
+    )
 
 
 def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:

@@ -37,7 +37,8 @@ class LiveFrame:
         time: seconds of speech, from the start, at which the frame begins.
         heard: :func:`time.monotonic` when the last sample within the frame had arrived.
         vertices: offsets from the neutral face (V, 3), in the performance's unit.
-        weights: of the performance's blendshapes (len(shapes),), from 0 to 1; None if no receiver needs them.
+        weights: of the performance's blendshapes (len(shapes),), from 0 to 1, and in radians what turns; None if no
+            receiver needs them.
         dropped: frames that were dropped so far, before this one.
     """
 
@@ -64,7 +65,7 @@ class Performance:
         faces: its triangles (F, 3); empty if the model has none.
         unit: of length: ``m``, ``mm`` …
         subject: name of the face in the receiving program.
-        shapes: names of the blendshapes, in the order of :attr:`LiveFrame.weights`.
+        shapes: names of the blendshapes, in the order of :attr:`LiveFrame.weights`; of a model of channels all of them.
         sample_rate: of speech, in Hz.
         colours: of the vertices (V, 3), bytes of sRGB; None if there are none.
         speech: whether receivers that can play speech shall do so.

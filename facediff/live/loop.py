@@ -168,6 +168,7 @@ class _Ready:
     spoken: float
     ready: float
     vertices: Array
+    values: Array | None
 
 
 class Loop:
@@ -178,7 +179,7 @@ class Loop:
         source: of the speech.
         receivers: of the frames; they are open, and closed by the caller.
         hearing: those of them that play the speech.
-        solve: finds weights of blendshapes for receivers that need them.
+        solve: finds weights of blendshapes for receivers that need them; None to send those that the model gives.
         seconds: of speech, after which it ends; None for the source's own end.
         report: prints a sentence.
         every: seconds between reports; None for none but that of a slow model.
@@ -302,23 +303,23 @@ class Loop:
                 gaps.append((math.ceil(fed * self.model.frame_rate / SAMPLE_RATE), dropped))
                 self.summary.lost = dropped / self.model.frame_rate
             before, began = stream.made, time.monotonic()
-            vertices = stream.feed(samples)
+            points = stream.feed(samples)
             now = time.monotonic()
             fed += len(samples)
             if stream.made > before:
                 self.summary.computing.add(now - began)
             recent.append((now - began, len(samples) / SAMPLE_RATE))
             self._measure(recent)
-            ready = self._ready(vertices, ready, gaps, now)
+            ready = self._ready(points, ready, gaps, now)
         if fed and not self._abandoned:
             self._thinning.stride = 1  # nothing waits any more, and the last frame shuts the mouth
             before, began = stream.made, time.monotonic()
-            vertices = stream.finish()
+            points = stream.finish()
             now = time.monotonic()
             self.summary.busy += now - began
             if stream.made > before:
                 self.summary.computing.add(now - began)
-            self._ready(vertices, ready, gaps, now)
+            self._ready(points, ready, gaps, now)
 
     def _measure(self, recent: deque[tuple[float, float]]) -> None:
         """Find out whether the model is fast enough; if not, little speech may wait for it once frames are left out."""
@@ -340,11 +341,13 @@ class Loop:
                 f"shorter --overlap, or end other programs"
             )
 
-    def _ready(self, vertices: Array, first: int, gaps: deque[tuple[int, int]], now: float) -> int:
-        """Queue frames (m, V, 3) of the stream, the first of which has the number ``made``; the number of the next."""
-        if not len(vertices):
+    def _ready(self, points: Array, first: int, gaps: deque[tuple[int, int]], now: float) -> int:
+        """Queue frames of the stream, the first of which has the number ``first``; the number of the next."""
+        if not len(points):
             return first
-        offsets = vertices - self.model.neutral
+        decoder = self.model.decoder
+        values = [None] * len(points) if decoder is None else decoder.values(points)
+        offsets = (points if decoder is None else decoder.vertices(points)) - self.model.neutral
         with self._changed:
             for place, frame_offsets in enumerate(offsets):
                 while len(gaps) > 1 and gaps[1][0] <= first + place:
@@ -353,9 +356,9 @@ class Loop:
                 spoken = self.clock.spoken((index + 1) / self.model.frame_rate)
                 if place == 0:
                     self.pacer.ready(spoken, now)
-                self._frames.append(_Ready(index, spoken, now, frame_offsets))
+                self._frames.append(_Ready(index, spoken, now, frame_offsets, values[place]))
             self._changed.notify()
-        return first + len(vertices)
+        return first + len(points)
 
     # The caller's thread.
 
@@ -391,7 +394,7 @@ class Loop:
             if self._late(frame):
                 self.summary.dropped += 1
             else:
-                self._send(frame, weights[1] if weights[0] == frame.index else None, solving)
+                self._send(frame, weights[1] if weights[0] == frame.index else frame.values, solving)
             if self._every is not None and time.monotonic() - reported > self._every:
                 reported = time.monotonic()
                 self._tell()

@@ -9,24 +9,25 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from facediff.spaces.decoding import Decoder
 from facediff.speech.voice_activity import USUAL_GATE, EnergyGate
 from facediff.utils import SAMPLE_RATE
 
 Array = npt.NDArray[np.float32]
 
 
-class VertexStream(Protocol):
-    """A stream: speech in pieces, to vertices."""
+class MotionStream(Protocol):
+    """A stream: speech in pieces, to absolute points of the model's motion: vertices, or channels."""
 
     @property
     def made(self) -> int:
         """Frames that the model has generated so far; some of them may wait to be certain."""
 
     def feed(self, samples: Array, /) -> Array:
-        """Take samples (n,) at 16 kHz, and give the frames (m, V, 3) that are certain now."""
+        """Take samples (n,) at 16 kHz, and give the frames (m, points, dims) that are certain now."""
 
     def finish(self) -> Array:
-        """The frames (m, V, 3) that are left."""
+        """The frames (m, points, dims) that are left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +43,11 @@ class LiveModel:
         look_ahead: seconds of speech that must arrive after a frame begins before it is certain, at most.
         hop: seconds of frames that become certain together.
         colours: of the vertices (V, 3); None if there are none.
+        decoder: turns a stream's frames into vertices, where they are channels; None where they are vertices.
         metadata: model, corpus, licences, identity, style, seed.
     """
 
-    start: Callable[[], VertexStream]
+    start: Callable[[], MotionStream]
     frame_rate: float
     neutral: Array
     faces: npt.NDArray[np.int32]
@@ -53,7 +55,14 @@ class LiveModel:
     look_ahead: float
     hop: float
     colours: npt.NDArray[np.uint8] | None = None
+    decoder: Decoder | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Names of the weights of ARKit's shapes that a stream's frames are; empty where they are something else."""
+        arkit = self.decoder is not None and self.decoder.space.kind == "arkit"
+        return self.decoder.space.channels if arkit and self.decoder is not None else ()
 
     @property
     def lag(self) -> float:

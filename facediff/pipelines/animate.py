@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from facediff.editing.controlled import ControlledFace
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
+    from facediff.spaces.decoding import Decoder
     from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.stream import AnimationStream, VertexGenerator
     from facediff.speech.voice_activity import MouthAtRest
@@ -99,8 +100,8 @@ class AnimationPipeline(ABC):
         model: name of the model, for errors.
         samples: whether the model's motion depends on a seed.
         usual_gate: the model's voice gate, where the options choose none.
-        rest_weights: how far each point (V,) goes to rest in pauses.
-        resting: the points (V, dims) of the model's motion at rest; those of the neutral face if None.
+        rest_weights: how far each vertex (V,) goes to rest in pauses, where the model's motion is vertices.
+        decoder: turns the channels of the model's motion into vertices; None where it is vertices.
 
     Attributes:
         seed: of the first sample.
@@ -126,8 +127,10 @@ class AnimationPipeline(ABC):
         samples: bool,
         usual_gate: str,
         rest_weights: Callable[[], Array],
-        resting: Array | None = None,
+        decoder: Decoder | None = None,
     ) -> None:
+        import numpy as np
+
         from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, MouthAtRest, read_gate
 
         self.options, self.facts, self.windows = options, face, windows
@@ -142,12 +145,14 @@ class AnimationPipeline(ABC):
         self.seed = options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or drawn else 0
         self.progress: Progress | None = None
         self.rest: MouthAtRest | None = None
-        self.resting: Array = face["template"] if resting is None else resting
+        self.decoder = decoder
+        self.resting: Array = face["template"] if decoder is None else decoder.resting[:, None].astype(np.float32)
         self.gate = options.voice_gate or usual_gate
         if options.low_latency and self.gate == USUAL_GATE:
             self.gate = QUICK_GATE  # The usual gate looks further ahead than windows of low latency do.
         if (gate := read_gate(self.gate)) is not None:
-            self.rest = MouthAtRest(gate, self.resting, rest_weights(), self.frame_rate)
+            weights = rest_weights() if decoder is None else decoder.rest_weights
+            self.rest = MouthAtRest(gate, self.resting, weights, self.frame_rate)
         self.acting: Acting | None = None
         if options.acting is not None:
             from facediff.editing.acting import read_acting
@@ -179,24 +184,30 @@ class AnimationPipeline(ABC):
         """Seconds from one window of a stream to the next."""
         return self.windows.in_frames(self.frame_rate).hop / self.frame_rate
 
-    has_weights = False
-    """Whether animations have weights of ARKit's shapes by themselves."""
+    @property
+    def has_weights(self) -> bool:
+        """Whether animations have weights of ARKit's shapes by themselves."""
+        return self.decoder is not None and self.decoder.space.kind == "arkit"
 
-    def made_of(self, animation: Animation, points: Array) -> Animation:  # noqa: ARG002
-        """An animation of the face alone with what it was decoded from; of vertices nothing."""
-        return animation
+    def made_of(self, animation: Animation, points: Array) -> Animation:
+        """An animation of the face alone with the channels that its vertices were decoded from; of vertices none."""
+        decoder = self.decoder
+        return animation if decoder is None else animation.made_of(decoder.space, decoder.values(points))
 
-    def posed(self, animation: Animation, points: Array) -> Animation:  # noqa: ARG002
-        """A finished animation with what its points say besides the face: how the head turns; of vertices nothing."""
-        return animation
+    def posed(self, animation: Animation, points: Array) -> Animation:
+        """A finished animation with the turns of the head that its channels say, unless something else moves it."""
+        from facediff.editing.procedural import move_head, moves_head
+
+        turns = None if self.decoder is None else self.decoder.head_turns(points)
+        if turns is None or moves_head(animation):
+            return animation
+        values = animation.values
+        turned = move_head(animation, turns, 0 * turns)
+        return turned if values is None else turned.made_of(animation.space, values)
 
     def shown(self, points: Array) -> Array:
         """Absolute vertices (T, V, 3) of points as the model generates them."""
-        return points
-
-    def rest_of_stream(self) -> MouthAtRest | None:
-        """What brings the mouth of a stream's vertices to rest."""
-        return self.rest
+        return points if self.decoder is None else self.decoder.vertices(points)
 
     @property
     @abstractmethod
@@ -286,8 +297,12 @@ class AnimationPipeline(ABC):
                 finished.append(self._finished(animation, seeds[i], points))
             yield finished
 
-    def stream(self, rate: int = SAMPLE_RATE) -> AnimationStream:
+    def stream(self, rate: int = SAMPLE_RATE, *, channels: bool = False) -> AnimationStream:
         """What animates speech of any length while it arrives.
+
+        Args:
+            rate: sample rate of the speech.
+            channels: give the channels (m, C, 1) of the model's motion instead of vertices; see :attr:`gives_channels`.
 
         Raises:
             FaceDiffError: if a control needs the whole animation.
@@ -298,19 +313,29 @@ class AnimationPipeline(ABC):
         if face is not None:
             face.refuse_whole_animation()
 
-        def control(vertices: Array, start: int, acted: npt.NDArray[np.float64] | None) -> Array:
-            assert face is not None  # noqa: S101 - for the type checker
-            return face.apply(self.bare(vertices), seed=self.seed, start=start, acted=acted).vertices
+        def finish(points: Array, start: int, acted: npt.NDArray[np.float64] | None) -> Array:
+            vertices = self.shown(points)
+            if not len(vertices):
+                return vertices
+            animation = self.bare(vertices)
+            if face is not None:
+                animation = face.apply(animation, seed=self.seed, start=start, acted=acted)
+            return self.posed(animation, points).vertices
 
         return AnimationStream(
             self.generator(),
-            rest=self.rest_of_stream(),
+            rest=self.rest,
             performer=None
             if self.acting is None
             else self.acting.performer(self.frame_rate, self._acting_seed(self.seed)),
-            controls=None if face is None else control,
+            finish=None if channels or (face is None and self.decoder is None) else finish,
             rate=rate,
         )
+
+    @property
+    def gives_channels(self) -> bool:
+        """Whether a stream's channels say all of its motion: controls change vertices."""
+        return self.decoder is not None and self.face is None
 
     @property
     def look_ahead(self) -> float:

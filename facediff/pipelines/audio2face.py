@@ -151,7 +151,6 @@ class Audio2FacePipeline(AnimationPipeline):
         self.model.emotion(self.emotion)  # refuses what the model does not know
         self._animated: list[dict[str, Array]] = []
         template = folder.arrays["skin"]
-        self.has_weights = "skin" in folder.poses and {*folder.poses["skin"].names} <= {*ARKIT}
         super().__init__(
             options,
             face={
@@ -172,6 +171,12 @@ class Audio2FacePipeline(AnimationPipeline):
     def hop(self) -> float:
         """A frame: each has a window of its own."""
         return 1 / self.frame_rate
+
+    @property
+    def has_weights(self) -> bool:
+        """Whether the folder has blendshapes under ARKit's names."""
+        poses = self.model.folder.poses
+        return "skin" in poses and {*poses["skin"].names} <= {*ARKIT}
 
     @property
     def corpus(self) -> str:

@@ -10,14 +10,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.style_files import Stillness, stillness_of
 from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
-from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, read_folder
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, packed_deltas, read_folder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic_folder
 from facediff.utils.licences import licence_metadata
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     import onnx
     import torch
 
-    from facediff.data import Reference
+    from facediff.data import Assets, Reference
     from facediff.models.base import AnimationModel
     from facediff.models.graphs import Graph, Graphs
     from facediff.models.inference import Style
+    from facediff.spaces.decoding import Decoder
     from facediff.speech.frame_clock import FrameClock
 
 Precision = Literal["float32", "float16", "int8"]
@@ -84,12 +85,10 @@ def export_model(
             than 1e-4 of the motion's range.
         MissingExtraError: if the packages for ONNX are not installed.
     """
+    from facediff.pipelines.trained import with_rig
+
     require_onnx()
-    if not model.assets.space.is_vertices:
-        raise FaceDiffError(
-            f"{folder}: exported folders hold models of vertices, and this one's motion is channels "
-            f"({model.assets.space.kind}); animate with the checkpoint itself"
-        )
+    _ = with_rig(model.assets).mesh  # refused before graphs are recorded, which takes a minute
     graphs = model.graphs()
     known = list(model.assets.templates)
     for name in identities or ():
@@ -288,9 +287,9 @@ def arrays_of(
     """What ``arrays.npz`` holds for these faces, and the names of its styles."""
     from facediff.editing.expressiveness import rest_weights
     from facediff.models.styles import vector_of
-    from facediff.pipelines.trained import facts_of
+    from facediff.pipelines.trained import facts_of, with_rig
 
-    assets = model.assets
+    assets = with_rig(model.assets).mesh
     facts = facts_of(assets)
     regions = facts["regions"]
     templates = np.stack([np.asarray(assets.templates[name], np.float32) for name in faces])
@@ -306,6 +305,8 @@ def arrays_of(
         grey = np.full((assets.n_vertices, 3), 190, np.uint8)
         own = [assets.colours_of(name) for name in faces]
         arrays["colours"] = np.stack([grey if colours is None else colours.numpy() for colours in own])
+    if not model.assets.space.is_vertices:
+        arrays |= channel_arrays(model.assets, faces)
     if graphs.sampling is not None and graphs.sampling.noise is not None:
         arrays["noise"] = graphs.sampling.noise.numpy()
     if graphs.style != "reference":
@@ -316,7 +317,8 @@ def arrays_of(
             chosen[name] = model.default_style(name)
     # Where identities do without their stored clips, these are styles by their own names, as in a checkpoint.
     defaults = {id(style) for style in chosen.values()}
-    stored = [assets.references[name] for name in faces if name in assets.references]
+    references = model.assets.references
+    stored = [references[name] for name in faces if name in references]
     chosen |= {reference.clip: reference for reference in stored if id(reference) not in defaults}
     chosen |= further
     styles = {name: vector_of(style, model).numpy() for name, style in chosen.items()}
@@ -328,8 +330,29 @@ def arrays_of(
     return arrays, list(styles)
 
 
+def channel_arrays(assets: Assets, faces: list[str]) -> dict[str, npt.NDArray[Any]]:
+    """What ``arrays.npz`` holds besides of a model of channels: their values at rest, and the rigs that decode them."""
+    from facediff.pipelines.trained import decoder_of, with_rig
+
+    rigged = with_rig(assets)
+    decoders = [cast("Decoder", decoder_of(rigged, name)) for name in faces]
+    # Most corpora have one rig for all of their speakers.
+    keys = [digest(decoder.deltas) for decoder in decoders]
+    rigs = dict(zip(keys, (decoder.deltas for decoder in decoders), strict=True))
+    deltas, scales = packed_deltas(np.stack([*rigs.values()]))
+    return {
+        "resting": np.stack([decoder.resting for decoder in decoders]).astype(np.float32),
+        "rest_weights": np.stack([decoder.rest_weights for decoder in decoders]),
+        "deltas": deltas,
+        "delta_scales": scales,
+        "rigs": np.array([[*rigs].index(key) for key in keys], np.int32),
+    }
+
+
 def model_stillness(model: AnimationModel) -> Stillness | None:
-    """Where the model's faces keep still, by its stored references."""
+    """Where the model's faces keep still, by its stored references; None for channels."""
+    if not model.assets.space.is_vertices:
+        return None
     return stillness_of([reference.motion.float().numpy() for reference in model.assets.references.values()])
 
 
@@ -343,6 +366,8 @@ def describe(
     faces: list[str],
 ) -> Description:
     """What ``model.json`` says."""
+    from facediff.pipelines.trained import with_rig
+
     assets, plan, loop = model.assets, model.windows, graphs.sampling
     stillness = model_stillness(model) if graphs.style == "reference" else None
     return Description(
@@ -357,7 +382,7 @@ def describe(
         graphs=described,
         sample_rate=SAMPLE_RATE,
         frame_rate=assets.frame_rate,
-        unit=assets.unit,
+        unit=with_rig(assets).mesh.unit,
         identities=list(assets.identities),
         faces=faces,
         styles=styles,
@@ -382,6 +407,7 @@ def describe(
         quick_steps=loop.quick_steps if loop else [],
         quick_table=loop.quick_table if loop else [],
         voice_gate=model.usual_gate,
+        space={} if assets.space.is_vertices else assets.space.state(),
     )
 
 
@@ -394,7 +420,7 @@ def clock_facts(clock: FrameClock) -> dict[str, Any]:
 
 
 def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]) -> dict[str, Any]:
-    """The folder against the model on some speech: largest difference of a coordinate, alone and by the range."""
+    """The folder against the model on some speech: largest difference of a number, alone and by the range."""
     import torch
 
     from facediff.runtime.model import RuntimeModel
@@ -408,8 +434,9 @@ def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]
         chosen = model.default_style(style)
     heard = torch.from_numpy(speech).to(model.device)
     wanted = model.animate(heard, identity=face, style=chosen, seed=3).vertices.numpy()
-    found = runtime.animate(speech, identity=face, style=style, seed=3).vertices
-    span = float(np.ptp(wanted - runtime.arrays["templates"][0]))
+    stream = runtime.stream(identity=face, style=style, seed=3)
+    found = runtime.motion(speech, stream)
+    span = float(np.ptp(wanted - stream.conditions.template))
     difference = float(np.abs(found - wanted).max())
     return {
         "seconds": round(len(speech) / SAMPLE_RATE, 3),

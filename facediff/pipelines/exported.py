@@ -58,7 +58,7 @@ class ExportedPipeline(AnimationPipeline):
             "expressivity": factors.get("all", 1.0),
         }
         stream = self.model.stream(seed=options.seed or 0, **self._chosen)
-        still = self.model.animation(self.model.arrays["templates"][stream.face][None], stream, None, "face")
+        still = self.model.animation(stream.conditions.template[None], stream, None, "face")
         self._metadata = dict(still.metadata)
         super().__init__(
             options,
@@ -68,6 +68,7 @@ class ExportedPipeline(AnimationPipeline):
             samples=about.generation == "sampled",
             usual_gate=about.voice_gate,
             rest_weights=lambda: self.model.arrays["rest_weights"][stream.face],
+            decoder=self.model.decoder(stream.face),
         )
 
     @property
@@ -86,14 +87,14 @@ class ExportedPipeline(AnimationPipeline):
         return self.model.clock.frames(samples)
 
     def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
-        """Absolute vertices of the whole recording."""
+        """Absolute points of the whole recording."""
         motions = []
         for seed in self.track(seeds, "samples"):
-            motions.append(self.model.animate(speech, seed=seed, **self._chosen).vertices)
+            motions.append(self.model.motion(speech, self.model.stream(seed=seed, **self._chosen)))
         yield motions
 
     def generator(self) -> RuntimeStream:
-        """What generates vertices while speech arrives."""
+        """What generates points while speech arrives."""
         return self.model.stream(seed=self.seed, **self._chosen)
 
     def metadata(self, seed: int) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -22,13 +22,11 @@ from facediff.utils.hub import model_name
 from facediff.utils.licences import licence_metadata
 
 if TYPE_CHECKING:
-    from facediff.animation import Animation
     from facediff.data import Assets, Reference
     from facediff.models import AnimationModel, Style
     from facediff.pipelines.animate import Array
     from facediff.pipelines.directing import DirectedStream
-    from facediff.spaces import Space
-    from facediff.speech.voice_activity import MouthAtRest
+    from facediff.spaces.decoding import Decoder
 
 
 class TrainedPipeline(AnimationPipeline):
@@ -61,7 +59,6 @@ class TrainedPipeline(AnimationPipeline):
         model.check_condition(options.condition)
         assets = self.assets = with_rig(model.assets)
         face = facts_of(assets.mesh, self.identity)
-        self.has_weights = assets.space.kind == "arkit"
         self.options, self.facts = options, face
         if options.expressivity is not None:
             self._choose_expressivity()
@@ -74,8 +71,6 @@ class TrainedPipeline(AnimationPipeline):
         def rest_weights() -> Array:
             from facediff.editing.expressiveness import rest_weights
 
-            if not assets.space.is_vertices:
-                return channel_rest(assets.space)
             return rest_weights(face["template"], face["regions"])
 
         super().__init__(
@@ -86,7 +81,7 @@ class TrainedPipeline(AnimationPipeline):
             samples=model.samples,
             usual_gate=model.usual_gate,
             rest_weights=rest_weights,
-            resting=assets.template(self.identity).numpy(),
+            decoder=decoder_of(assets, self.identity),
         )
         steps = getattr(getattr(model, "sampler", None), "steps", 1)
         self.step_seconds *= steps * len(self.runs)
@@ -147,49 +142,8 @@ class TrainedPipeline(AnimationPipeline):
             yield [*blend(motions, self.runs, self.frame_rate).numpy()]
 
     def generator(self) -> FirstSample:
-        """What generates vertices while speech arrives."""
-        return FirstSample(self._directed([self.seed]), self.shown)
-
-    def shown(self, points: Array) -> Array:
-        """Vertices as they are, and channels decoded by the corpus's rig."""
-        import torch
-
-        assets = self.assets
-        if assets.space.is_vertices:
-            return points
-        offsets = assets.to_vertices(torch.from_numpy(points - self.resting), self.identity).numpy()
-        offsets += self.facts["template"]
-        return offsets
-
-    def made_of(self, animation: Animation, points: Array) -> Animation:
-        """With the channels that its vertices were decoded from."""
-        space = self.model.assets.space
-        return animation if space.is_vertices else animation.made_of(space, np.ascontiguousarray(points[..., 0]))
-
-    def posed(self, animation: Animation, points: Array) -> Animation:
-        """With the turns of the head that the channels say, unless something else moves it."""
-        from facediff.editing.procedural import move_head, moves_head
-        from facediff.spaces.rotations import convert
-
-        turn = next((turn for turn in self.model.assets.space.rotations if turn.joint == "head"), None)
-        if turn is None or moves_head(animation):
-            return animation
-        values = animation.values
-        turns = convert(points[:, turn.start : turn.channels.stop, 0], turn.form, "axis_angle")
-        turned = move_head(animation, turns, np.zeros_like(turns))
-        return turned if values is None else turned.made_of(animation.space, values)
-
-    def rest_of_stream(self) -> MouthAtRest | None:
-        """Of a stream vertices are brought to rest, since they are decoded as they come."""
-        from facediff.editing.expressiveness import rest_weights
-        from facediff.speech.voice_activity import MouthAtRest
-
-        if self.rest is None or self.model.assets.space.is_vertices:
-            return self.rest
-        face = self.facts
-        return MouthAtRest(
-            self.rest.gate, face["template"], rest_weights(face["template"], face["regions"]), self.frame_rate
-        )
+        """What generates points while speech arrives."""
+        return FirstSample(self._directed([self.seed]))
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
@@ -255,8 +209,8 @@ class TrainedPipeline(AnimationPipeline):
 class FirstSample:
     """The only sample of a stream with one seed."""
 
-    def __init__(self, stream: DirectedStream, shown: Callable[[Array], Array]) -> None:
-        self._stream, self._shown = stream, shown
+    def __init__(self, stream: DirectedStream) -> None:
+        self._stream = stream
 
     @property
     def frames(self) -> int:
@@ -264,12 +218,12 @@ class FirstSample:
         return self._stream.frames
 
     def feed(self, samples: Array) -> Array:
-        """The frames (m, V, 3) that more speech (n,) at 16 kHz makes certain."""
-        return self._shown(self._stream.feed(samples)[0])
+        """The frames (m, points, dims) that more speech (n,) at 16 kHz makes certain."""
+        return self._stream.feed(samples)[0]
 
     def finish(self) -> Array:
-        """The frames (m, V, 3) that are left."""
-        return self._shown(self._stream.finish()[0])
+        """The frames (m, points, dims) that are left."""
+        return self._stream.finish()[0]
 
 
 def with_rig(assets: Assets) -> Assets:
@@ -293,12 +247,24 @@ def with_rig(assets: Assets) -> Assets:
     return replace(assets, rig=Rig.of(LinearRig(names, places, moves, None, "m", WITHOUT_FACE), assets))
 
 
-def channel_rest(space: Space) -> Array:
-    """How far each channel (C,) goes to rest in pauses: those of the lower face do; brows, eyes and head move on."""
-    upper = {*space.region("upper_face"), *space.region("eyes")}
-    weights = np.zeros(len(space.channels), np.float32)
-    weights[[channel for channel in space.face if channel not in upper]] = 1.0
-    return weights
+def decoder_of(assets: Assets, identity: str) -> Decoder | None:
+    """What turns a corpus's channels into the vertices of one of its speakers; None for a corpus of vertices.
+
+    Raises:
+        FaceDiffError: if no rig is known.
+    """
+    if assets.space.is_vertices:
+        return None
+    from facediff.spaces.decoding import Decoder
+
+    mesh, rig = assets.mesh, assets.rig
+    assert rig is not None  # noqa: S101 - or assets.mesh would have raised
+    return Decoder(
+        assets.space,
+        assets.template(identity).numpy()[:, 0],
+        mesh.template(identity).numpy(),
+        rig.deltas_of(identity).numpy(),
+    )
 
 
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:

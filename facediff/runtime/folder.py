@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,8 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.runtime.graph_check import REMEDY, check_graph
+from facediff.spaces import VERTICES, Space
+from facediff.spaces.decoding import Decoder
 from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.speech.windows import WindowPlan
@@ -87,6 +90,7 @@ class Description:
         quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
         quick_table: for each of them, as in ``table``.
         voice_gate: the voice gate where nobody chooses one: ``energy``, or ``off`` for imported models.
+        space: what the numbers of the motion mean, as :meth:`facediff.spaces.Space.state` says it; empty for vertices.
         check: the comparison with PyTorch when the folder was written.
     """
 
@@ -126,6 +130,7 @@ class Description:
     quick_steps: list[int] = field(default_factory=list)
     quick_table: list[list[float]] = field(default_factory=list)
     voice_gate: str = USUAL_GATE
+    space: dict[str, Any] = field(default_factory=dict)
     check: dict[str, Any] = field(default_factory=dict)
 
     def content(self) -> dict[str, Any]:
@@ -136,6 +141,11 @@ class Description:
     def known(self) -> list[str]:
         """The identities that it was trained on and whose faces it has, or else all faces; the first is the default."""
         return [name for name in self.identities if name in self.faces] or list(self.faces)
+
+    @cached_property
+    def motion_space(self) -> Space:
+        """What the numbers of the motion mean."""
+        return Space.from_state(self.space) if self.space else VERTICES
 
     @property
     def plan(self) -> WindowPlan:
@@ -255,6 +265,10 @@ def _check(path: Path, description: Description) -> None:
         refuse("faces", "one name at least")
     _check_clock(refuse, description)
     try:
+        _ = description.motion_space
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{path}: {error}. Export the model again") from error
+    try:
         description.plan.in_frames(description.frame_rate)
     except (FaceDiffError, TypeError) as error:
         raise FaceDiffError(f"{path}: windows: {error}") from error
@@ -302,7 +316,16 @@ def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
     vertices = arrays["templates"].shape[1]
     if description.style_source == "reference":
         need("styles", (len(description.styles), None), "f")
-    need("rest_weights", (len(description.faces), vertices), "f")
+    space = description.motion_space
+    need("rest_weights", (len(description.faces), len(space.channels) or vertices), "f")
+    if not space.is_vertices:
+        need("resting", (len(description.faces), len(space.channels)), "f")
+        need("deltas", (None, len(space.face), vertices, 3), "i")
+        rigs = len(arrays["deltas"])
+        need("delta_scales", (rigs, len(space.face)), "f")
+        need("rigs", (len(description.faces),), "i")
+        if not 0 <= int(arrays["rigs"].min()) <= int(arrays["rigs"].max()) < rigs:
+            raise FaceDiffError(f"{path}: rigs names one that does not exist; export the model again")
     if "noise" in arrays:
         need("noise", (description.state, description.state), "f")
     if "faces" in arrays:
@@ -323,7 +346,8 @@ def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
 
 def _check_ends(path: Path, description: Description, arrays: Arrays) -> None:
     """Refuse graphs whose inputs and outputs are not those of the model that the description and the arrays state."""
-    about, graphs, vertices = description, description.graphs, arrays["templates"].shape[1]
+    about, graphs, space = description, description.graphs, description.motion_space
+    points = [len(space.channels) or arrays["templates"].shape[1], space.dims]
     try:
         features = graphs["speech"]["outputs"][0]["shape"][2:]
     except (KeyError, TypeError, IndexError) as error:
@@ -333,7 +357,7 @@ def _check_ends(path: Path, description: Description, arrays: Arrays) -> None:
     frames = ["batch", "frames"]
     shared: dict[str, list[Any]] = {
         **{"features": ["float", *frames, *features], "mask": ["bool", *frames], "identity": ["int64", "batch"]},
-        **{"style": ["float", "batch", style], "template": ["float", "batch", vertices, 3]},
+        **{"style": ["float", "batch", style], "template": ["float", "batch", *points]},
     }
     loop: dict[str, list[Any]] = {
         **{"state": ["float", *frames, about.state], "step": ["int64", "batch"]},
@@ -343,7 +367,7 @@ def _check_ends(path: Path, description: Description, arrays: Arrays) -> None:
         **{"audio": ["float", "batch", "samples"], "mean": ["float", "batch"], "deviation": ["float", "batch"]},
         **{"samples": ["int64", "batch"], "mask": ["bool", *frames]},
     }
-    noise, offsets = ["float", *frames, drawn], ["float", *frames, vertices, 3]
+    noise, offsets = ["float", *frames, drawn], ["float", *frames, *points]
     expected: dict[str, tuple[Mapping[str, list[Any]], list[list[Any]]]] = {
         "speech": (heard, [shared["features"]]),
         "start": ({"noise": noise}, [loop["state"]]),
@@ -361,7 +385,7 @@ def _check_ends(path: Path, description: Description, arrays: Arrays) -> None:
             if not fits or len(ends or ()) != len(wanted) or not all(map(_is_end, ends or (), wanted)):
                 raise FaceDiffError(
                     f"{path}: {key} of the graph {graph} are {quoted(ends)}, expected those of a model with "
-                    f"{about.state} numbers of state, {about.kept} kept and {vertices} vertices; {REMEDY}"
+                    f"{about.state} numbers of state, {about.kept} kept and {points[0]} points of {points[1]}; {REMEDY}"
                 )
 
 
@@ -374,6 +398,33 @@ def _is_end(end: Mapping[str, Any], wanted: list[Any] | None) -> bool:
         isinstance(size, str) if isinstance(want, str) else type(size) is int and size == want
         for size, want in zip(shape, wanted[1:], strict=True)
     )
+
+
+LEVELS = 32767
+"""Steps of 16 bits that a channel's largest displacement has."""
+
+
+def packed_deltas(rigs: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.float32]]:
+    """Displacements (R, K, V, 3) in 16 bits, and the size (R, K) of a step: one for each channel.
+
+    Example:
+        >>> packed, scales = packed_deltas(np.array([[[[0.5, 0.0, -1.0]]]]))
+        >>> packed.tolist(), bool(np.abs(packed * scales[..., None, None] - [0.5, 0, -1]).max() < 2e-5)
+        ([[[[16384, 0, -32767]]]], True)
+    """
+    sizes = np.abs(rigs).max(axis=(2, 3)).astype(np.float32)
+    scales = np.asarray(np.where(sizes > 0, sizes, 1.0) / LEVELS, np.float32)
+    return np.rint(rigs / scales[..., None, None]).astype(np.int16), scales
+
+
+def decoder_of(description: Description, arrays: Arrays, face: int) -> Decoder | None:
+    """What turns a folder's channels into the vertices of one of its faces; None for vertices."""
+    if description.motion_space.is_vertices:
+        return None
+    rig = int(arrays["rigs"][face])
+    deltas = arrays["deltas"][rig] * arrays["delta_scales"][rig, :, None, None]
+    template = arrays["templates"][face].astype(np.float32)
+    return Decoder(description.motion_space, arrays["resting"][face], template, deltas.astype(np.float32))
 
 
 def copy_exported(source: Path, folder: Path) -> int:

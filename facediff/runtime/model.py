@@ -1,4 +1,4 @@
-"""An exported model at work: the path from samples to vertices, of files and streams, with NumPy and ONNX Runtime.
+"""An exported model at work: the path from samples to motion, of files and streams, with NumPy and ONNX Runtime.
 
 What generates the motion of a clip or of a window is in ``sampling.py``; pauses, controls and files are those of every
 model (:mod:`facediff.pipelines`), so that most programs want :func:`facediff.load` instead.
@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.animation import WITHOUT_FACE
 from facediff.errors import FaceDiffError, OptionError, choices
-from facediff.runtime.folder import Arrays, Description
+from facediff.runtime.folder import Arrays, Description, decoder_of
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, WindowSpeech, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, encode_style, read_style
@@ -25,6 +26,8 @@ from facediff.version import __version__
 
 if TYPE_CHECKING:
     import onnxruntime  # type: ignore[import-untyped]
+
+    from facediff.spaces.decoding import Decoder
 
 Array = npt.NDArray[np.float32]
 
@@ -56,12 +59,23 @@ class RuntimeModel(ExportedGraphs):
     def animate(self, audio: Array, *, name: str = NAME, **choices: Any) -> Animation:  # noqa: ANN401
         """Animate a face with speech, as the model moves it: also in pauses.
 
+        Of a model of channels the vertices are decoded by the folder's rig, and the head as a whole stays where it is.
+
         Args:
             audio: speech (S,) at 16 kHz.
             name: of the animation.
             choices: fields of :class:`~facediff.runtime.sampling.RuntimeChoices`: who moves, in which style.
         """
         stream = self.stream(**choices)
+        return self.animation(self.motion(audio, stream), stream, audio, name)
+
+    def motion(self, audio: Array, stream: RuntimeStream) -> Array:
+        """Absolute points (T, points, dims) of a recording (S,): vertices, or the channels of the model's space.
+
+        Args:
+            audio: speech at 16 kHz.
+            stream: at its beginning; it says who moves, and how.
+        """
         audio = np.ascontiguousarray(audio, np.float32)
         if audio.ndim != 1 or not np.isfinite(audio).all():
             raise FaceDiffError(f"audio: is {audio.dtype} {audio.shape}; expected finite samples (S,) at 16 kHz")
@@ -75,10 +89,8 @@ class RuntimeModel(ExportedGraphs):
             mean = samples.mean(dtype=np.float32)
             deviation = np.sqrt(np.square(samples - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
             speech = WindowSpeech(samples, frames, float(mean), float(deviation))
-            vertices = stream.joined([clip_motion(self, speech, stream.conditions)])
-        else:
-            vertices = np.concatenate(list(stream.parts(audio, frames=frames)))
-        return self.animation(vertices, stream, audio, name)
+            return stream.joined([clip_motion(self, speech, stream.conditions)])
+        return np.concatenate(list(stream.parts(audio, frames=frames)))
 
     def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> RuntimeStream:  # noqa: ANN401
         """Animate speech of any length while it arrives.
@@ -90,8 +102,12 @@ class RuntimeModel(ExportedGraphs):
         face, conditions = self._face(RuntimeChoices(**choices))
         return RuntimeStream(self, face, conditions, plan or self.windows)
 
-    def animation(self, vertices: Array, stream: RuntimeStream, audio: Array | None, name: str) -> Animation:
-        """Vertices (T, V, 3) of a stream's face with everything that exporters need."""
+    def decoder(self, face: int) -> Decoder | None:
+        """What turns channels into the vertices of a face, by its place; None for a model of vertices."""
+        return decoder_of(self.description, self.arrays, face)
+
+    def animation(self, points: Array, stream: RuntimeStream, audio: Array | None, name: str) -> Animation:
+        """Points (T, points, dims) of a stream's face with everything that exporters need."""
         about, arrays, conditions = self.description, self.arrays, stream.conditions
         regions = {
             key.removeprefix("region_"): value.astype(np.int64)
@@ -110,12 +126,16 @@ class RuntimeModel(ExportedGraphs):
             metadata |= {"seed": str(conditions.choices.seed), "sampler": f"{about.sampler}, {len(self.loop)} steps"}
         if conditions.choices.expressivity != 1:
             metadata["expressivity"] = f"{conditions.choices.expressivity:g}"
+        decoder = self.decoder(stream.face)
+        # Without a rig, a folder has a point for each channel, and no triangles.
+        if decoder is not None and decoder.space.kind != "arkit" and "faces" not in arrays:
+            metadata["face"] = WITHOUT_FACE
         optional = {key: arrays[key] for key in ("faces", "colours", "inner_lip_pairs") if key in arrays}
         if "colours" in optional and optional["colours"].ndim == 3:
             optional["colours"] = optional["colours"][stream.face]
-        return Animation(
+        animation = Animation(
             name=name,
-            vertices=np.ascontiguousarray(vertices, np.float32),
+            vertices=np.ascontiguousarray(points if decoder is None else decoder.vertices(points), np.float32),
             template=arrays["templates"][stream.face],
             frame_rate=about.frame_rate,
             unit=about.unit,
@@ -124,6 +144,7 @@ class RuntimeModel(ExportedGraphs):
             metadata=metadata,
             **cast(Any, optional),
         )
+        return animation if decoder is None else animation.made_of(decoder.space, decoder.values(points))
 
     def _face(self, choice: RuntimeChoices) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and the conditions of its motion."""
@@ -158,14 +179,16 @@ class RuntimeModel(ExportedGraphs):
             raise OptionError("expressivity", f"{about.model} predicts no mean of its motion; omit the option")
         face = about.faces.index(chosen)
         index = about.identities.index(conditioned_on) if conditioned_on in about.identities else -1
-        template = self.arrays["templates"][face].astype(np.float32)
-        return face, RuntimeConditions(index, vector.vector, vector.name, template, choice)
+        vertices = about.motion_space.is_vertices
+        resting = self.arrays["templates"][face] if vertices else self.arrays["resting"][face][:, None]
+        return face, RuntimeConditions(index, vector.vector, vector.name, resting.astype(np.float32), choice)
 
     def encode_style(self, motion: Array, *, name: str = "reference") -> RuntimeStyle:
         """The style of a reference motion.
 
         Args:
-            motion: offsets (T, V, 3) from the speaker's neutral face, in the model's unit and at its frame rate.
+            motion: offsets (T, V, 3) from the speaker's neutral face, in the model's unit and at its frame rate; of a
+                model of channels, (T, C, 1) from their values at rest.
             name: of the style.
 
         Raises:
@@ -181,7 +204,8 @@ class RuntimeModel(ExportedGraphs):
 class RuntimeStream(SpeechWindows[Array]):
     """Animates speech that arrives in pieces; see :class:`~facediff.speech.windows.SpeechWindows`.
 
-    :meth:`feed` and :meth:`finish` give absolute vertices (frames, V, 3), as the model moves them.
+    :meth:`feed` and :meth:`finish` give absolute points (frames, points, dims), as the model moves them: vertices, or
+    the channels of its space.
 
     Args:
         model: the model.
@@ -201,13 +225,13 @@ class RuntimeStream(SpeechWindows[Array]):
         self._tail: list[Array] | None = None
 
     def generate(self, window: MotionWindow, speech: Array, frames: int, mean: float, deviation: float) -> Array:
-        """Offsets (1, frames, V, 3) of a window, which continues the window before it."""
+        """Offsets (1, frames, points, dims) of a window, which continues the window before it."""
         window_speech = WindowSpeech(speech, frames, mean, deviation)
         motion, self._tail = window_motion(self.model, window_speech, window, self.conditions, self._tail)
         return motion
 
     def joined(self, parts: Sequence[Array]) -> Array:
-        """Offsets (1, frames, V, 3) of consecutive frames as absolute vertices (frames, V, 3)."""
-        template = self.model.arrays["templates"][self.face]
+        """Offsets (1, frames, points, dims) of consecutive frames as absolute points (frames, points, dims)."""
+        template = self.conditions.template
         offsets = np.concatenate([np.zeros((1, 0, *template.shape), np.float32), *parts], 1)
         return np.asarray(offsets[0] + template, np.float32)

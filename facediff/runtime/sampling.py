@@ -74,7 +74,7 @@ class WindowSpeech:
 
 
 def clip_motion(model: ExportedGraphs, speech: WindowSpeech, conditions: RuntimeConditions) -> Array:
-    """Offsets from the template (1, frames, vertices, 3) of a whole clip."""
+    """Offsets from the template (1, frames, points, dims) of a whole clip."""
     about = model.description
     features = features_of(model, speech, own_frame_count(model, speech))
     if about.generation == "direct":
@@ -198,7 +198,7 @@ class SamplerRun:
         self.kept: list[Array] = []
 
     def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
-        """Offsets from the template (1, frames, vertices, 3), but for those frames that are given out already."""
+        """Offsets from the template (1, frames, points, dims), but for those frames that are given out already."""
         about, share = self.model.description, self.conditions.choices.expressivity
         frames, width = features.shape[1], about.drawn or about.state
         LIMITS.check("bytes", 4 * frames * max(width, about.state, about.kept), f"{about.model}: {frames} frames")

@@ -64,6 +64,11 @@ def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyl
                 f"{vectors.shape[1]} (no NaN); make one with `facediff style extract` from the same checkpoint"
             )
         return RuntimeStyle(path.stem, vector)
+    if not about.motion_space.is_vertices:
+        raise OptionError.naming(
+            f"{{style}} {path}: motion files hold vertices, and this model takes channels; name a style of the folder, "
+            f"or a style vector of this model"
+        )
     templates, rate, scale = model.arrays["templates"], opened.frame_rate or about.frame_rate, 1.0
     whose = next((name for name in (path.stem.rpartition("_")[0], identity) if name in about.faces), about.faces[0])
     face = templates[about.faces.index(whose)] if opened.template is None else opened.template
@@ -81,7 +86,7 @@ def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyl
 
 
 def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyle:
-    """The style of reference motion: offsets (T, V, 3) from the speaker's face, at the model's unit and frame rate.
+    """The style of reference motion: offsets (T, points, dims) from rest, at the model's unit and frame rate.
 
     Raises:
         FaceDiffError: if the model takes no styles from motion, or the motion is of another topology.
@@ -91,8 +96,10 @@ def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyl
             f"style: the folder has no style encoder, so {model.description.model} takes styles by name alone; "
             f"choose one of {', '.join(model.description.styles[:5])}, or export the model again"
         )
-    motion, vertices = np.ascontiguousarray(motion, np.float32), model.arrays["templates"].shape[1]
-    if motion.ndim != 3 or not len(motion) or motion.shape[1:] != (vertices, 3) or not np.isfinite(motion).all():
-        raise FaceDiffError(f"style: is {motion.shape}; expected finite offsets (frames, {vertices}, 3)")
+    space = model.description.motion_space
+    points = (len(space.channels) or model.arrays["templates"].shape[1], space.dims)
+    motion = np.ascontiguousarray(motion, np.float32)
+    if motion.ndim != 3 or not len(motion) or motion.shape[1:] != points or not np.isfinite(motion).all():
+        raise FaceDiffError(f"style: is {motion.shape}; expected finite offsets (frames, {points[0]}, {points[1]})")
     inputs = {"motion": motion[None], "mask": np.ones((1, len(motion)), bool)}
     return RuntimeStyle(name, model.run("style", inputs)[0][0])

@@ -17,22 +17,23 @@ from facediff.utils import SAMPLE_RATE
 
 Array = npt.NDArray[np.float32]
 Acted = npt.NDArray[np.float64]
-Controls = Callable[[Array, int, Acted | None], Array]
-"""Changes frames (m, V, 3), the first of which has a number, with what acting does in each of them (m, 5)."""
+Finish = Callable[[Array, int, Acted | None], Array]
+"""Makes vertices (m, V, 3) of frames of a model's points (m, points, dims), the first of which has a number, with what
+acting does in each of them (m, 5): decoding, controls."""
 
 
 class VertexGenerator(Protocol):
-    """A model that generates absolute vertices of one sample while speech arrives."""
+    """A model that generates absolute points of one sample while speech arrives: vertices, or channels."""
 
     @property
     def frames(self) -> int:
         """Frames that have been generated so far."""
 
     def feed(self, samples: Array, /) -> Array:
-        """Take speech (n,) at 16 kHz, and give the frames (m, V, 3) that it makes certain."""
+        """Take speech (n,) at 16 kHz, and give the frames (m, points, dims) that it makes certain."""
 
     def finish(self) -> Array:
-        """The frames (m, V, 3) that are left."""
+        """The frames (m, points, dims) that are left."""
 
 
 class ActingStream(Protocol):
@@ -54,7 +55,7 @@ class AnimationStream:
         generator: the model at the beginning of speech.
         rest: brings the mouth to rest in pauses; None for the model's own motion there.
         performer: acts; None for no acting.
-        controls: the animation controls; None for none.
+        finish: makes vertices of the model's frames, with the animation controls; None for the frames as they are.
         rate: sample rate of the speech.
     """
 
@@ -64,10 +65,10 @@ class AnimationStream:
         *,
         rest: MouthAtRest | None = None,
         performer: ActingStream | None = None,
-        controls: Controls | None = None,
+        finish: Finish | None = None,
         rate: int = SAMPLE_RATE,
     ) -> None:
-        self.generator, self._rest, self._performer, self._controls = generator, rest, performer, controls
+        self.generator, self._rest, self._performer, self._finish = generator, rest, performer, finish
         self._convert = None if rate == SAMPLE_RATE else resampler(rate)
         self._openness = None if rest is None else rest.openness()
         # Frames of the model, how far their mouths may be open, and how they are acted: each of the three becomes
@@ -124,7 +125,7 @@ class AnimationStream:
         acted, self._acted = self._acted[:count], self._acted[count:]
         if self._rest is not None:
             vertices = self._rest.apply(vertices, opened)
-        if self._controls is not None and count:
-            vertices = self._controls(vertices, self._finished, None if self._performer is None else acted)
+        if self._finish is not None:
+            vertices = self._finish(vertices, self._finished, None if self._performer is None else acted)
         self._finished += count
         return vertices

@@ -89,8 +89,14 @@ def is_audio2face(source: str | os.PathLike[str]) -> bool:
 
 
 def may_have_weights(source: str | os.PathLike[str]) -> bool:
-    """Whether a model's animations may be made of weights of face shapes: not those of ``facediff export-model``."""
-    return not is_exported(source) or is_audio2face(source)
+    """Whether a model's animations may be made of weights of face shapes, before it is read whole."""
+    if not is_exported(source) or is_audio2face(source):
+        return True
+    from facediff.utils.plain_files import load_json
+
+    content = load_json(Path(source) / "model.json", remedy=EXPECTED)
+    space = content.get("space") if isinstance(content, dict) else None
+    return isinstance(space, dict) and space.get("kind") == "arkit"
 
 
 def check_animating_source(source: str | os.PathLike[str]) -> None:

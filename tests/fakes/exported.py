@@ -12,7 +12,10 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from facediff.pipelines.export_model import OPSET, described_ends
-from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, packed_deltas
+from facediff.spaces import VERTICES as VERTICES_SPACE
+from facediff.spaces import Rotation, Space
+from facediff.spaces.arkit import ARKIT, ROTATIONS
 from facediff.utils.plain_files import write_json
 
 VERTICES, STATE, WIDTH = 6, 18, 3
@@ -45,8 +48,19 @@ def stored(name: str, value: Any) -> onnx.TensorProto:  # noqa: ANN401
     return numpy_helper.from_array(array.astype(np.int64 if array.dtype.kind in "iu" else np.float32), name)
 
 
-def graphs() -> Graphs:
-    """The graphs of a model that samples."""
+CHANNELS = Space(
+    "arkit",
+    (*[name for name in ARKIT if "Left" not in name][: STATE - 3], *ROTATIONS[:3]),
+    version="arkit",
+    rotations=(Rotation("head", STATE - 3, "euler"),),
+    valid_range=(0.0, 1.0),
+)
+"""A space with as many channels as a state has numbers."""
+
+
+def graphs(space: Space = VERTICES_SPACE) -> Graphs:
+    """The graphs of a model that samples, in a space of its motion."""
+    points = [VERTICES, 3] if space.is_vertices else [STATE, 1]
     nodes = {
         "speech": [
             node("Cast", "mask", "wide", to=FLOAT),
@@ -59,11 +73,13 @@ def graphs() -> Graphs:
     tensors = {
         "speech": [stored("axis", [-1]), stored("weights", [0.1, 0.2, 0.3])],
         "step": [stored("half", [0.5])],
-        "motion": [stored("shape", [0, 0, VERTICES, 3])],
+        "motion": [stored("shape", [0, 0, *points])],
     }
     made = {}
     for name, (inputs, outputs) in ENDS.items():
         ends = [helper.make_tensor_value_info(key, *value) for key, value in inputs.items()]
+        if name == "motion":
+            outputs = {"offsets": [*FRAMES, *points]}
         results = [helper.make_tensor_value_info(key, FLOAT, shape) for key, shape in outputs.items()]
         graph = helper.make_graph(nodes[name], name, ends, results, tensors[name])
         made[name] = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=10)
@@ -71,27 +87,40 @@ def graphs() -> Graphs:
 
 
 def write_exported(
-    folder: Path, change: Callable[[Graphs, dict[str, Any]], object] | None = None, **changes: object
+    folder: Path,
+    change: Callable[[Graphs, dict[str, Any]], object] | None = None,
+    space: Space = VERTICES_SPACE,
+    **changes: object,
 ) -> Path:
     """Write the folder.
 
     Args:
         folder: to write.
         change: of the graphs, which are described as they are then, and of what the description says.
+        space: of the motion.
         changes: what replaces what the description says.
     """
     folder.mkdir(parents=True)
-    documents = graphs()
+    documents = graphs(space)
     if change is not None:
         change(documents, changes)
     rng = np.random.default_rng(0)
-    arrays = {
+    arrays: dict[str, Any] = {
         "templates": rng.normal(0, 0.05, (2, VERTICES, 3)).astype(np.float32),
         "styles": rng.normal(size=(2, 4)).astype(np.float32),
         "rest_weights": np.ones((2, VERTICES), np.float32),
         "faces": np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]], np.int32),
     }
-    np.savez_compressed(folder / ARRAYS, **arrays)  # type: ignore[arg-type]
+    if not space.is_vertices:
+        deltas, scales = packed_deltas(rng.normal(0, 0.01, (1, len(space.face), VERTICES, 3)))
+        arrays |= {
+            "rest_weights": np.ones((2, STATE), np.float32),
+            "resting": np.zeros((2, STATE), np.float32),
+            "deltas": deltas,
+            "delta_scales": scales,
+            "rigs": np.zeros(2, np.int32),
+        }
+    np.savez_compressed(folder / ARRAYS, **arrays)
     for name, document in documents.items():
         (folder / f"{name}.onnx").write_bytes(document.SerializeToString())
     description = Description(
@@ -120,6 +149,7 @@ def write_exported(
         table=[[0.5, 0.5, 0.0, 0.0, 0.0]] * 2,
         last_step=0,
         decoded="sample",
+        space={} if space.is_vertices else space.state(),
     )
     write_json(folder / DESCRIPTION, {**description.content(), **changes})
     return folder

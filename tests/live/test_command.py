@@ -17,6 +17,8 @@ from facediff.live.command import perform
 from facediff.live.model import LiveModel, usual_gate
 from facediff.live.options import LiveOptions
 from facediff.registry import Kind
+from facediff.spaces import Rotation, Space
+from facediff.spaces.decoding import Decoder
 from facediff.speech.voice_activity import EnergyGate, Openness, read_gate
 from tests.fakes.live import FakeSound, Kept, device, fake_model
 
@@ -108,6 +110,34 @@ def test_what_cannot_be_is_refused_before_a_model_is_opened(words: dict[str, Any
 
     with pytest.raises(FaceDiffError, match=named):
         perform(LiveOptions(**{"speech": str(speech), "to": ["keep:1"], **words}), never, str)
+
+
+def test_weights_of_a_model_of_channels_are_sent_as_they_are(speech: Path) -> None:
+    """Without shapes; receivers of vertices get what the rig makes of them."""
+    space = Space("arkit", ("jawOpen", "HeadYaw", "HeadPitch", "HeadRoll"), rotations=(Rotation("head", 1, "euler"),))
+    neutral = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    deltas = np.random.default_rng(1).normal(size=(1, 5, 3))
+
+    class Channels(Moved):
+        def feed(self, samples: np.ndarray) -> np.ndarray:
+            return super().feed(samples)[:, :, :1] / 100  # of four vertices that count frames, the first coordinates
+
+        def finish(self) -> np.ndarray:
+            return super().finish()[:, :, :1] / 100
+
+    fake = fake_model()
+    facts = {"neutral": neutral, "start": lambda: Channels(fake.start(), np.zeros((4, 3), np.float32))}
+    model = LiveModel(**{**vars(fake), **facts, "decoder": Decoder(space, np.zeros(4), neutral, deltas)})
+    options = LiveOptions(speech=str(speech), to=["keep:1?weights=true", "keep:2"])
+    perform(options, lambda: model, str, weights=True)
+    assert MADE[0].performance is not None
+    assert MADE[0].performance.shapes == space.channels
+    for frame in (frame for made in MADE for frame in made.frames):
+        assert frame.weights is not None
+        np.testing.assert_allclose(frame.weights, [frame.index / 100, 0, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(frame.vertices, frame.index / 100 * deltas[0], atol=1e-5)
+    with pytest.raises(FaceDiffError, match="shapes"):
+        perform(options, fake_model, str, weights=True)
 
 
 def test_weights_of_blendshapes_are_solved_for(speech: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from facediff.errors import FaceDiffError
 from facediff.export import check_export
 from facediff.models import DiffPoseTalk, DualPathDiffusion, import_checkpoint, load_model
 from facediff.models.published.importing import save_model
-from facediff.pipelines.trained import TrainedPipeline, channel_rest
+from facediff.pipelines.trained import TrainedPipeline
 from facediff.spaces.rotations import convert
 from facediff.speech.audio import read_speech
 from facediff.synthetic.known_faces import built_in_rig
@@ -89,15 +89,21 @@ def test_changed_vertices_have_no_channels_any_more(checkpoint: Path, tmp_path: 
         animation.save(tmp_path / "a.csv")
 
 
-def test_a_stream_gives_vertices(checkpoint: Path) -> None:
-    pipeline = TrainedPipeline(AnimationOptions(checkpoint=str(checkpoint), seed=3, quiet=True))
-    stream = pipeline.stream()
-    frames = np.concatenate([stream.feed(SPEECH), stream.finish()])
-    assert frames.shape == (25, 24, 3)
-
-
-def test_pauses_rest_the_lower_face() -> None:
-    assert channel_rest(CHANNELS).tolist() == [1, 0, 1, 0, 0, 0]
+def test_a_stream_gives_what_the_file_has(checkpoint: Path) -> None:
+    """Pauses, decoded vertices and the turning head, however the speech is cut."""
+    speech = np.concatenate([SPEECH, 0 * SPEECH, *[SPEECH] * 9])
+    pipeline = TrainedPipeline(AnimationOptions(checkpoint=str(checkpoint), seed=3, quiet=True, window=1, overlap=0.4))
+    with pipeline.animations(speech, "speech") as (animation,):
+        assert animation.values is not None
+        stream = pipeline.stream()
+        pieces = [stream.feed(piece) for piece in np.split(speech, [1, 20_000, 20_001])]
+        np.testing.assert_allclose(np.concatenate([*pieces, stream.finish()]), animation.vertices, atol=1e-6)
+        stream = pipeline.stream(channels=True)
+        channels = np.concatenate([stream.feed(speech), stream.finish()])
+        np.testing.assert_allclose(channels[..., 0], animation.values, atol=1e-6)
+    still = animation.values[40]
+    assert not still[[0, 2]].any()
+    assert still[[1, 3]].all()  # pauses rest the lower face
 
 
 def test_arkit_channels_without_a_rig_move_the_built_in_face(

@@ -22,6 +22,7 @@ from facediff.models.graphs import Graph
 from facediff.pipelines.export_model import arrays_of, describe, export_model
 from facediff.runtime import RuntimeModel
 from facediff.speech.windows import LOW_LATENCY, WindowPlan
+from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
 from tests.runtime.test_runtime import sound
 
@@ -44,7 +45,22 @@ FACEDIFFUSER = {**PUBLISHED, "diffusion_steps": 8}
 DIFFSPEAKER = {**PUBLISHED, "sampling_steps": 8, "smooth": True}
 OWN = {"audio_dim": None}  # the encoder's own channels
 
+DUAL_PATH = {
+    **{"dim": 16, "diffusion_steps": 40, "sampler": partial(registry.sampler.dpm_solver, steps=3)},
+    "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
+    "decoder": partial(registry.decoder.style_transformer, num_layers=1),
+}
+IN_CHANNELS = {"n_vertices": len(CHANNELS.channels), "space": CHANNELS}
+
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "dual path in channels": ("DualPathDiffusion", {**DUAL_PATH, **IN_CHANNELS}),
+    "style content in channels": (
+        "StyleContentDisentanglement",
+        {**STYLE_CONTENT, **IN_CHANNELS, "mesh_encoder": registry.mesh_encoder.linear},
+    ),
+    "EmoTalk in channels": ("EmoTalk", {**EMOTALK, **IN_CHANNELS}),
+    "UniTalker in channels": ("UniTalker", {**PUBLISHED, **IN_CHANNELS}),
+    "LAM in channels": ("LamAudio2Expression", {**PUBLISHED, **IN_CHANNELS}),
     "style content": ("StyleContentDisentanglement", STYLE_CONTENT),
     "style content at 50": ("StyleContentDisentanglement", {**STYLE_CONTENT, "speech_rate": 50}),
     "style content at 12.5": ("StyleContentDisentanglement", {**STYLE_CONTENT, "speech_rate": 12.5}),
@@ -74,10 +90,15 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 Sources = dict[str, Path]
 
 
+@pytest.fixture(scope="module")
+def channels_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_channels(tmp_path_factory.mktemp("corpus") / "channels")
+
+
 @pytest.fixture
-def sources(hubert_source: Path, deepspeech_source: Path) -> Sources:
-    """Pretrained networks in miniature by the audio encoder that reads them."""
-    return {"wav2vec2": hubert_source, "deepspeech": deepspeech_source}
+def sources(hubert_source: Path, deepspeech_source: Path, channels_root: Path) -> Sources:
+    """Pretrained networks in miniature by the audio encoder that reads them, and the corpus in channels."""
+    return {"wav2vec2": hubert_source, "deepspeech": deepspeech_source, "channels": channels_root}
 
 
 @dataclass
@@ -103,6 +124,8 @@ def ready(case: str, root: Path, sources: Sources) -> AnimationModel:
     if isinstance(encoder := options["audio_encoder"], str):
         options["audio_encoder"] = partial(registry.audio_encoder.get(encoder), source=str(sources[encoder]))
     made, data = registry.model.get(name)(**options), Tiny(root=str(root))
+    if "space" in options:
+        data = TinyChannels(root=str(sources["channels"]))
     for parameter in made.parameters():
         if parameter.requires_grad and not parameter.any():
             torch.nn.init.normal_(parameter, std=0.1)
@@ -126,7 +149,7 @@ def assert_alike(runtime: RuntimeModel, model: AnimationModel, seconds: float, i
     runtime.windows = model.windows = PLAN
     speech = sound(seconds)
     wanted = model.animate(torch.from_numpy(speech), identity=identity, seed=seed).vertices.numpy()
-    found = runtime.animate(speech, identity=identity, seed=seed).vertices
+    found = runtime.motion(speech, runtime.stream(identity=identity, seed=seed))
     assert found.shape == wanted.shape
     span = np.ptp(wanted - model.assets.template(identity).numpy())
     assert np.abs(found - wanted).max() / span < 1e-4
@@ -138,6 +161,19 @@ def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path, sources:
     runtime = in_eager(model)
     for seconds, identity in ((0.3, "B"), (1.013, UNSEEN), (4.317, "A")):  # the last one by windows
         assert_alike(runtime, model, seconds, identity, seed=5)
+
+
+def test_channels_are_decoded_by_the_rig_of_the_face(tiny_root: Path, sources: Sources) -> None:
+    model = ready("dual path in channels", tiny_root, sources)
+    runtime, assets = in_eager(model), model.assets
+    for identity in ("B", UNSEEN):
+        animation = runtime.animate(sound(1.0), identity=identity, seed=5)
+        assert animation.values is not None
+        assert animation.space == CHANNELS
+        offsets = torch.from_numpy(animation.values)[..., None] - assets.template(identity)
+        decoded = (assets.to_vertices(offsets, identity) + assets.mesh.template(identity)).numpy()
+        # The folder's displacements have 16 bits.
+        assert np.abs(animation.vertices - decoded).max() < 1e-4 * np.ptp(decoded - decoded[:1])
 
 
 def test_style_content_takes_a_style_from_motion(tiny_root: Path) -> None:
@@ -161,7 +197,8 @@ def test_exported_folder_gives_what_the_model_gives(
     for seconds, identity in ((0.3, "B"), (4.317, UNSEEN)):
         assert_alike(runtime, model, seconds, identity, seed=5)
     if runtime.has("style"):
-        motion = 0.01 * np.random.default_rng(2).normal(size=(33, VERTICES, 3)).astype(np.float32)
+        shape = (33, model.n_vertices, model.dims)
+        motion = 0.01 * np.random.default_rng(2).normal(size=shape).astype(np.float32)
         with torch.inference_mode():
             wanted = model.encode_style(torch.from_numpy(motion)[None], torch.ones(1, 33, dtype=torch.bool))[0].numpy()
         np.testing.assert_allclose(runtime.encode_style(motion).vector, wanted, atol=1e-5 * np.abs(wanted).max())

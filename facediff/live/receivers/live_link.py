@@ -29,7 +29,7 @@ from facediff.errors import FaceDiffError
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
-from facediff.spaces.arkit import ARKIT, left_first
+from facediff.spaces.arkit import ARKIT, ROTATIONS, left_first
 from facediff.spaces.files.tables import gaze, mirrored
 
 VERSION = 6
@@ -45,8 +45,9 @@ class LiveLink(UdpReceiver):
     """Unreal Engine's Live Link Face: weights of ARKit's shapes by UDP.
 
     The timecode begins at the time of day at which the first frame is sent and goes on with the numbers of the frames:
-    where frames were dropped, numbers are missing. Rotations of the eyes follow the weights of the ``eyeLook`` shapes
-    as in the app's recordings; those of the head are 0, since live frames do not say how the head is turned.
+    where frames were dropped, numbers are missing. Rotations of head and eyes are those of a model of channels, in the
+    app's mirrored frame. Elsewhere those of the eyes follow the weights of the ``eyeLook`` shapes as in the app's
+    recordings, and those of the head are 0.
 
     Args:
         address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
@@ -63,7 +64,8 @@ class LiveLink(UdpReceiver):
 
     def open(self, performance: Performance) -> None:
         """Make the socket and the parts of the datagram that stay the same."""
-        self._weights = ArkitWeights(performance, self.address, ORDER)
+        self._weights = ArkitWeights(performance, self.address, (*ORDER, *ROTATIONS))
+        self._turning = any(name in performance.shapes for name in ROTATIONS)
         subject = self.subject or performance.subject
         device = self.device or str(uuid.uuid5(uuid.NAMESPACE_DNS, f"{subject}.facediff"))
         for option, text in (("subject", subject), ("device", device)):
@@ -83,9 +85,10 @@ class LiveLink(UdpReceiver):
         if self._first is None:
             self._first = int(seconds_of_day() * self._rate) - frame.index
         number = (self._first + frame.index) % int(DAY * self._rate)
-        weights = self._weights.of(frame)
-        rotations = mirrored(np.concatenate([np.zeros(3), gaze(ORDER, weights[None])[0]]))
-        values = [*weights.tolist(), *rotations.tolist()]
+        weights, rotations = np.split(self._weights.of(frame), [len(ORDER)])
+        if not self._turning:
+            rotations = np.concatenate([np.zeros(3), gaze(ORDER, weights[None])[0]])
+        values = [*weights.tolist(), *mirrored(rotations).tolist()]
         rate = self._rate.numerator, self._rate.denominator
         return [self._head + struct.pack(f">ifiiB{len(values)}f", number, 0.0, *rate, len(values), *values)]
 

@@ -1,0 +1,76 @@
+"""Channels of one speaker as vertices, for models whose motion is channels: with PyTorch, exported, and live."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.spaces.rotations import convert
+from facediff.spaces.space import Space
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Decoder:
+    """What turns absolute channels of a speaker into vertices, and what else is known of them.
+
+    Attributes:
+        space: what the channels mean.
+        resting: (C,) their values at rest.
+        neutral: (V, 3) the face at rest.
+        deltas: (K, V, 3) what each channel of :attr:`Space.face` moves the vertices by at 1.
+
+    Raises:
+        FaceDiffError: if the arrays do not fit each other.
+
+    Example:
+        >>> space = Space("linear", ("jawOpen",))
+        >>> decoder = Decoder(space, np.zeros(1), np.zeros((2, 3)), np.ones((1, 2, 3)))
+        >>> decoder.vertices(np.full((1, 1, 1), 0.5)).tolist()
+        [[[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]]
+    """
+
+    space: Space
+    resting: npt.NDArray[np.floating]
+    neutral: npt.NDArray[np.floating]
+    deltas: npt.NDArray[np.floating]
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit each other."""
+        expected = (len(self.space.face), *self.neutral.shape)
+        if self.resting.shape != (len(self.space.channels),) or self.deltas.shape != expected:
+            raise FaceDiffError(
+                f"rig: has {self.resting.shape} values at rest and displacements {self.deltas.shape}; expected "
+                f"({len(self.space.channels)},) and {expected}"
+            )
+
+    def vertices(self, points: npt.NDArray[np.floating]) -> Array:
+        """Absolute vertices (T, V, 3) of absolute channels (T, C, 1); the head as a whole stays where it is."""
+        weights = (points[..., 0] - self.resting)[:, list(self.space.face)].astype(np.float32)
+        moved = weights @ np.asarray(self.deltas, np.float32).reshape(len(self.deltas), -1)
+        moved = moved.reshape(len(points), *self.neutral.shape)
+        moved += self.neutral
+        return moved
+
+    @staticmethod
+    def values(points: npt.NDArray[np.floating]) -> Array:
+        """Channels (T, C) as animations keep them."""
+        return np.ascontiguousarray(points[..., 0], np.float32)
+
+    def head_turns(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64] | None:
+        """How the head turns as a whole (T, 3), axis-angle in radians; None where no channel says it."""
+        turn = next((turn for turn in self.space.rotations if turn.joint == "head"), None)
+        return None if turn is None else convert(points[:, list(turn.channels), 0], turn.form, "axis_angle")
+
+    @cached_property
+    def rest_weights(self) -> Array:
+        """How far each channel (C,) goes to rest in pauses: those of the lower face do, others move on."""
+        upper = {*self.space.region("upper_face"), *self.space.region("eyes")}
+        weights = np.zeros(len(self.space.channels), np.float32)
+        weights[[channel for channel in self.space.face if channel not in upper]] = 1.0
+        return weights

@@ -1,0 +1,121 @@
+"""Folders of models of channels: what they hold, what is made of it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facediff.animation.options import AnimationOptions
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.pipelines.exported import ExportedPipeline
+from facediff.runtime import RuntimeModel
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, packed_deltas
+from facediff.spaces.files import read_parameters
+from facediff.spaces.rotations import convert
+from tests.fakes.exported import CHANNELS, STATE, fit_sizes, write_exported
+from tests.runtime.test_runtime import sound
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_exported(tmp_path / "channels", space=CHANNELS)
+
+
+def test_a_folder_animates_in_channels(folder: Path) -> None:
+    """Files, streams and streams of channels have the same frames, pauses included."""
+    speech = np.concatenate([sound(6.0), np.zeros(32_000, np.float32), sound(4.0)])
+    pipeline = ExportedPipeline(AnimationOptions(checkpoint=folder, seed=2, quiet=True))
+    with pipeline.animations(speech, "speech") as (animation,):
+        assert animation.values is not None
+        assert animation.space == CHANNELS
+        assert animation.head is not None
+        turns = convert(animation.values[:, -3:], "euler", "axis_angle")
+        np.testing.assert_allclose(animation.head[:, :3], turns, atol=1e-6)
+        decoder = RuntimeModel.open(folder).decoder(0)
+        assert decoder is not None
+        decoded = decoder.vertices(animation.values[..., None])
+        np.testing.assert_allclose(animation.still().vertices, decoded, atol=1e-5)
+        stream = pipeline.stream()
+        pieces = [stream.feed(piece) for piece in np.split(speech, [1, 20_000, 20_001])]
+        np.testing.assert_allclose(np.concatenate([*pieces, stream.finish()]), animation.vertices, atol=1e-5)
+        stream = pipeline.stream(channels=True)
+        channels = np.concatenate([stream.feed(speech), stream.finish()])
+        np.testing.assert_array_equal(channels[..., 0], animation.values)
+
+
+def test_the_command_writes_weights_as_they_are(folder: Path, tmp_path: Path) -> None:
+    import soundfile
+
+    soundfile.write(tmp_path / "speech.wav", sound(1.0), 16_000)
+    arguments = ["animate", str(tmp_path / "speech.wav"), "--checkpoint", str(folder), "--seed", "1", "-o"]
+    assert main([*arguments, str(tmp_path / "out.csv")]) == 0
+    clip = read_parameters(tmp_path / "out.csv")
+    pipeline = ExportedPipeline(AnimationOptions(checkpoint=folder, seed=1, quiet=True))
+    with pipeline.animations(sound(1.0), "speech") as (animation,):
+        assert animation.values is not None
+        written = clip.values[: len(animation.values)]
+        jaw, head = clip.space.index("jawOpen"), list(clip.space.head)
+        np.testing.assert_allclose(written[:, jaw], animation.values[:, CHANNELS.index("jawOpen")], atol=1e-3)
+        # Angles beyond 90 degrees are written as others of the same rotation.
+        turns = [convert(angles, "euler", "six_d") for angles in (written[:, head], animation.values[:, -3:])]
+        np.testing.assert_allclose(turns[0], turns[1], atol=1e-3)
+    assert main([*arguments, str(tmp_path / "louder.csv"), "--expressiveness", "1.5"]) != 0
+
+
+def test_displacements_take_16_bits() -> None:
+    rigs = np.random.default_rng(0).normal(size=(2, 3, 40, 3)) * np.array([1e-6, 1.0, 0.0])[:, None, None]
+    packed, scales = packed_deltas(rigs)
+    sizes = np.abs(rigs).max((2, 3))[..., None, None]
+    assert (np.abs(packed * scales[..., None, None] - rigs) <= sizes / 65_000).all()
+
+
+def spoilt(record: str, value: object) -> dict[str, Any]:
+    return {**CHANNELS.state(), record: value}
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        [],
+        {"kind": "arkit"},
+        spoilt("kind", "vertices"),
+        spoilt("kind", "faces"),
+        spoilt("channels", ["jawOpen"] * STATE),
+        spoilt("channels", list(CHANNELS.channels[:-1])),
+        spoilt("rotations", [{"joint": "head", "start": STATE - 2, "form": "euler"}]),
+        spoilt("rotations", []),
+        {},
+    ],
+)
+def test_a_space_that_does_not_fit_is_refused(folder: Path, space: object) -> None:
+    path = folder / DESCRIPTION
+    path.write_text(json.dumps({**json.loads(path.read_text()), "space": space}))
+    with pytest.raises(FaceDiffError, match=r"model\.json|arrays\.npz"):
+        RuntimeModel.open(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("resting", None),
+        ("deltas", None),
+        ("deltas", np.zeros((1, STATE - 3, 5, 3), np.int16)),
+        ("deltas", np.zeros((0, STATE - 3, 6, 3), np.int16)),
+        ("delta_scales", np.full((1, STATE - 3), np.nan, np.float32)),
+        ("rigs", np.array([0, 1], np.int32)),
+        ("rigs", np.array([-1, 0], np.int32)),
+        ("rest_weights", np.ones((2, 6), np.float32)),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(folder: Path, name: str, value: np.ndarray | None) -> None:
+    with np.load(folder / ARRAYS) as stored:
+        arrays = {**stored, name: value}
+    np.savez_compressed(folder / ARRAYS, **{key: array for key, array in arrays.items() if array is not None})
+    fit_sizes(folder)
+    with pytest.raises(FaceDiffError, match=f"arrays.npz: .*({name}|delta)"):
+        RuntimeModel.open(folder)
