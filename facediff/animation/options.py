@@ -188,7 +188,8 @@ class AnimationControls(CheckedOptions):
             none
         controls_seed: seed of blinks, gaze, sway and acting (default: the seed of the noise, or 0)
         direction: keys over time of style, expressiveness, brows, head and others (.json, .csv, or an .npz that was
-            made with some; see docs/animation_controls.md); for a batch also a folder with a file for each recording
+            made with some; see docs/animation_controls.md), or a mood: calm, lively, happy, sad, angry,
+            surprised; for a batch also a folder with a file for each recording
         acting: brows, head and lids that move with the speech: prosody, with options (prosody:strength=0.8,brows=3)
     """
 

@@ -67,23 +67,32 @@ def brows_of(
         neutral, triangles = resting_faces(1)["F1"], build_face().faces
         lender = known_face(neutral, triangles)
         assert lender is not None  # noqa: S101 - for type checkers
-        fields = _carried(neutral, np.stack([lender.brows_up, lender.brows_down]), template, faces)
+        moved = carried(neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)
+        if moved is None:
+            raise OptionError.naming(
+                'brows: where they are is not known for this face; list their vertices as "brows" in the file of '
+                "{eyes}, or give a mesh with triangles whose mouth can open"
+            )
+        fields = moved
     else:
         fields = np.stack([puppet.brows_up, puppet.brows_down])
     return Brows(*(_one_millimetre(field, unit) for field in fields))
 
 
-def _carried(
-    neutral: Array, fields: Array, template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None
-) -> Array:
-    """Displacements (2, V, 3) of the built-in face on another one."""
+def carried(
+    neutral: Array,
+    triangles: npt.NDArray[np.integer],
+    fields: Array,
+    template: npt.NDArray[np.floating],
+    faces: npt.NDArray[np.integer] | None,
+) -> Array | None:
+    """Displacements (K, V, 3) of a built-in face on another one, in its unit; None if no face is found in it."""
     from facediff.editing.correspondence import correspond
     from facediff.editing.face_features import find_features
     from facediff.editing.retargeting import carry_displacements
-    from facediff.synthetic.face import build_face
 
     if faces is not None and len(faces):
-        correspondence = correspond(neutral, build_face().faces, template, faces)
+        correspondence = correspond(neutral, triangles, template, faces)
         laid = correspondence.similarity.inverse().apply(correspondence.target_vertices)
         features = find_features(
             laid,
@@ -92,10 +101,7 @@ def _carried(
         )
         if features is not None and not correspondence.fits_badly:
             return carry_displacements(correspondence, fields)
-    raise OptionError.naming(
-        'brows: where they are is not known for this face; list their vertices as "brows" in the file of {eyes}, or '
-        "give a mesh with triangles whose mouth can open"
-    )
+    return None
 
 
 def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:

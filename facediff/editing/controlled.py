@@ -26,11 +26,12 @@ from facediff.errors import FaceDiffError, OptionError
 if TYPE_CHECKING:
     from facediff.animation.options import AnimationControls
     from facediff.editing.brows import Brows
+    from facediff.editing.face_shapes import Fields
 
 HEAD = ("head.pitch", "head.yaw", "head.roll")
 ACTED = ("brows", "lids", *HEAD)
 """What acting moves, in the order of its columns."""
-POSES = ("brows", "lids", "head")
+POSES = ("shape", "brows", "lids", "head")
 """Channels that are no options, but set a pose by themselves."""
 
 
@@ -43,6 +44,7 @@ class Amounts:
         blinks: a minute; None for none. So for gaze and sway, which are in degrees.
         gaze: degrees.
         sway: degrees.
+        shapes: weights (T,) by ARKit's names.
         brows: millimetres (T,).
         lids: shares (T,).
         turns: degrees of pitch, yaw and roll (T, 3).
@@ -52,6 +54,7 @@ class Amounts:
     blinks: Amount | None = None
     gaze: Amount | None = None
     sway: Amount | None = None
+    shapes: Mapping[str, Array] = field(default_factory=dict)
     brows: Array | None = None
     lids: Array | None = None
     turns: Array | None = None
@@ -99,6 +102,12 @@ class ControlledFace:
             from facediff.editing.brows import brows_of
 
             self.brows = brows_of(template, faces, regions, unit, self.eyes)
+
+        self.shapes: Fields = {}
+        if shapes := [channel.partition(".")[2] for channel in self._keys("shape")]:
+            from facediff.editing.face_shapes import shapes_of
+
+            self.shapes = shapes_of(template, faces, unit, shapes)
 
     def _keys(self, name: str) -> dict[str, object]:
         return {} if self.direction is None else dict(self.direction.under(name))
@@ -182,6 +191,7 @@ class ControlledFace:
             of_option("blinks", controls.blinks),
             of_option("gaze", controls.gaze),
             of_option("sway", controls.sway),
+            {name.partition(".")[2]: curves[name] for name in self._keys("shape")},
             poses.get("brows"),
             poses.get("lids"),
             np.stack([poses.get(name, np.zeros(frames)) for name in HEAD], axis=1) if turned else None,
@@ -190,7 +200,7 @@ class ControlledFace:
     def apply(self, animation: Animation, *, seed: int = 0, start: int = 0, acted: Array | None = None) -> Animation:
         """The animation, or a stretch of one that begins at a frame, with everything changed that is asked for.
 
-        Expressiveness comes first, then brows, gaze and lids, and last the head, which takes everything along.
+        Expressiveness comes first, then shapes, brows, gaze and lids, and last the head, which takes everything along.
 
         Args:
             animation: of the face, with frames as the model made them.
@@ -211,6 +221,11 @@ class ControlledFace:
             from facediff.editing.expressiveness import scale_regions
 
             animation = scale_regions(animation, amounts.expressiveness, eyes)
+        if amounts.shapes:
+            from facediff.editing.face_shapes import add_shapes
+
+            moved = add_shapes(procedural.copied(animation.vertices), self.shapes, amounts.shapes)
+            animation = noted(animation, moved, EDITED, "shape keys")
         if self.brows is not None and amounts.brows is not None:
             from facediff.editing.brows import raise_brows
 

@@ -25,7 +25,11 @@ def check_controls(controls: AnimationControls) -> None:
 
         read_factors(controls.expressiveness)
     if (file := keys_file(controls.direction)) is not None and not file.exists():
-        raise OptionError("direction", "no such file; expected keys over time, .json or .csv", file)
+        from facediff.editing.direction import MOODS
+
+        raise OptionError(
+            "direction", f"no such file; expected keys over time, .json or .csv, or {', '.join(MOODS)}", file
+        )
     if controls.eyes is not None and not Path(controls.eyes).is_file():
         raise OptionError(
             "eyes", "no such file; expected .json or .npz (see docs/animation_controls.md)", controls.eyes
@@ -47,8 +51,12 @@ def check_controls(controls: AnimationControls) -> None:
 
 
 def keys_file(direction: DirectionLike | None) -> Path | None:
-    """The file or folder of keys over time; None where the keys themselves were given."""
-    return Path(direction) if isinstance(direction, str | Path) else None
+    """The file or folder of keys over time; None where the keys themselves or a mood were given."""
+    if not isinstance(direction, str | Path):
+        return None
+    from facediff.editing.direction import is_mood
+
+    return None if is_mood(direction) else Path(direction)
 
 
 def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) -> Direction | None:
@@ -62,11 +70,11 @@ def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) ->
         return None
     from facediff.editing.direction import Direction, read_direction
 
-    if (file := keys_file(direction)) is None:
-        return direction if isinstance(direction, Direction) else Direction.parse(direction, "direction")
-    if file.is_dir():
-        return None
-    return read_direction(file, UNCHECKED if frame_rate is None else frame_rate)
+    if isinstance(direction, str | Path):
+        if Path(direction).is_dir():
+            return None
+        return read_direction(direction, UNCHECKED if frame_rate is None else frame_rate)
+    return direction if isinstance(direction, Direction) else Direction.parse(direction, "direction")
 
 
 def is_procedural(controls: AnimationControls) -> bool:

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices
+from facediff.spaces.arkit import ARKIT
 from facediff.utils import ranges
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_table, write_json, write_rows
@@ -64,6 +65,7 @@ CHANNELS: dict[str, Channel] = {
     "guidance": Channel(ranges.GUIDANCE_SCALE, parts=("speech", "identity", "style"), in_model=True),
     "expressiveness": Channel(Range(0, 4), regions=True),
     "acting": Channel(Range(0, 2)),
+    "shape": Channel(Range(-1, 1), parts=ARKIT),  # weights that are added to the motion
     "brows": Channel(Range(-5, 8)),  # millimetres
     "lids": Channel(Range(0, 1)),
     "blinks": Channel(Range(0, 40)),  # a minute
@@ -287,16 +289,60 @@ class Direction:
         return cls(tuple(_read_keys(enumerate(content["keys"], 1), source, frame_rate)), source)
 
 
+def _mood(**values: float) -> tuple[Key, ...]:
+    return tuple(Key(0.0, name.replace("__", "."), value) for name, value in values.items())
+
+
+MOODS = {
+    "calm": _mood(expressiveness=0.85, shape__eyeBlinkLeft=0.08, shape__eyeBlinkRight=0.08),
+    "lively": _mood(expressiveness=1.25, brows=1.0, shape__mouthSmileLeft=0.1, shape__mouthSmileRight=0.1),
+    "happy": _mood(
+        expressiveness=1.1,
+        brows=0.5,
+        shape__mouthSmileLeft=0.35,
+        shape__mouthSmileRight=0.35,
+        shape__cheekSquintLeft=0.3,
+        shape__cheekSquintRight=0.3,
+    ),
+    "sad": _mood(
+        expressiveness=0.75,
+        head__pitch=4.0,
+        shape__mouthFrownLeft=0.35,
+        shape__mouthFrownRight=0.35,
+        shape__browInnerUp=0.45,
+        shape__eyeBlinkLeft=0.12,
+        shape__eyeBlinkRight=0.12,
+    ),
+    "angry": _mood(
+        expressiveness=1.2,
+        head__pitch=2.0,
+        shape__browDownLeft=0.6,
+        shape__browDownRight=0.6,
+        shape__noseSneerLeft=0.2,
+        shape__noseSneerRight=0.2,
+    ),
+    "surprised": _mood(expressiveness=1.15, brows=4.0, shape__eyeWideLeft=0.5, shape__eyeWideRight=0.5),
+}
+"""Keys by the name of a mood, which ``--direction`` takes in place of a file; they hold from beginning to end."""
+
+
+def is_mood(path: str | Path) -> bool:
+    """Whether it names a mood; a file or folder of that name comes first."""
+    return str(path) in MOODS and not Path(path).exists()
+
+
 def read_direction(path: str | Path, frame_rate: float | None = None) -> Direction:
     """A direction from a file.
 
     Args:
-        path: .json or .csv, or an animation (.npz) that was made with a direction.
+        path: .json or .csv, an animation (.npz) that was made with a direction, or the name of a mood.
         frame_rate: of frames and timecodes, where the file does not say it.
     """
+    if is_mood(path):
+        return Direction(MOODS[str(path)], str(path))
     path = Path(path)
     if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected keys over time, .json or .csv")
+        raise FaceDiffError(f"{path}: no such file; expected keys over time, .json or .csv, or {', '.join(MOODS)}")
     suffix = path.suffix.lower()
     if suffix == ".json":
         return Direction.parse(load_json(path), str(path), frame_rate)

@@ -31,6 +31,7 @@ from facediff.export.viewer.packing import (
     mouth_opening,
     pack_motion,
 )
+from facediff.export.viewer.posing import acted_curves, moods, pose_fields
 from facediff.registry import export_format
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.pages import fill, hash_source, script_data
@@ -51,7 +52,8 @@ USUAL = {"head": (-10.0, 10.0)}
 REST = {"expressivity": 1.0, "guidance": 1.0, "expressiveness": 1.0, "acting": 1.0}
 """Where a channel stays without keys, and gets its first one; 0 for the others."""
 PREVIEWED = ("expressiveness", "head")
-"""Channels whose effect the page shows without the model."""
+POSED = ("brows", "lids", "shape")
+"""Channels whose effect the page shows without the model: of any face, and of those whose displacements it has."""
 
 
 @export_format.register("html")
@@ -198,13 +200,14 @@ def _direction_facts() -> dict[str, Any]:
             "usual": USUAL.get(name),
             "unit": UNITS.get(name, ""),
             "regions": channel.regions,
-            "preview": name in PREVIEWED,
+            "preview": "always" if name in PREVIEWED else "posed" if name in POSED else "never",
         }
         channels |= {f"{name}.{part}": facts for part in channel.parts} or {name: facts}
     return {
         "format": direction.FORMAT,
         "version": direction.VERSION,
         "stepSeconds": direction.STEP_SECONDS,
+        "moods": moods(),
         "channels": channels,
     }
 
@@ -258,6 +261,8 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
             name: blobs.add(np.asarray(indices, "<i4").tobytes()) for name, indices in animation.regions.items()
         },
         "head": None if animation.head is None else blobs.add(_head_in_mm(animation.head, animation)),
+        "fields": pose_fields(animation, blobs),
+        "acted": acted_curves(animation, blobs),
         "weights": _weights_of(animation, blobs),
         "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),
         "direction": _keys_of(animation),

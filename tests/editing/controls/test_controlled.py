@@ -15,10 +15,12 @@ from facediff.animation.options import AnimationControls
 from facediff.cli.parsing import parameters_of, parse
 from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import check_controls
+from facediff.editing.direction import MOODS, Direction, Key, read_direction
 from facediff.editing.expressiveness import scale_regions
 from facediff.editing.eyes import Eyes
 from facediff.editing.procedural import add_blinks, add_gaze, add_sway
 from facediff.errors import FaceDiffError
+from facediff.synthetic.known_faces import built_in_rig
 
 
 def parsed(*words: str) -> AnimationControls:
@@ -101,3 +103,22 @@ def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable
         .metadata["procedural"]
         .startswith("head sway")
     )
+
+
+def test_shape_keys_add_their_displacements(make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(3, frame_rate=2.0)
+    keys = [Key(0, "shape.jawOpen", 0.0, "linear"), Key(1, "shape.jawOpen", 1.0), Key(0, "shape.mouthSmileLeft", -0.5)]
+    moved = apply_controls(animation, AnimationControls(direction=Direction(keys))).vertices
+    rig = built_in_rig("F1", 1)
+    jaw, smile = (rig.deltas[rig.names.index(name)] for name in ("jawOpen", "mouthSmileLeft"))
+    np.testing.assert_allclose(moved - animation.vertices, [t * jaw - 0.5 * smile for t in (0, 0.5, 1)], atol=1e-7)
+    with pytest.raises(FaceDiffError, match="shape"):
+        apply_controls(replace(animation, faces=None), AnimationControls(direction=Direction(keys)))
+
+
+@pytest.mark.parametrize("mood", MOODS)
+def test_moods_are_keys_that_finished_motion_takes(mood: str, make_animation: Callable[..., Animation]) -> None:
+    animation = make_animation(2)
+    moved = apply_controls(animation, AnimationControls(direction=mood))
+    assert read_direction(mood).rows() == Direction.parse(moved.metadata["direction"], mood).rows()
+    assert np.isfinite(moved.vertices).all()

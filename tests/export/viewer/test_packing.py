@@ -213,7 +213,7 @@ def test_page_has_the_keys_of_its_animation_and_what_their_preview_needs(tmp_pat
 def test_page_has_code_of_its_own_of_less_than_120_kilobytes(tmp_path: Path) -> None:
     """Many pages are mailed."""
     write_page(tmp_path / "a.html", [clicks(speech=False)])
-    assert (tmp_path / "a.html").stat().st_size < 150_000
+    assert (tmp_path / "a.html").stat().st_size < 160_000
     page = Written(tmp_path / "a.html")
     (program,) = [text for attributes, text in page.reader.scripts if "type" not in attributes]
     assert len(program) < 120_000

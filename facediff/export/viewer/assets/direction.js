@@ -95,12 +95,13 @@ class Direction {
 
   // Changes. Keys are never changed but replaced, so that the history is a list of lists.
 
-  set(keys) {
+  /** `turned` says that keys stand in place of acting and blinks; it is part of the history as they are. */
+  set(keys, turned = this.keys.turned) {
     if (!this.held) {
       this.past.push(this.keys);
       this.future = [];
     }
-    this.keys = this.ordered(keys);
+    this.keys = Object.assign(this.ordered([...keys]), { turned });
     this.onChange();
   }
 

@@ -4,7 +4,7 @@
 const quoted = (word) => (/^[\w./:=,+@-]+$/.test(word) ? word : `'${word.replaceAll("'", `'\\''`)}'`);
 
 /** The options of a take, from its metadata; a file from elsewhere may hold anything, but no output and no other model. */
-const optionWords = (text) => {
+const optionWords = (text, turned) => {
   let words = [];
   try {
     words = JSON.parse(text ?? "[]");
@@ -13,8 +13,34 @@ const optionWords = (text) => {
   }
   const strings = Array.isArray(words) ? words.filter((word) => typeof word === "string") : [];
   const known = strings.every((word) => !word.startsWith("-") || /^--(?!output|checkpoint|yes)[a-z-]+$|^-[\d.]+$/.test(word));
-  return known ? strings.map(quoted) : [];
+  if (!known) return [];
+  return (turned ? withoutRules(strings) : strings).map(quoted);
 };
+
+/** Options without those whose work has been turned into keys; their seed stays for gaze and sway. */
+const withoutRules = (words) => {
+  const others = ["--gaze", "--sway"].some((name) => words.includes(name));
+  const left = ["--acting", "--blinks", ...(others ? [] : ["--controls-seed"])];
+  let dropped = false;
+  return words.filter((word) => {
+    if (word.startsWith("--")) dropped = left.includes(word);
+    return !dropped;
+  });
+};
+
+/** How far straight lines between keys may be from each frame; 0.05 degrees for the head. */
+const TOLERANCES = { brows: 0.03, lids: 0.01 };
+
+/** Displacements in mm, vertex by vertex, from blobs that hold steps, axis by axis. */
+async function readFields(fields, vertices) {
+  const read = async (blob) => {
+    const steps = new Int16Array(await readBlob(blob));
+    return Float32Array.from(steps, (_, i) => steps[(i % 3) * vertices + Math.floor(i / 3)] * fields.step);
+  };
+  const shapes = Object.entries(fields.shapes).map(async ([name, blob]) => [name, await read(blob)]);
+  const [browsUp, browsDown, closing] = await Promise.all([fields.browsUp, fields.browsDown, fields.closing].map(read));
+  return { browsUp, browsDown, closing, shapes: Object.fromEntries(await Promise.all(shapes)) };
+}
 
 class Editor {
   constructor(player) {
@@ -70,6 +96,12 @@ class Editor {
     click("delete-key", () => this.removeKeys());
     click("copy-keys", () => this.copyKeys());
     click("paste-keys", () => this.pasteKeys());
+    click("turn-into-keys", () => this.turnIntoKeys());
+    find("mood").append(...Object.keys(this.facts.direction.moods).map((name) => new Option(name, name)));
+    find("mood").addEventListener("change", () => {
+      this.setMood(find("mood").value);
+      find("mood").value = "";
+    });
     click("box", () => find("box").setAttribute("aria-pressed", String(!this.boxing)));
     const { view } = this.player;
     click("time-closer", () => view.zoom(1.5, this.time));
@@ -124,8 +156,38 @@ class Editor {
       const made = new Direction(this.facts.direction, [], () => {});
       made.keys = this.directions[number].keys;
       const head = animation.head === null ? null : new Float32Array(await readBlob(animation.head));
-      return new Preview(this.facts, animation, Object.fromEntries(await Promise.all(entries)), head, made);
+      const fields = animation.fields && (await readFields(animation.fields, animation.vertices));
+      const curve = async (blob) => new Float32Array(await readBlob(blob));
+      const acted = animation.acted && {
+        acting: Object.fromEntries(await Promise.all(Object.entries(animation.acted.acting).map(async ([name, blob]) => [name, await curve(blob)]))),
+        blinks: animation.acted.blinks === null ? null : await curve(animation.acted.blinks),
+      };
+      return new Preview(this.facts, animation, Object.fromEntries(await Promise.all(entries)), head, made, fields, acted);
     }));
+    this.changed();
+  }
+
+  /** Whether the page shows what keys of a channel do. */
+  canPreview(name) {
+    return !this.previews || this.previews[this.number].shows(name);
+  }
+
+  /** Replace what acting and blinking did by keys of the same motion, which can be edited. */
+  turnIntoKeys() {
+    const preview = this.previews[this.number], { direction } = this, { acting, blinks } = preview.acted;
+    const names = [...new Set([...Object.keys(acting), ...(blinks ? ["lids"] : [])])];
+    const rows = names.flatMap((name) => preview.reduced(direction, name, TOLERANCES[name] ?? 0.05));
+    const left = direction.keys.filter(({ channel }) => !names.includes(channel) && channel !== "acting");
+    direction.set([...left, ...rows.map(Object.freeze)], true);
+    find("direction-said").textContent = `${rows.length} keys in place of acting and blinks; the command leaves out the options that made them`;
+  }
+
+  /** A mood's keys at the beginning, in place of other keys of its channels. */
+  setMood(name) {
+    const rows = this.facts.direction.moods[name], { direction } = this;
+    const channels = new Set(rows.map(({ channel }) => channel));
+    direction.set([...direction.keys.filter(({ channel }) => !channels.has(channel)), ...rows.map((row) => Object.freeze({ ...row }))]);
+    find("direction-said").textContent = `${name}: ${rows.length} keys from beginning to end, as --direction ${name} has them`;
   }
 
   preview(number, face, frame) {
@@ -290,6 +352,10 @@ class Editor {
     this.chosen = this.chosen.map(now).filter(Boolean);
     for (const name of direction.channels) this.addLane(name);
     this.drawLanes();
+    const acted = this.previews && this.previews[this.number].acted;
+    find("turn-into-keys").hidden = !acted;
+    find("turn-into-keys").disabled = Boolean(direction.keys.turned);
+    for (const lane of this.lanes) lane.later.hidden = this.canPreview(lane.name);
     find("paste-keys").disabled = !this.copied.length;
     find("undo").disabled = !direction.past.length;
     find("redo").disabled = !direction.future.length;
@@ -309,7 +375,11 @@ class Editor {
       channel.regions ? [name, ...Object.keys(regions).map((region) => `${name}.${region}`)] : [name]
     );
     const left = names.filter((name) => !this.lanes.some((lane) => lane.name === name));
-    find("add-channel").replaceChildren(new Option("Add a channel…", ""), ...left.map((name) => new Option(name, name)));
+    const shapes = make("optgroup");
+    shapes.label = "ARKit's shapes";
+    const of = (some) => some.map((name) => new Option(name, name));
+    shapes.append(...of(left.filter((name) => name.startsWith("shape."))));
+    find("add-channel").replaceChildren(new Option("Add a channel…", ""), ...of(left.filter((name) => !name.startsWith("shape."))), shapes);
   }
 
   showFields() {
@@ -357,7 +427,7 @@ class Editor {
     for (const name of ["identity", ...(directed ? [] : ["style"]), "seed", "expressivity", "guidance"]) {
       if (/^[\w.=,-]+$/.test(metadata[name] ?? "")) words.push(`--${name}`, metadata[name]); // not "zoe (not trained on)"
     }
-    words.push(...optionWords(metadata.options));
+    words.push(...optionWords(metadata.options, this.direction.keys.turned));
     words.push("--direction", quoted(this.fileOf(this.number)), "-o", "take.html");
     find("command").textContent = words.join(" ");
   }

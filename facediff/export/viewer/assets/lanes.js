@@ -29,7 +29,9 @@ class Lane extends Plot {
     };
     head.append(make("b", "", name), this.now);
     if (this.known.unit) head.append(make("span", "what", this.known.unit));
-    if (!this.known.preview) head.append(make("span", "mark", "shows after a new run"));
+    this.later = make("span", "mark", "shows after a new run");
+    this.later.hidden = editor.canPreview(name);
+    head.append(this.later);
     const tools = make("span", "lane-tools");
     if (this.known.range) {
       tools.append(
