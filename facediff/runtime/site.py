@@ -116,8 +116,13 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
     """The page of a model, with the names of recordings to try.
 
     Raises:
-        FaceDiffError: if the model has no triangles.
+        FaceDiffError: if the model has no triangles, or its motion is channels.
     """
+    if not description.motion_space.is_vertices:
+        raise FaceDiffError(
+            f"{title}: moves channels ({description.motion_space.kind}), and the page plays models of vertices only; "
+            f"use `facediff live {title} --to browser`"
+        )
     if "faces" not in arrays:
         raise FaceDiffError(
             f"{title}: holds no triangles, which a picture needs; export a model whose corpus has a mesh"

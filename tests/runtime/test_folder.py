@@ -15,6 +15,7 @@ from facediff.errors import FaceDiffError
 from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, packed_deltas
+from facediff.runtime.site import make_site
 from facediff.spaces.files import read_parameters
 from facediff.spaces.rotations import convert
 from tests.fakes.exported import CHANNELS, STATE, fit_sizes, write_exported
@@ -65,6 +66,11 @@ def test_the_command_writes_weights_as_they_are(folder: Path, tmp_path: Path) ->
         turns = [convert(angles, "euler", "six_d") for angles in (written[:, head], animation.values[:, -3:])]
         np.testing.assert_allclose(turns[0], turns[1], atol=1e-3)
     assert main([*arguments, str(tmp_path / "louder.csv"), "--expressiveness", "1.5"]) != 0
+
+
+def test_the_page_says_that_it_plays_vertices_only(folder: Path) -> None:
+    with pytest.raises(FaceDiffError, match="channels"):
+        make_site(folder, {})
 
 
 def test_displacements_take_16_bits() -> None:
