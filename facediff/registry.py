@@ -294,6 +294,12 @@ corpus = Kind(
     aliases=False,
 )
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
+render_metric = Kind(
+    "render_metric",
+    "facediff.evaluation.renders",
+    "a score of rendered frames and speech by networks of one's own",
+    aliases=False,
+)
 augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech", aliases=False)
 voice_gate = Kind("voice_gate", "facediff.speech.voice_activity", "finds the pauses of speech", aliases=False)
 acting = Kind("acting", "facediff.editing.acting", "moves brows, head and lids with the speech", aliases=False)
@@ -336,7 +342,18 @@ KINDS: dict[str, Kind] = {
     **COMPONENTS,
     **{
         kind.kind: kind
-        for kind in (model, corpus, metric, augmentation, voice_gate, acting, puppet_voice, export_format, receiver)
+        for kind in (
+            model,
+            corpus,
+            metric,
+            render_metric,
+            augmentation,
+            voice_gate,
+            acting,
+            puppet_voice,
+            export_format,
+            receiver,
+        )
     },
 }
 """Everything that can be chosen by name."""

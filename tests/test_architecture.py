@@ -49,7 +49,7 @@ ALLOWED: dict[str, set[str]] = {
     "runtime": {"spaces", "version", "animation", "speech", "export", *BASE},
     "live": {"spaces", "version", "runtime", "animation", "speech", "editing", "export", "mesh", *BASE},
     "reporting": BASE,
-    "evaluation": {"spaces", "reporting", "speech", "data", "metrics", "mesh", "render", *BASE},
+    "evaluation": {"spaces", "runtime", "reporting", "speech", "data", "metrics", "mesh", "render", *BASE},
     "benchmark": {"version", "evaluation", "reporting", "speech", "metrics", "synthetic", *BASE},
     "study": {"version", "reporting", "animation", "speech", "data", "evaluation", "mesh", "render", *BASE},
     "pipelines": {

@@ -50,6 +50,8 @@ def evaluate(
     rig: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
     unit: Annotated[str | None, Option(metavar="UNIT")] = None,
     file_unit: Annotated[str | None, Option(metavar="UNIT")] = None,
+    render: Annotated[list[str] | None, Option(metavar="NAME:OPTION=VALUE,…")] = None,
+    mesh: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
     pattern: Annotated[list[str] | None, Option(metavar="PATTERN")] = None,
     truth_pattern: Annotated[str | None, Option(metavar="PATTERN")] = None,
     identity: Annotated[str, Option(metavar="NAME")] = "own",
@@ -91,6 +93,8 @@ def evaluate(
         truth_layout: the same of the truth's (default: as --layout)
         rig: what decodes parameters to vertices, the head at rest: a .glb, a folder of shapes, or FLAME's model file
         unit: unit of lengths of the scores: m, cm or mm (default: the protocol's, or the files')
+        render: score renders too, by networks of your own, such as onnx:graph=net.onnx; repeatable
+        mesh: mesh file whose triangles are rendered (default: the rig's)
         file_unit: unit of the files' vertices (default: as the rig or the corpus's manifest.json says)
         pattern: how predictions are named, repeatable (default: see the manual)
         truth_pattern: how truths are named (default: {subject}_{sentence})
@@ -112,9 +116,11 @@ def evaluate(
         idle = {
             "lip_pairs": lip_pairs is not None,
             "eyelid_pairs": eyelid_pairs is not None,
-            "frame_rate": frame_rate is not None,
+            "frame_rate": frame_rate is not None and not render,
         }
         refuse_idle("is for further metrics, chosen with --metric", **idle)
+    if not render:
+        refuse_idle("is for --render", mesh=mesh is not None)
     if layout is None:
         refuse_idle("goes with --layout, that of the predictions", truth_layout=truth_layout is not None)
     methods = named_folders([predictions, *(method or [])])
@@ -132,6 +138,7 @@ def evaluate(
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
     from facediff.evaluation.files import count_vertices, find_truths, read_pairs
     from facediff.evaluation.parameters import holds_parameters, parameter_files
+    from facediff.mesh.files import read_mesh
     from facediff.metrics import EyelidPairs
 
     protocols, metrics = find_protocols(protocol or ["paper"], topology), metric or []
@@ -172,6 +179,8 @@ def evaluate(
         files=files,
         unit=unit,
         file_unit=file_unit,
+        renders=render or (),
+        faces=read_mesh(mesh).faces if mesh is not None else None if files is None else files.faces,
         patterns=pattern or DEFAULT_PATTERNS,
         truth_pattern=truth_pattern or TRUTH_PATTERN,
         identity=identity,

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -27,6 +29,7 @@ from facediff.evaluation.files import (
 )
 from facediff.evaluation.groups import attributes_of
 from facediff.evaluation.parameters import ParameterFiles, refuse_vertex_protocols
+from facediff.evaluation.renders import RenderScorer, means, read_render_metrics
 from facediff.evaluation.report import EvaluationReport, MethodTable, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
@@ -59,6 +62,8 @@ def evaluate(
     files: ParameterFiles | None = None,
     unit: str | None = None,
     file_unit: str | None = None,
+    renders: Sequence[str] = (),
+    faces: npt.NDArray[np.integer] | None = None,
     patterns: Sequence[str] = DEFAULT_PATTERNS,
     truth_pattern: str = TRUTH_PATTERN,
     identity: str = OWN,
@@ -95,6 +100,8 @@ def evaluate(
         files: how files of parameters are read; None for files of vertices.
         unit: unit of lengths of the scores of vertices; that of each protocol, or of the vertices, if None.
         file_unit: unit of the vertices; as the rig or the corpus's ``manifest.json`` says if None.
+        renders: render metrics by name with options; see :mod:`facediff.evaluation.renders`.
+        faces: (F, 3) triangles, by which motion is rendered; those of the rig if None.
         patterns: how predictions may be named; see :class:`facediff.evaluation.files.NamePattern`.
         truth_pattern: how truths are named.
         identity: which predictions of a clip are scored where several were conditioned on different identities:
@@ -127,7 +134,7 @@ def evaluate(
     suffixes = (".npy",) if files is None else SUFFIXES
     names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())], suffixes)
     truths = index_truths(names)
-    if frame_rate is None and requests and corpus is not None:
+    if frame_rate is None and (requests or renders) and corpus is not None:
         stored = read_manifest(corpus).get("frame_rate")
         frame_rate = stored / truth_stride if isinstance(stored, int | float) and stored > 0 else None
     if files is not None:
@@ -184,6 +191,9 @@ def evaluate(
     if named:
         lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in named.items()]
         definitions[METRICS] = "\n".join(["further metrics", *lines])
+    rendered = {}
+    if renders:
+        rendered = score_renders(renders, scorer, paired, lips, faces, corpus, frame_rate)
     results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
         truth=str(truth),
@@ -202,8 +212,52 @@ def evaluate(
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
+        renders=rendered,
         points="channels" if files is not None and files.rig is None else "vertices",
     )
+
+
+def score_renders(
+    renders: Sequence[str],
+    scorer: Scorer,
+    paired: Mapping[str, tuple[Sequence[Pair], object]],
+    lips: Region,
+    faces: npt.NDArray[np.integer] | None,
+    corpus: Path | None,
+    frame_rate: float | None,
+) -> dict[str, dict[str, float]]:
+    """Means over clips of the scores on renders, of every method and of the truth.
+
+    Raises:
+        FaceDiffError: if there are no triangles, no vertices or no frame rate.
+    """
+    metrics = read_render_metrics(renders)
+    if faces is None or frame_rate is None:
+        lacking = "triangles (--mesh FILE)" if faces is None else "the frame rate (--frame-rate)"
+        raise FaceDiffError(f"--render draws motion, and lacks {lacking}; give it")
+
+    def speech(clip: str) -> npt.NDArray[np.float32]:
+        path = None if corpus is None else corpus / "wav" / f"{clip}.wav"
+        return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
+
+    drawing = RenderScorer(metrics, faces=faces, lips=lips.indices, frame_rate=frame_rate, speech=speech)
+    rows: dict[str, dict[str, list[dict[str, float]]]] = {}
+    for method, (pairs, _) in paired.items():
+        for pair in pairs:
+            truth = scorer.read(pair.truth.path, scorer.truth_stride)
+            vertices = truth.get(channels=False)
+            known = scorer.templates.get(pair.truth.name.subject, truth.template)
+            template = (vertices.double().mean(0) if known is None else known.double()).numpy()
+            clip = pair.truth.path.stem
+            own = rows.setdefault(method, {})
+            own[clip] = [
+                drawing.score(clip, scorer.read(path, 1).get(channels=False).double().numpy(), template)
+                for path in pair.predictions.values()
+            ]
+            truths = rows.setdefault("truth", {})
+            if clip not in truths:
+                truths[clip] = [drawing.score(clip, vertices.double().numpy(), template)]
+    return {who: means([means(own) for own in clips.values()]) for who, clips in rows.items()}
 
 
 def names_of(paired: Mapping[str, tuple[Sequence[Pair], object]]) -> set[str]:

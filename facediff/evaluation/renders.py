@@ -1,0 +1,329 @@
+"""Scores of rendered frames by networks that users bring, such as lip-sync and lip-reading models, as graphs of ONNX.
+
+facediff ships no weights. A render metric is a class that says which pictures it wants and scores those of a clip with
+its speech; it is registered with ``@facediff.registry.render_metric.register("name")``, and chosen by
+``facediff evaluate --render name:option=value``. Files are read as those of exported models are: what a graph may cost
+is checked before it is opened, and no code of a file is run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.registry import UnknownComponentError, render_metric
+from facediff.render.rasteriser import Camera, Renderer
+from facediff.runtime.graph_check import check_graph
+from facediff.runtime.graphs import open_session, run_session
+from facediff.speech.audio import SAMPLE_RATE
+from facediff.speech.cepstra import mel_filters
+
+if TYPE_CHECKING:
+    import onnxruntime  # type: ignore[import-untyped]
+
+Frames = npt.NDArray[np.uint8]
+Speech = npt.NDArray[np.float32]
+Array = npt.NDArray[np.floating]
+
+
+class RenderMetric:
+    """Base of scores of rendered frames; a subclass defines :meth:`score`.
+
+    Attributes:
+        part: what pictures show: the ``face``, or the ``mouth`` and as much around it.
+        size: height and width of the pictures.
+    """
+
+    part: Literal["face", "mouth"] = "face"
+    size: tuple[int, int] = (224, 224)
+
+    def score(self, frames: Frames, speech: Speech, frame_rate: float) -> Mapping[str, float]:
+        """Scores of one clip by name.
+
+        Args:
+            frames: pictures (T, H, W, 3), sRGB.
+            speech: samples (S,) at 16 kHz, beginning with the first frame; empty if there is none.
+            frame_rate: frames a second.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A graph of ONNX, opened once it has been read."""
+
+    path: Path
+
+    @cached_property
+    def session(self) -> onnxruntime.InferenceSession:
+        """The graph, ready to run."""
+        if not self.path.is_file():
+            raise FaceDiffError(f"{self.path}: no such file; expected a graph of ONNX (.onnx) with your network")
+        return open_session(self.path, check_graph(self.path))
+
+    @property
+    def inputs(self) -> dict[str, list[int | str | None]]:
+        """Shapes of the inputs by name."""
+        return {end.name: list(end.shape) for end in self.session.get_inputs()}
+
+    def run(self, inputs: Mapping[str, Array], seconds: float) -> dict[str, Array]:
+        """The outputs by name, finite.
+
+        Args:
+            inputs: by name.
+            seconds: of motion, which bound how long it may take.
+        """
+        numbers = {name: np.ascontiguousarray(value, np.float32) for name, value in inputs.items()}
+        results = run_session(self.session, numbers, str(self.path), seconds=seconds)
+        outputs = dict(zip((end.name for end in self.session.get_outputs()), results, strict=True))
+        for name, value in outputs.items():
+            if value.dtype.kind != "f" or not value.size or not np.isfinite(value).all():
+                raise FaceDiffError(
+                    f"{self.path}: gives {value.dtype} {value.shape} as {name}; expected finite numbers"
+                )
+        return outputs
+
+
+@render_metric.register("onnx")
+class OnnxScores(RenderMetric):
+    """Whatever a graph of ONNX makes of a clip: the mean of each of its outputs is a score of the output's name.
+
+    Its input ``frames`` is (1, T, H, W, 3) with colours from 0 to 1, H and W fixed; an input ``speech``, if it has one,
+    is (1, S) at 16 kHz. Lip-reading scores and perceptual ones such as PLRS can be exported in this form.
+
+    Args:
+        graph: the file.
+        part: ``face`` or ``mouth``.
+    """
+
+    def __init__(self, *, graph: str = "", part: str = "face") -> None:
+        self.graph = Graph(Path(graph))
+        self.part = _part(part)
+        shape = self.graph.inputs.get("frames", [])
+        if len(shape) != 5 or shape[4] != 3 or not self.graph.inputs.keys() <= {"frames", "speech"}:
+            raise FaceDiffError(
+                f"{graph}: has the inputs {self.graph.inputs}; expected frames (1, T, H, W, 3), and speech (1, S) if "
+                f"it hears"
+            )
+        self.size = _size(graph, shape[2:4])
+
+    def score(self, frames: Frames, speech: Speech, frame_rate: float) -> Mapping[str, float]:
+        """The mean of each output."""
+        inputs: dict[str, Array] = {"frames": frames[None] / np.float32(255)}
+        if "speech" in self.graph.inputs:
+            if not len(speech):
+                raise FaceDiffError(f"{self.graph.path}: reads speech, and the truth has no wav/ next to it")
+            inputs["speech"] = speech[None]
+        outputs = self.graph.run(inputs, len(frames) / frame_rate)
+        return {name: float(value.mean()) for name, value in outputs.items()}
+
+
+@render_metric.register("sync")
+class SyncScores(RenderMetric):
+    """LSE-D and LSE-C: are mouth and sound in step by two encoders, as SyncNet's are?
+
+    Each moment of the motion, 25 a second, gives a window of five mouth pictures (0.2 s, which it begins), and of the
+    sound a mel spectrogram of the same 0.2 s. With d(o), the mean over moments of the Euclidean distance between the
+    video's embedding and that of the sound o frames later, for o from −15 to 15: LSE-D is the least d, LSE-C the median
+    of d less the least (Chung and Zisserman 2016; names of Prajwal et al. 2020), and ``offset`` where it lies. Windows
+    without a partner are left out.
+
+    ``video`` takes (N, 15, H, W), five pictures of three colours after one another, or (N, 3, 5, H, W), from 0 to 1;
+    ``audio`` takes (N, 1, 80, 16): log mel of windows of 800 samples every 200, pre-emphasis 0.97, 55 to 7600 Hz on the
+    Slaney scale, in decibels less 20, from −100 to 0 mapped to −4 to 4, which is Wav2Lip's. Scores of different
+    encoders, and of renders and camera pictures, cannot be compared.
+
+    Args:
+        video: the graph of the video's encoder.
+        audio: the graph of the sound's.
+        order: of colours, ``bgr`` as OpenCV reads them, or ``rgb``.
+        reach: largest offset, in frames.
+    """
+
+    part = "mouth"
+
+    def __init__(self, *, video: str = "", audio: str = "", order: str = "bgr", reach: int = 15) -> None:
+        if order not in ("bgr", "rgb") or reach < 1:
+            raise FaceDiffError(f"sync: order is {order!r} and reach {reach}; expected bgr or rgb, and 1 or more")
+        self.video, self.audio = Graph(Path(video)), Graph(Path(audio))
+        self.order, self.reach = order, reach
+        ends = [list(graph.inputs.items()) for graph in (self.video, self.audio)]
+        shapes = [end[0][1] if len(end) == 1 else [] for end in ends]
+        self.flat = len(shapes[0]) == 4
+        if shapes[0][1:-2] not in ([15], [3, 5]) or shapes[1][1:] != [1, 80, 16]:
+            raise FaceDiffError(
+                f"{video} and {audio}: have the inputs {shapes[0]} and {shapes[1]}; expected (N, 15, H, W) or "
+                f"(N, 3, 5, H, W), and (N, 1, 80, 16)"
+            )
+        self.names = [end[0][0] for end in ends]
+        self.size = _size(video, shapes[0][-2:])
+
+    def score(self, frames: Frames, speech: Speech, frame_rate: float) -> Mapping[str, float]:
+        """Both scores and the offset, of one clip."""
+        if not len(speech):
+            raise FaceDiffError(f"{self.video.path}: reads speech, and the truth has no wav/ next to it")
+        places = np.rint(np.arange(int(len(frames) / frame_rate * 25 + 1e-6)) * frame_rate / 25).astype(int)
+        pictures = frames[places.clip(0, len(frames) - 1)][..., :: -1 if self.order == "bgr" else 1]
+        count = min(len(pictures) - 4, int((len(speech) / SAMPLE_RATE - 0.2) * 25) + 1)
+        if count < 2 * self.reach:
+            raise FaceDiffError(f"a clip of {len(frames)} frames is too short for offsets of {self.reach} frames")
+        windows = np.stack([pictures[start : start + 5] for start in range(count)]) / np.float32(255)
+        # (N, 5, H, W, 3): colours within pictures, or pictures within colours.
+        seen = windows.transpose(0, 1, 4, 2, 3) if self.flat else windows.transpose(0, 4, 1, 2, 3)
+        seen = seen.reshape(count, 15, *self.size) if self.flat else seen
+        mel = mel_spectrogram(speech)
+        starts = [min(round(3.2 * start), mel.shape[1] - 16) for start in range(count)]
+        heard = np.stack([mel[None, :, start : start + 16] for start in starts])
+        moving, sounding = self._embeddings(self.video, 0, seen), self._embeddings(self.audio, 1, heard)
+        if moving.shape != sounding.shape:
+            raise FaceDiffError(
+                f"{self.video.path} and {self.audio.path}: give embeddings {moving.shape} and {sounding.shape}; "
+                f"expected the two encoders of one model"
+            )
+        offsets = range(-self.reach, self.reach + 1)
+        distances = []
+        for offset in offsets:
+            first, last = max(0, -offset), min(count, count - offset)
+            gaps = moving[first:last] - sounding[first + offset : last + offset]
+            distances.append(float(np.linalg.norm(gaps, axis=1).mean()))
+        least = int(np.argmin(distances))
+        return {
+            "lse_d": distances[least],
+            "lse_c": float(np.median(distances)) - distances[least],
+            "offset": float(offsets[least]),
+        }
+
+    def _embeddings(self, graph: Graph, which: int, windows: Array) -> Array:
+        """Embeddings (N, D), a few windows at a time, or one where the graph takes no more."""
+        batch = graph.inputs[self.names[which]][0]
+        step = batch if isinstance(batch, int) else 32
+        if len(windows) % step:
+            step = step if not isinstance(batch, int) else 1
+        parts = [
+            next(iter(graph.run({self.names[which]: windows[start : start + step]}, step / 25).values()))
+            for start in range(0, len(windows), step)
+        ]
+        return np.concatenate([part.reshape(len(part), -1) for part in parts]).astype(np.float64)
+
+
+def mel_spectrogram(speech: Speech) -> Array:
+    """Log mel (80, frames) of speech (S,) at 16 kHz, 80 frames a second, as :class:`SyncScores` says."""
+    emphasised = np.append(speech[:1], speech[1:] - 0.97 * speech[:-1]).astype(np.float64)
+    padded = np.pad(emphasised, 400, mode="reflect") if len(speech) > 400 else np.pad(emphasised, 400)
+    count = max(16, len(speech) // 200 + 1)
+    padded = np.pad(padded, (0, max(0, 200 * (count - 1) + 800 - len(padded))))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 800)[::200][:count]
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(800) / 800)
+    mel = mel_filters(80, 800, 55.0, 7600.0, scale="slaney").astype(np.float64) @ np.abs(np.fft.rfft(windows * hann)).T
+    decibels = 20 * np.log10(np.maximum(mel, 1e-5)) - 20
+    return np.asarray(np.clip(8 * (decibels + 100) / 100 - 4, -4, 4), np.float32)
+
+
+def _part(part: str) -> Literal["face", "mouth"]:
+    if part not in ("face", "mouth"):
+        raise FaceDiffError(f"part is {part!r}; expected face or mouth")
+    return cast(Literal["face", "mouth"], part)
+
+
+def _size(path: str, dims: Sequence[int | str | None]) -> tuple[int, int]:
+    if not all(isinstance(size, int) and size > 0 for size in dims):
+        raise FaceDiffError(f"{path}: takes pictures of {dims[0]} × {dims[1]}; export it with a fixed height and width")
+    height, width = cast(tuple[int, int], tuple(dims))
+    return height, width
+
+
+# Rendering and scoring clips.
+
+
+def read_render_metrics(texts: Sequence[str]) -> dict[str, RenderMetric]:
+    """Render metrics by ``NAME:option=value,…``, under these texts.
+
+    Raises:
+        FaceDiffError: if there is no such metric or option, or its files do not fit.
+    """
+    metrics: dict[str, RenderMetric] = {}
+    for text in texts:
+        try:
+            name, options = render_metric.read(text)
+        except UnknownComponentError as error:
+            raise FaceDiffError(str(error)) from error
+        metrics[text.partition(":")[0] if text.partition(":")[0] not in metrics else text] = render_metric.get(name)(
+            **options
+        )
+    return metrics
+
+
+def framing(metric: RenderMetric, template: Array, lips: Sequence[int]) -> Camera:
+    """The camera of a metric's pictures of a face (V, 3); the mouth is twice as wide as the lips, in the middle."""
+    whole = Camera.framing(template)
+    height, width = metric.size
+    if metric.part == "face":
+        return Camera.framing(template, aspect=width / height)
+    mouth = template[list(lips)]
+    middle, half = (mouth.max(0) + mouth.min(0)) / 2, np.ptp(mouth, axis=0)
+    half[1] = half[0] * height / width
+    camera = Camera.framing(np.stack([middle - half, middle + half]), aspect=width / height, margin=0.0)
+    # What is drawn lies within a radius, which is the head's and not the mouth's.
+    return replace(camera, radius=whole.radius)
+
+
+class RenderScorer:
+    """Renders clips and scores them.
+
+    Args:
+        metrics: by name.
+        faces: (F, 3) triangles.
+        lips: lip vertices.
+        frame_rate: frames a second.
+        speech: gives the samples of a clip by its name; empty where there is none.
+    """
+
+    def __init__(
+        self,
+        metrics: Mapping[str, RenderMetric],
+        *,
+        faces: npt.NDArray[np.integer],
+        lips: Sequence[int],
+        frame_rate: float,
+        speech: Callable[[str], Speech],
+    ) -> None:
+        self.metrics, self.faces, self.lips = metrics, faces, lips
+        self.frame_rate, self.speech = frame_rate, speech
+
+    def score(self, clip: str, vertices: Array, template: Array) -> dict[str, float]:
+        """All scores of a clip, ``<metric>/<score>``.
+
+        Args:
+            clip: the truth's name, by which its speech is found.
+            vertices: (T, V, 3) absolute.
+            template: (V, 3) the face at rest, which the camera is set up for.
+        """
+        scores: dict[str, float] = {}
+        drawn: dict[tuple[str, tuple[int, int]], Frames] = {}
+        for name, metric in self.metrics.items():
+            key = (metric.part, metric.size)
+            if key not in drawn:
+                camera = framing(metric, template, self.lips)
+                renderer = Renderer(self.faces, template=template, size=metric.size, camera=camera)
+                drawn[key] = np.stack([renderer.render(frame) for frame in vertices])
+            speech = self.speech(clip)
+            speech = speech[: int(len(vertices) / self.frame_rate * SAMPLE_RATE)]
+            try:
+                found = metric.score(drawn[key], speech, self.frame_rate)
+            except FaceDiffError as error:
+                raise FaceDiffError(f"--render {name}: {clip}: {error}") from error
+            scores |= {f"{name}/{score}": value for score, value in found.items()}
+        return scores
+
+
+def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of each score over clips."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
