@@ -18,6 +18,7 @@ Indices = npt.NDArray[np.int64]
 
 BLINKS = 0.5  # An animation whose lids leave more than this share of the opening does not blink
 LEFT_OPEN = 0.2  # Share of an eye's opening that may still be seen at a full blink, beyond what the animation leaves
+HOLE = 0.2  # Share of the opening's height that may show in one place between shut lids: torn ones meet elsewhere
 PASSED = 0.3  # Share of the opening by which the upper lid may pass the lower one
 INSIDE, DEEP = 0.15, 0.04  # Share of a lid's vertices that may lie this share of the eye's width inside the eyeball
 UNEVEN = 0.25  # How much more of one eye's opening than of the other's may be left
@@ -35,6 +36,8 @@ class EyeFigures:
 
     Attributes:
         lid_gap: share of the opening that is still seen, of the worse eye; 0 is best.
+        hole: tallest place where shut lids show what is behind them, as a share of the opening's height, of the worse
+            eye; where few triangles are large, a lid tears though most of it is shut.
         overshoot: how far the upper lid passes the lower one, as a share of the opening.
         inside: share of the lids' vertices that lie inside the eyeball.
         uneven: difference between both eyes of the share that is still seen.
@@ -43,6 +46,7 @@ class EyeFigures:
     """
 
     lid_gap: float | None
+    hole: float | None
     overshoot: float | None
     inside: float | None
     uneven: float | None
@@ -75,6 +79,7 @@ def check_eyes(
     posed = _laid(correspondence, carried.vertices[blink])
     new = [lid_edges(correspondence.laid.vertices, target, eye) for eye in (0, 1)]
     gaps: list[float] | None = None
+    holes: list[float] = []
     passed: list[float] | None = None
     inside: list[float] | None = None
     if left > BLINKS:
@@ -90,14 +95,22 @@ def check_eyes(
         original = np.asarray(animation.vertices[blink], np.float64)
         gaps, passed, inside, expected = [], [], [], []
         for eye in (0, 1):
-            gaps.append(_still_seen(whole, posed, target, eye))
-            expected.append(_still_seen(face, original, source, eye))
+            gap, hole = _still_seen(whole, posed, target, eye)
+            gaps.append(gap)
+            holes.append(hole)
+            expected.append(_still_seen(face, original, source, eye)[0])
             passed.append(_overshoot(new[eye], whole.vertices, posed))
             inside.append(_inside_ball(whole, posed, target, eye))
         worst = int(np.argmax(np.subtract(gaps, expected)))
         if gaps[worst] > expected[worst] + LEFT_OPEN:
             faults.append(
                 f"its {('right', 'left')[worst]} eye does not shut: {gaps[worst]:.0%} is left at a full blink"
+            )
+        elif max(holes) > HOLE:
+            torn = int(np.argmax(holes))
+            faults.append(
+                f"the lids of its {('right', 'left')[torn]} eye tear: a hole of {holes[torn]:.0%} of the opening's "
+                f"height is left between them at a full blink"
             )
         if max(passed) > PASSED:
             faults.append(f"its upper lids pass the lower ones by {max(passed):.0%} of the opening")
@@ -115,6 +128,7 @@ def check_eyes(
         faults.append(f"its forehead folds: {folded:.1%} of the moving triangles turn over")
     figures = EyeFigures(
         lid_gap=None if gaps is None else max(gaps),
+        hole=max(holes, default=None),
         overshoot=None if passed is None else max(passed),
         inside=None if inside is None else max(inside),
         uneven=None if gaps is None else abs(gaps[0] - gaps[1]),
@@ -155,8 +169,8 @@ def _laid(correspondence: Correspondence, vertices: npt.NDArray[np.floating]) ->
     return correspondence.similarity.inverse().apply(np.asarray(vertices, np.float64))
 
 
-def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> float:
-    """Share of an eye's opening, as seen from the front at rest, that shows no lid."""
+def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> tuple[float, float]:
+    """Share of an eye's opening, as seen from the front, that shows no lid; and of its height at the tallest hole."""
     opening = features.eyes[eye]
     assert opening is not None  # noqa: S101 - for type checkers
     ball = eyeball_triangles(rest, features, eye)
@@ -169,7 +183,7 @@ def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> fl
     margin = 0.2 * (top - bottom)
     inner = (y < top - margin) & (y > bottom + margin)
     if not inner.any():
-        return 0.0
+        return 0.0, 0.0
     shown = [Seen(points, rest.faces).raster(kept, low, step, PIXELS, PIXELS)[0] for points in (rest.vertices, posed)]
     inside = np.zeros(len(rest.faces) + 1, bool)
     inside[ball] = True
@@ -177,7 +191,12 @@ def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> fl
     inside[-1] = True
     # What faces away is the inside of a lid, or of the head, that is seen past a torn one.
     inside[:-1] |= _face_normals(posed, rest.faces)[:, 2] < 0
-    return float(inside[shown[1][inner]].mean())
+    share = float(inside[shown[1][inner]].mean())
+    opening_seen = (y < top) & (y > bottom)
+    columns = (inside[shown[1]] & opening_seen).sum(axis=0)
+    # A hole is three columns wide at least: corners and single pixels at the edges of triangles are none.
+    tallest = np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]).max()
+    return share, float(tallest / opening_seen.sum(axis=0).max())
 
 
 def _overshoot(edges: LidEdges | None, rest: Array, posed: Array) -> float:
