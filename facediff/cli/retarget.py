@@ -74,7 +74,7 @@ def retarget(
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
-    both_glb = output.suffix == ".glb" and target_mesh.suffix.lower() == ".glb" and output != target_mesh
+    both_glb = output.suffix in (".glb", ".fbx") and target_mesh.suffix.lower() == ".glb" and output != target_mesh
     for option, chosen in (("--add-to-mesh", add_to_mesh), ("--own-shapes", own_shapes)):
         if chosen and not both_glb:
             raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
@@ -103,7 +103,7 @@ def retarget(
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    dressed = add_to_mesh or (not bare_face and output.suffix == ".glb" and wears_more(target_mesh))
+    dressed = add_to_mesh or (not bare_face and output.suffix in (".glb", ".fbx") and wears_more(target_mesh))
     if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
     driven = own_shapes_of(target_mesh).summary if own_shapes else ""
@@ -138,7 +138,7 @@ def retarget(
     elif dressed and not add_to_mesh:
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
     textured = has_uvs(target_mesh)
-    if textured and "surface" in FORMATS[output.suffix].uses:
+    if textured and (output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses):
         notes += read_surface(target_mesh, len(made.triangles)).lost
     elif textured:
         notes.append(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from facediff import registry
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
+from facediff.export.fbx import refuse_without_blender, write_fbx
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
 from facediff.mesh.obj_surface import PICTURE_SUFFIXES, has_uvs
@@ -73,6 +75,14 @@ def write_animations(
     """
     options = options or ExportOptions()
     check_export(path, options, len(animations), weights=have_weights(animations))
+    if path.suffix.lower() == ".fbx":
+        names = [path] if len(animations) == 1 else _targets(path, FORMATS[".glb"], len(animations))
+        written = []
+        for name, animation in zip(names, animations, strict=True):
+            glb = partial(write_animations, animations=[animation], options=options, into=into, own_shapes=own_shapes)
+            sound = _speech_file(name, FORMATS[".glb"], animation, options)
+            written += write_fbx(name, animation, sound, glb)
+        return written
     form = FORMATS[path.suffix]
     if into is not None and into.suffix.lower() == ".obj":
         if "surface" in form.uses and options.surface is None and has_uvs(into):
@@ -137,10 +147,9 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
     if not suffix:
         raise FaceDiffError(f"{path}: has no suffix, which chooses the format; add one, such as {path.name}.glb")
     if suffix.lower() == ".fbx":
-        raise FaceDiffError(
-            f"{path}: Blender writes .fbx; write {path.stem}.glb, then `blender --background --python glb_to_fbx.py -- "
-            f"{path.stem}.glb {path.name}` with the script docs/tools/glb_to_fbx.py of facediff's source"
-        )
+        refuse_without_blender(path)
+        check_writable(path)
+        path, suffix = path.with_suffix(".glb"), ".glb"
     if suffix not in FORMATS:
         raise FaceDiffError(f'{path}: there is no format "{suffix}": {choices(suffix.lower(), FORMATS)}')
     if n_animations < 1:

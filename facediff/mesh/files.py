@@ -50,6 +50,13 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         [[0, 1, 2], [0, 2, 3]]
     """
     suffix = path.suffix.lower()
+    if suffix == ".fbx":
+        export = f"bpy.ops.export_scene.gltf(filepath='{path.stem}.glb')"
+        raise FaceDiffError(
+            f'{path}: .fbx is read by Blender; convert it with `blender --background --python-expr "import bpy; '
+            f"bpy.ops.wm.read_factory_settings(use_empty=True); bpy.ops.import_scene.fbx(filepath='{path.name}'); "
+            f'{export}"` and give {path.stem}.glb'
+        )
     if suffix not in SUFFIXES:
         raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}")
     try:

@@ -263,7 +263,7 @@ class AnimationPipeline(ABC):
 
         into, target = None, Path(self.options.target_mesh or "")
         # What a surface alone lacks would be lost: textures, skins and targets of a .glb, coordinates of an .obj.
-        is_dressed = output.suffix == ".glb" and export.output_unit is None and wears_more(target)
+        is_dressed = output.suffix in (".glb", ".fbx") and export.output_unit is None and wears_more(target)
         if is_dressed or has_uvs(target):
             into = target
         own_shapes = self.options.own_shapes

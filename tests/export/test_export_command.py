@@ -56,7 +56,7 @@ def test_animations_of_one_recording_are_named_after_their_files(animation: Anim
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["a.npz", "-o", "a.fbx"], "docs/tools/glb_to_fbx.py"),
+        (["a.npz", "-o", "a.fbx"], "glb_to_fbx.py"),
         (["a.npz", "-o", "a.abc"], 'there is no format ".abc"'),
         (["a.npz", "-o", "a.csv"], "give --shapes"),
         (["a.npz", "-o", "a.usdc", "--shapes", "."], "--shapes: has no effect on .usdc"),

@@ -3,13 +3,19 @@
     blender --background --python glb_to_fbx.py -- hello.glb hello.fbx
     python glb_to_fbx.py hello.glb hello.fbx            # where bpy is installed with pip
 
+`facediff export hello.npz -o hello.fbx` runs it where there is one of them.
+
 ``--key-tolerance 0.01`` leaves out the keys of each curve that a straight line replaces to within so much of a weight.
+The sound next to the .glb is a strip of the scene, which ``--blend hello.blend`` keeps; .fbx has no place for it.
 """
+
+from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 
-import bpy
+import bpy  # type: ignore[import-not-found]  # Blender runs this file
 
 
 def thin(curve: bpy.types.FCurve, tolerance: float) -> None:
@@ -42,14 +48,26 @@ def curves_of(action: bpy.types.Action) -> list[bpy.types.FCurve]:
     return [curve for bag in bags for curve in bag.fcurves]
 
 
-def convert(glb: str, fbx: str, tolerance: float) -> None:
-    """Import the .glb into an empty scene and write its mesh, shapes and curves."""
+def facts_of(glb: str) -> tuple[float, int]:
+    """Frame rate and number of frames, as a .glb of facediff has them; avatars do not."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    # Blender keeps its own frame rate on import, and would put the keys between whole frames: ask the file first.
     bpy.ops.import_scene.gltf(filepath=glb)
-    facts = next(dict(made.items()) for made in scene.objects if "frame_rate" in made)
-    rate, frames = float(facts["frame_rate"]), int(facts["frames"])
+    facts = next((dict(made.items()) for made in bpy.context.scene.objects if "frame_rate" in made), None)
+    if facts is None:
+        sys.exit(f"{glb}: does not say its frame rate; give --frame-rate and --frames")
+    return float(facts["frame_rate"]), int(facts["frames"])
+
+
+def add_sound(scene: bpy.types.Scene, wav: Path) -> None:
+    """Let a scene play a sound from its first frame on."""
+    editor = scene.sequence_editor_create()
+    strips = editor.strips if hasattr(editor, "strips") else editor.sequences  # renamed in Blender 4.4
+    strips.new_sound("speech", str(wav), 1, 0)
+
+
+def convert(glb: str, fbx: str, tolerance: float, rate: float, frames: int, blend: str | None) -> None:
+    """Import the .glb into an empty scene and write its mesh, shapes and curves."""
+    # Blender keeps its own frame rate on import, and would put the keys between whole frames.
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.fps = max(1, round(rate))
@@ -60,6 +78,11 @@ def convert(glb: str, fbx: str, tolerance: float) -> None:
         for action in bpy.data.actions:
             for curve in curves_of(action):
                 thin(curve, tolerance)
+    wav = Path(glb).resolve().with_suffix(".wav")
+    if wav.is_file():
+        add_sound(scene, wav)
+    if blend is not None:
+        bpy.ops.wm.save_as_mainfile(filepath=str(Path(blend).resolve()))
     bpy.ops.export_scene.fbx(
         filepath=fbx,
         bake_anim_use_nla_strips=False,
@@ -75,5 +98,10 @@ if __name__ == "__main__":
     parser.add_argument("glb")
     parser.add_argument("fbx")
     parser.add_argument("--key-tolerance", type=float, default=0.0)
+    parser.add_argument("--frame-rate", type=float)
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--blend")
     options = parser.parse_args(own)
-    convert(options.glb, options.fbx, options.key_tolerance)
+    given = options.frame_rate, options.frames
+    rate, frames = facts_of(options.glb) if None in given else given
+    convert(options.glb, options.fbx, options.key_tolerance, rate, frames, options.blend)

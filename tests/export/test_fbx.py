@@ -1,0 +1,92 @@
+"""FBX through a program called blender, which here is a script that writes down how it was called."""
+
+from __future__ import annotations
+
+import ast
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from facediff.animation import write_archive
+from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.export import fbx, write_animations
+from facediff.mesh import read_mesh
+from tests.fakes.clicks import clicks
+from tests.fakes.glb_reader import Reader
+
+
+@pytest.fixture
+def blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program on PATH, which keeps its words and the .glb, and writes the .fbx unless that is called fails.fbx."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    program = folder / "blender"
+    program.write_text(
+        f"#!{sys.executable}\n"
+        "import json, pathlib, shutil, sys\n"
+        f"kept = pathlib.Path({str(folder)!r})\n"
+        "(kept / 'words.json').write_text(json.dumps(sys.argv[1:]))\n"
+        "glb, made = sys.argv[sys.argv.index('--') + 1:][:2]\n"
+        "shutil.copy(glb, kept / 'seen.glb')\n"
+        "if made.endswith('fails.fbx'):\n    sys.exit('cannot import')\n"
+        "pathlib.Path(made).write_bytes(b'Kaydara FBX Binary')\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    return folder
+
+
+def test_blender_is_called_with_the_script_and_the_animations_rate(tmp_path: Path, blender: Path) -> None:
+    own = tmp_path / "hello.wav"
+    own.write_bytes(b"a recording of the user's")
+    animation = clicks()
+    written = write_animations(tmp_path / "hello.fbx", [animation])
+    assert [path.name for path in written] == ["hello.fbx", "hello_speech.wav"]
+    assert own.read_bytes() == b"a recording of the user's"
+    assert written[0].read_bytes().startswith(b"Kaydara")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bin", "hello.fbx", "hello.wav", "hello_speech.wav"]
+    words = json.loads((blender / "words.json").read_text())
+    script = Path(words[words.index("--python") + 1])
+    assert script == fbx.SCRIPT
+    assert script.is_file()
+    assert "--background" in words
+    assert words[-4:] == ["--frame-rate", "25", "--frames", str(len(animation.vertices))]
+    assert words[words.index("--") + 1].endswith("hello.glb")
+    assert len(Reader(blender / "seen.glb").times) == len(animation.vertices)
+    # The script takes what it is called with.
+    options = {
+        node.args[0].value
+        for node in ast.walk(ast.parse(script.read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument"
+        if isinstance(node.args[0], ast.Constant)
+    }
+    assert {"glb", "fbx", "--frame-rate", "--frames"} <= options
+
+
+@pytest.mark.usefixtures("blender")
+def test_several_samples_and_a_failure(tmp_path: Path) -> None:
+    written = write_animations(tmp_path / "x.fbx", [clicks(), clicks()])
+    assert [path.name for path in written if path.suffix == ".fbx"] == ["x_sample1.fbx", "x_sample2.fbx"]
+    with pytest.raises(FaceDiffError, match="cannot import"):
+        write_animations(tmp_path / "fails.fbx", [clicks()])
+    assert not (tmp_path / "fails.fbx").exists()
+
+
+def test_without_blender_the_script_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(fbx, "MODULE", "no_such_module")
+    write_archive(tmp_path / "a.npz", clicks())
+    assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "a.fbx")]) == 2
+    assert str(fbx.SCRIPT) in capsys.readouterr().err
+    monkeypatch.setattr(fbx, "MODULE", "json")
+    assert fbx.command() == [sys.executable, str(fbx.SCRIPT)]
+
+
+def test_a_target_in_fbx_is_refused_with_the_conversion(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match=r"import_scene\.fbx\(filepath='me\.fbx'\).*me\.glb"):
+        read_mesh(tmp_path / "me.fbx")
