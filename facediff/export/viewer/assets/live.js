@@ -5,9 +5,9 @@ const HEADER = 24, MESH = 0, FRAME = 1, SPEECH = 2; // as the receiver's descrip
 const RETRIES = [250, 500, 1000, 2000, 4000];
 const SILENCE_MS = 1500; // without a frame: nobody performs
 const LATE_S = 0.5; // a lag that anybody notices
-/** Seconds: that the sound is planned after the picture, which is drawn later than it comes; that both may be apart; of
- * speech that waits for its frames. */
-const CUSHION = 0.03, APART = 0.04, KEPT = 60;
+/** Seconds: that a picture takes to the screen, until it is measured; that both may be apart; of speech that waits for its
+ * frames; by which the face is held at most for a loudspeaker that is slower, as wireless ones are. */
+const DRAWN = 0.03, APART = 0.04, KEPT = 60, LONGEST_HOLD = 0.5;
 
 /** Plays speech with the frames of the same time, however much later than the speech they come. */
 class DelayedSpeech {
@@ -19,7 +19,35 @@ class DelayedSpeech {
     this.pieces = []; // speech whose frames are still to come, in its order
     this.planned = null; // times of speech and of the sound device at which what is planned ends
     this.played = 0;
+    this.drawn = DRAWN; // seconds from a frame's arrival until it is on the screen
+    this.hold = 0; // seconds by which frames wait for the sound
     this.anchors = 0; // times that the sound had to be moved to the picture
+  }
+
+  /**
+   * The time of the sound device that leaves the loudspeaker at a time by the page's clock: what is being computed is heard
+   * later by what the browser buffers and the device takes.
+   */
+  heard(now) {
+    const { context } = this, stamp = context.getOutputTimestamp?.();
+    if (stamp?.performanceTime > 0) return stamp.contextTime + now - stamp.performanceTime / 1000;
+    return context.currentTime - (context.outputLatency || context.baseLatency || 0);
+  }
+
+  /** Seconds that sound takes from being computed to the loudspeaker, as the browser says. */
+  latency(now) {
+    return Math.max(0, this.context.currentTime - this.heard(now));
+  }
+
+  /** Seconds by which the speech that is heard is ahead of the face that is seen (behind it if negative), or null. */
+  ahead(now) {
+    if (!this.context || !this.planned || this.delay === null || this.planned.at < this.heard(now)) return null;
+    return this.planned.time - (this.planned.at - this.heard(now)) - (now - this.delay - this.drawn);
+  }
+
+  /** A frame that came at a time began to be drawn at another one, with so many seconds between pictures. */
+  drew(came, began, interval) {
+    this.drawn += (Math.min(0.1, began + interval - came) - this.drawn) / 50;
   }
 
   /** Another performance, whose times begin again. */
@@ -32,6 +60,7 @@ class DelayedSpeech {
   async toggle() {
     this.on = !this.on;
     this.planned = null;
+    this.hold = 0;
     for (const piece of this.pieces) piece.planned = false;
     await this.context?.close(); // what is planned is not heard any more
     this.context = this.on ? new AudioContext() : null;
@@ -61,10 +90,15 @@ class DelayedSpeech {
       if (piece.planned) continue;
       piece.planned = true;
       const { time, samples, end } = piece;
-      const wanted = this.context.currentTime + (time + this.delay - now) + CUSHION;
+      const wanted = this.heard(now) + (time + this.delay + this.drawn - now);
       const follows = this.planned && Math.abs(this.planned.time - time) < 1e-3 && Math.abs(this.planned.at - wanted) < APART;
       const at = follows ? this.planned.at : wanted;
-      if (at < this.context.currentTime) continue; // too late to be heard with its face
+      const late = this.context.currentTime - at;
+      if (late > 0) { // too late to be heard with its face, which waits from now on
+        this.hold = Math.min(LONGEST_HOLD, this.hold + Math.min(late, 0.05));
+        continue;
+      }
+      if (late < -0.1) this.hold = Math.max(0, this.hold - 0.001); // there is time to spare again
       if (!follows) this.anchors += 1;
       const buffer = this.context.createBuffer(1, samples.length, this.rate);
       buffer.copyToChannel(Float32Array.from(samples, (each) => each / 32767), 0);
@@ -171,15 +205,25 @@ class LivePage {
     const steps = new Int16Array(data, HEADER);
     if (steps.length !== offsets.length) throw new Error("a frame has another number of vertices than the face");
     for (let i = 0; i < offsets.length; i++) offsets[i] = this.about.step * steps[i];
-    this.stage.push(offsets);
+    const hold = this.speech?.context ? this.speech.hold : 0;
+    if (hold) {
+      const kept = offsets.slice();
+      setTimeout(() => this.stage.push(kept), 1000 * hold);
+    } else this.stage.push(offsets);
+    if (this.speech) this.watchPicture(now);
     if (!this.stage.performing) this.stage.perform(true);
     if (stats.index >= 0) stats.missed += Math.max(0, index - stats.index - 1);
     Object.assign(stats, { index, time, dropped: view.getUint32(8, true), lag: view.getFloat32(12, true) });
     stats.received += 1;
     this.last = now;
     this.arrivals.push(now);
-    this.speech?.frame(time, now / 1000);
+    this.speech?.frame(time, now / 1000 + hold);
     this.say("Live");
+  }
+
+  /** Measure how long a frame that came now takes to the screen: until a picture begins, and one more. */
+  watchPicture(came) {
+    requestAnimationFrame((began) => requestAnimationFrame((next) => this.speech.drew(came / 1000, began / 1000, Math.min(0.05, (next - began) / 1000))));
   }
 
   showNumbers() {
@@ -194,6 +238,12 @@ class LivePage {
     find("lag").textContent = performing ? `${Math.round(1000 * stats.lag)} ms` : "–";
     find("rate").textContent = performing ? `${this.arrivals.length} frames/s` : "–";
     find("dropped").textContent = stats.received ? String(stats.missed) : "–";
+    const { speech } = this, ahead = speech?.ahead(now / 1000) ?? null;
+    find("apart").parentElement.hidden = !speech?.on;
+    if (speech?.on) {
+      const words = ahead === null ? "–" : `${Math.abs(Math.round(1000 * ahead))} ms ${ahead > 0 ? "before" : "after"} the face`;
+      find("apart").textContent = `${words}; output ${Math.round(1000 * speech.latency(now / 1000))} ms`;
+    }
     find("time").textContent = stats.received ? `${stats.time.toFixed(1)} s` : "–";
   }
 
@@ -248,8 +298,9 @@ window.facediff = {
   get speech() {
     const { speech } = livePage;
     if (!speech) return null;
-    const { on, played, anchors, delay, planned, context } = speech;
-    return { on, played, anchors, delay, planned, now: performance.now() / 1000, sounding: context?.currentTime ?? null };
+    const { on, played, anchors, delay, planned, context, drawn, hold } = speech, now = performance.now() / 1000;
+    const heard = context ? speech.heard(now) : null, ahead = speech.ahead(now);
+    return { on, played, anchors, delay, planned, drawn, hold, now, heard, ahead, sounding: context?.currentTime ?? null };
   },
   get positions() { return livePage.stage?.face.positions; },
   get state() { return find("state").textContent; },
