@@ -41,8 +41,8 @@ def referee(
     """Compare models on one face and the same speech, whose phonemes are known.
 
     MODEL is NAME=PATH or PATH of a checkpoint, a model folder, an exported folder or a folder of Audio2Face-3D, or a
-    plan (.yaml) of them; without any, the model that comes with facediff. Closures, timing, jitter, blinks, head,
-    languages, cost and licence are reported, and four faults that are planted in every model must be seen.
+    plan (.yaml) of them; puppet, or none, is the model that comes with facediff. Closures, timing, jitter, blinks,
+    head, languages, cost and licence are reported, and four faults that are planted in every model must be seen.
     Exit status: 0 all scored, 1 some models could not be scored, 2 something to put right.
 
     For example:
@@ -130,6 +130,8 @@ def candidates_of(
         name, equals, path = word.partition("=")
         if not equals or Path(word).exists():
             name, path = Path(word).stem if Path(word).suffix == ".ckpt" else Path(word).name, word
+        if path == BUNDLED.name and not Path(path).exists():
+            path = str(BUNDLED)
         if Path(path).suffix in PLANS:
             candidates += read_models(Path(path))
             continue

@@ -60,6 +60,7 @@ def fit(
     every_n_steps: int = 1,
     model_options: dict[str, object] | None = None,
     data_options: dict[str, object] | None = None,
+    data_class: type[Tiny] = Tiny,
     **trainer_options: object,
 ) -> tuple[DualPathDiffusion, list[dict[str, str]]]:
     pl.seed_everything(7)
@@ -82,7 +83,7 @@ def fit(
         **{**TRAINER, **trainer_options},  # type: ignore[arg-type]
     )
     trainer.strategy.checkpoint_io = AtomicCheckpointIO()
-    data = Tiny(root=str(tiny_root), **{"batch_size": 3, **(data_options or {})})  # type: ignore[arg-type]
+    data = data_class(root=str(tiny_root), **{"batch_size": 3, **(data_options or {})})  # type: ignore[arg-type]
     trainer.fit(model, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
     return model, rows(folder)
 

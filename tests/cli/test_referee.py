@@ -52,6 +52,7 @@ def test_a_plan_names_models_and_motion(tmp_path: Path) -> None:
     assert second.commercial_use == "forbidden"
     assert second.motion == tmp_path / "motion"
     assert [candidate.name for candidate in candidates_of([str(plan)], [], None, None)] == ["first", "second"]
+    assert candidates_of(["puppet"], [], None, None) == candidates_of([], [], None, None)
     with pytest.raises(FaceDiffError, match="first"):
         candidates_of([str(plan), f"first={tmp_path / 'a.ckpt'}"], [], None, None)
     plan.write_text("models: {one: {layout: arkit}}\n")

@@ -1,6 +1,7 @@
 """One of two processes that train a tiny model of each published method together, over gloo.
 
-Called with: rank, a free port, the corpus's folder, CodeTalker's prior, the output file, and the methods.
+Called with: rank, a free port, the corpus's folder, CodeTalker's prior, the output file, and the methods. A corpus that
+has channels is trained on in channels and 16 bits.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from lightning.pytorch import Trainer
 
 from facediff import registry
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from tests.fakes.channels import TinyChannels
 from tests.fakes.tiny import Tiny
 from tests.models.published.conftest import METHODS, SIZES, TEXT
 
@@ -43,6 +45,10 @@ def main() -> None:
     for method in methods:
         torch.manual_seed(0)
         options = {**SIZES, **METHODS[method], "audio_encoder": SPEECH, "audio_dim": None}
+        channels = (Path(root) / "values_npy").is_dir()
+        data = (TinyChannels if channels else Tiny)(root=root, batch_size=2)
+        if channels:
+            options |= {"n_vertices": data.n_vertices, "space": data.space}
         if method == "CodeTalker":
             options["prior"] = prior
         model = registry.model.get(method)(**options)
@@ -51,6 +57,7 @@ def main() -> None:
             accelerator="cpu",
             devices=2,
             strategy="ddp",
+            precision="bf16-mixed" if channels else "32-true",
             max_epochs=1,
             limit_train_batches=2,
             limit_val_batches=1,
@@ -61,7 +68,7 @@ def main() -> None:
             enable_checkpointing=False,
         )
         before = digest(model)
-        trainer.fit(model, datamodule=Tiny(root=root, batch_size=2))
+        trainer.fit(model, datamodule=data)
         finite = all(bool(value.isfinite().all()) for value in model.parameters())
         found[method] = {"before": before, "after": digest(model), "steps": trainer.global_step, "finite": finite}
     Path(out).write_text(json.dumps(found), encoding="utf-8")
