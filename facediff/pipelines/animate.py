@@ -12,6 +12,7 @@ import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -258,19 +259,25 @@ class AnimationPipeline(ABC):
             the files, and the first animation.
         """
         from facediff.export import write_animations
-        from facediff.mesh.glb import wears_more
-        from facediff.mesh.obj_surface import has_uvs
 
-        into, target = None, Path(self.options.target_mesh or "")
         # What a surface alone lacks would be lost: textures, skins and targets of a .glb, coordinates of an .obj.
-        is_dressed = output.suffix in (".glb", ".fbx") and export.output_unit is None and wears_more(target)
-        if is_dressed or has_uvs(target):
-            into = target
+        wears_more, has_uvs = self._target_beyond_surface
+        is_dressed = output.suffix in (".glb", ".fbx") and export.output_unit is None and wears_more
+        into = Path(self.options.target_mesh or "") if is_dressed or has_uvs else None
         own_shapes = self.options.own_shapes
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
         with self.animations(speech, name, output, seed=seed) as animations:
             return write_animations(output, animations, export, into=into, own_shapes=own_shapes), animations[0]
+
+    @cached_property
+    def _target_beyond_surface(self) -> tuple[bool, bool]:
+        """Whether the target mesh is a .glb that wears more than its surface, or an .obj with texture coordinates."""
+        from facediff.mesh.glb import wears_more
+        from facediff.mesh.obj_surface import has_uvs
+
+        target = Path(self.options.target_mesh or "")
+        return wears_more(target), has_uvs(target)
 
     @contextmanager
     def animations(

@@ -28,7 +28,7 @@ from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGa
 from facediff.speech.windows import LOW_LATENCY
 from facediff.utils.files import atomic_folder
 from facediff.utils.server import HEADERS as SERVED
-from facediff.utils.server import OwnPagesOnly, WithHeaders, names_of, require_server, run_server
+from facediff.utils.server import names_of, own_page_only, require_server, run_server
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -183,7 +183,6 @@ def make_app(site: Site, hosts: tuple[str, ...] | None) -> Starlette:
         hosts: names under which it is served; None for any.
     """
     from starlette.applications import Starlette
-    from starlette.middleware import Middleware
     from starlette.responses import FileResponse, PlainTextResponse, Response
     from starlette.routing import Route
 
@@ -201,7 +200,7 @@ def make_app(site: Site, hosts: tuple[str, ...] | None) -> Starlette:
 
     return Starlette(
         routes=[Route("/{name:path}", show)],
-        middleware=[Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts)],
+        middleware=own_page_only(hosts),
     )
 
 

@@ -28,10 +28,9 @@ from facediff.study.page import PAGE
 from facediff.study.store import AnswerStore, FullError
 from facediff.utils.server import (
     LOOPBACK,
-    OwnPagesOnly,
     RefusedError,
-    WithHeaders,
     names_of,
+    own_page_only,
     read_body,
     require_server,
     run_server,
@@ -65,7 +64,6 @@ def make_app(
     """
     from starlette.applications import Starlette
     from starlette.concurrency import run_in_threadpool
-    from starlette.middleware import Middleware
     from starlette.responses import FileResponse, JSONResponse
     from starlette.routing import Route
 
@@ -134,7 +132,7 @@ def make_app(
             Route("/api/answers", taking(answer), methods=["POST"]),
             Route("/api/finish", taking(finish), methods=["POST"]),
         ],
-        middleware=[Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts, public_name=public_name)],
+        middleware=own_page_only(hosts, public_name),
     )
 
 

@@ -17,6 +17,7 @@ from facediff.utils.plain_files import parse_json
 
 if TYPE_CHECKING:
     import uvicorn
+    from starlette.middleware import Middleware
     from starlette.requests import Request
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -144,6 +145,13 @@ async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise FaceDiffError("request: holds no object; expected one")
     return content
+
+
+def own_page_only(hosts: Collection[str] | None, public_name: str | None = None) -> list[Middleware]:
+    """Middleware of an application: strict headers, and :class:`OwnPagesOnly`, whose arguments these are."""
+    from starlette.middleware import Middleware
+
+    return [Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts, public_name=public_name)]
 
 
 def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn"), extra: str = "study") -> None:

@@ -15,11 +15,10 @@ import lightning.pytorch as pl
 import pytest
 import torch
 
-from facediff import registry
 from facediff.models import DualPathDiffusion
 from facediff.runtime.onnxruntime_web import VERSION
 from tests.fakes.parsing import parse_imports_once
-from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
+from tests.fakes.tiny import Tiny, tiny_model_options, write_tiny
 from tools.browser.chromium import Chromium, find_chromium
 
 # Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
@@ -56,21 +55,8 @@ def make_model() -> Callable[..., DualPathDiffusion]:
     """A model small enough to train in a test; keyword arguments override."""
 
     def make(**options: object) -> DualPathDiffusion:
-        from functools import partial
-
         torch.manual_seed(0)
-        defaults: dict[str, object] = {
-            "n_vertices": VERTICES,
-            "identities": SEEN,
-            "frame_rate": 25.0,
-            "dim": 16,
-            "diffusion_steps": 40,
-            "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
-            "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
-            "decoder": partial(registry.decoder.style_transformer, num_layers=1),
-            "sampler": partial(registry.sampler.ddim, steps=3),
-        }
-        return DualPathDiffusion(**{**defaults, **options})
+        return DualPathDiffusion(**{**tiny_model_options(), **options})
 
     return make
 

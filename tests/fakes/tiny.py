@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import soundfile
@@ -17,6 +17,25 @@ SEEN = ["A", "B"]
 UNSEEN = "C"
 VERTICES = 24
 RATE = 25
+
+
+def tiny_model_options() -> dict[str, Any]:
+    """Options of a DualPathDiffusion for this corpus that is small enough to train in a test."""
+    from functools import partial
+
+    from facediff import registry
+
+    return {
+        "n_vertices": VERTICES,
+        "identities": SEEN,
+        "frame_rate": 25.0,
+        "dim": 16,
+        "diffusion_steps": 40,
+        "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
+        "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
+        "decoder": partial(registry.decoder.style_transformer, num_layers=1),
+        "sampler": partial(registry.sampler.ddim, steps=3),
+    }
 
 
 def write_tiny(root: Path, *, sentences: int = 7, seed: int = 0) -> Path:

@@ -36,7 +36,7 @@ from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNois
 from facediff.runtime.styles import read_style
 from facediff.speech.voice_activity import QUICK_GATE
 from facediff.speech.windows import MotionWindow, WindowPlan
-from tests.fakes.tiny import Tiny
+from tests.fakes.tiny import Tiny, tiny_model_options
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
 CPU = torch.device("cpu")
@@ -94,24 +94,10 @@ def model(tiny_root: Path) -> AnimationModel:
 
 
 def ready(root: Path, **options: object) -> AnimationModel:
-    from tests.fakes.tiny import SEEN, VERTICES
-
     torch.manual_seed(0)
     data = Tiny(root=str(root))
-    made = DualPathDiffusion(
-        **{
-            "n_vertices": VERTICES,
-            "identities": SEEN,
-            "frame_rate": 25.0,
-            "dim": 16,
-            "diffusion_steps": 40,
-            "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1),
-            "style_encoder": partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
-            "decoder": partial(registry.decoder.style_transformer, num_layers=1),
-            "sampler": partial(registry.sampler.dpm_solver, steps=3),
-            **options,
-        }
-    )
+    sampler = partial(registry.sampler.dpm_solver, steps=3)
+    made = DualPathDiffusion(**{**tiny_model_options(), "sampler": sampler, **options})
     torch.nn.init.normal_(made.network.embed.bias)
     made.adopt(data.assets().with_motion_scale(data.motion_scale()))
     made.windows = PLAN

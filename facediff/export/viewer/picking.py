@@ -39,10 +39,9 @@ from facediff.export.viewer.page import assemble
 from facediff.mesh import Mesh, Similarity
 from facediff.mesh.parts import MeshPart
 from facediff.utils.server import (
-    OwnPagesOnly,
     RefusedError,
-    WithHeaders,
     names_of,
+    own_page_only,
     read_body,
     require_server,
     run_server,
@@ -223,7 +222,6 @@ def make_app(picking: Picking, page: str, hosts: tuple[str, ...] | None, stop: C
     from starlette.applications import Starlette
     from starlette.background import BackgroundTask
     from starlette.concurrency import run_in_threadpool
-    from starlette.middleware import Middleware
     from starlette.responses import HTMLResponse, JSONResponse
     from starlette.routing import Route
 
@@ -242,7 +240,7 @@ def make_app(picking: Picking, page: str, hosts: tuple[str, ...] | None, stop: C
 
     return Starlette(
         routes=[Route("/", show), Route("/api/landmarks", save, methods=["POST"])],
-        middleware=[Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts)],
+        middleware=own_page_only(hosts),
     )
 
 

@@ -27,7 +27,7 @@ from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
-from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions, convert_style
+from facediff.models.published.clip_style import convert_style
 from facediff.models.published.diffposetalk_checkpoints import count_layers
 from facediff.models.published.parametric import ParametricModel, window_at
 from facediff.models.published.recognition import (
@@ -77,12 +77,6 @@ class ARTalk(ParametricModel):
         codec_dim: channels of the codec.
         codec_layers: layers of its encoder, and of its decoder.
         codec_heads: their attention heads.
-        style_dim: channels of the style.
-        style_layers: layers of the style encoder.
-        style_heads: its attention heads.
-        style_rows: rows of its table of positions.
-        style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
-            influence; ``frames`` gives each its own, as was meant.
         style_scale: how far the style goes from no style; 1 takes it as it is.
         memory_chunks: chunks that the generator attends to.
         smooth: filter the result (Savitzky–Golay), as the authors' programs do.
@@ -117,11 +111,6 @@ class ARTalk(ParametricModel):
         codec_dim: Width = 512,
         codec_layers: Layers = 8,
         codec_heads: Heads = 8,
-        style_dim: Width = 128,
-        style_layers: Layers = 4,
-        style_heads: Heads = 4,
-        style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
-        style_positions: StylePositions = "published",
         style_scale: Annotated[float, Range(0, 100)] = 1.1,
         memory_chunks: Annotated[int, Range(1, 100)] = 1,
         smooth: bool = True,
@@ -147,20 +136,12 @@ class ARTalk(ParametricModel):
         self.weights = {"velocity": velocity_weight, "head": head_weight, "commitment": commitment_weight}
         channels = len(self.modelled)
         self.codec = BitCodec(channels, scales, code_dim, codec_dim, codec_layers, codec_heads)
-        self.style_encoder = ClipStyleEncoder(
-            channels,
-            style_dim,
-            num_layers=style_layers,
-            num_heads=style_heads,
-            feed_forward_dim=4 * style_dim,
-            rows=style_rows,
-            positions=style_positions,
-        )
+        self.style_encoder = self.make_style_encoder()
         self.register_buffer("style_mean", torch.zeros(channels))
         self.register_buffer("style_std", torch.ones(channels))
         self.generator = BitGenerator(
             code_dim=code_dim,
-            style_dim=style_dim,
+            style_dim=self.style_dim,
             audio_width=self.audio_width,
             dim=dim,
             num_layers=num_layers,
@@ -173,10 +154,6 @@ class ARTalk(ParametricModel):
         if stage == "codec":
             for module in (self.generator, self.style_encoder, self.audio_encoder):
                 module.requires_grad_(False)
-
-    def personal_modules(self) -> list[nn.Module]:
-        """The style encoder."""
-        return [self.style_encoder]
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Take the mean and the deviation of every channel, which codec and style encoder have as well."""

@@ -37,7 +37,7 @@ from facediff.models.graphs import (
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.registry import component_class
-from facediff.speech.frame_clock import FrameClock
+from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.utils.plain_options import fits, parameters
 
 Alignment = Literal["auto", "pairs", "interpolated"]
@@ -60,6 +60,8 @@ class PublishedModel(AnimationModel):
     Class attributes:
         published_encoder: the audio encoder as the method's authors use it.
         table_frames: frames for which the published tables of attention have rows; None where there are none.
+        clock_rule: how frames are counted where speech is resampled to them, whatever the alignment: of the motion
+            nothing is cut then; None to count by the steps of the speech network.
 
     Args:
         audio_encoder: speech to features; the method's own pretrained network with its settings if None.
@@ -76,6 +78,7 @@ class PublishedModel(AnimationModel):
     hears_all: ClassVar[bool] = True
     published_encoder: ClassVar[AudioEncoderFactory]
     table_frames: ClassVar[int | None] = None
+    clock_rule: ClassVar[Rule | None] = None
     long_speech: LongSpeech = "extend"
 
     def __init__(
@@ -132,7 +135,9 @@ class PublishedModel(AnimationModel):
 
     @property
     def clock(self) -> FrameClock:
-        """By the steps of the speech network."""
+        """By the steps of the speech network, or the method's own rule."""
+        if self.clock_rule is not None:
+            return FrameClock(self.frame_rate, self.clock_rule)
         return FrameClock(self.frame_rate, "pairs" if self.pairs else "steps", self.audio_encoder.convolutions())
 
     def plan_long_speech(self, long_speech: LongSpeech) -> None:
@@ -163,12 +168,16 @@ class PublishedModel(AnimationModel):
     def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
         """Frames of each clip that training compares: motion that lasts longer than pairs of steps is cut."""
         lengths = batch.frame_lengths
-        if not self.pairs:
+        if not self.pairs or self.clock_rule is not None:
             return lengths
         steps = torch.tensor([self.steps_of(int(n)) // 2 for n in batch.audio_lengths], device=lengths.device)
         return torch.minimum(lengths, steps.clamp_min(1))
 
     # The speaker.
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The network's table of speakers, where it has one."""
+        return [module for name, module in self.named_modules() if name == "network.style"]
 
     def identity_weights(self, batch: Batch) -> Float[Tensor, "batch identities"]:
         """One-hot rows of the clips' identities; of an unknown speaker :meth:`unknown_weights`.

@@ -30,9 +30,6 @@ from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.clip_style import (
-    TABLE_ROWS,
-    ClipStyleEncoder,
-    StylePositions,
     style_contrast,
 )
 from facediff.models.published.diffposetalk_network import (
@@ -68,12 +65,6 @@ class DiffPoseTalk(ParametricModel):
         num_heads: its attention heads.
         feed_forward_dim: channels between the two maps of its feed-forward layers; four times ``dim`` if None.
         dropout: in both Transformers, in training.
-        style_dim: channels of the style.
-        style_layers: layers of the style encoder.
-        style_heads: its attention heads.
-        style_rows: rows of its table of positions.
-        style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
-            influence; ``frames`` gives each its own, as was meant.
         window_frames: frames that are generated in one pass.
         context: frames before it that the network sees.
         diffusion_steps: noising steps, all of which sampling takes.
@@ -114,11 +105,6 @@ class DiffPoseTalk(ParametricModel):
         num_heads: Heads = 8,
         feed_forward_dim: Width | None = None,
         dropout: Share = 0.1,
-        style_dim: Width = 128,
-        style_layers: Layers = 4,
-        style_heads: Heads = 4,
-        style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
-        style_positions: StylePositions = "published",
         window_frames: Annotated[int, Range(2, 10_000)] = 100,
         context: Annotated[int, Range(1, 10_000)] = 10,
         diffusion_steps: Annotated[int, Range(1, 10_000)] = 500,
@@ -143,9 +129,8 @@ class DiffPoseTalk(ParametricModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(shape_dim=shape_dim, head=head, **options)
-        for width, heads, name in ((dim, num_heads, "dim"), (style_dim, style_heads, "style_dim")):
-            if width % heads or width % 2:
-                raise ArgumentError({name: width}, "it must be even, and a multiple of its attention heads")
+        if dim % num_heads or dim % 2:
+            raise ArgumentError({"dim": dim}, "it must be even, and a multiple of its attention heads")
         if context > window_frames:
             raise ArgumentError(
                 {"context": context, "window_frames": window_frames}, "a window must hold the context of the next"
@@ -173,21 +158,12 @@ class DiffPoseTalk(ParametricModel):
         self.start_audio = nn.Parameter(torch.randn(1, context, dim))
         self.start_motion = nn.Parameter(torch.randn(1, context, channels))
         self.no_audio = nn.Parameter(torch.randn(1, 1, dim))
-        self.no_style = nn.Parameter(torch.randn(1, 1, style_dim))
-        self.style_encoder = ClipStyleEncoder(
-            channels,
-            style_dim,
-            num_layers=style_layers,
-            num_heads=style_heads,
-            feed_forward_dim=4 * style_dim,
-            rows=style_rows,
-            positions=style_positions,
-            dropout=dropout,
-        )
+        self.no_style = nn.Parameter(torch.randn(1, 1, self.style_dim))
+        self.style_encoder = self.make_style_encoder(dropout=dropout)
         self.process = CosineProcess(diffusion_steps)
         self.network = PoseDenoiser(
             channels=channels,
-            person_dim=shape_dim + style_dim,
+            person_dim=shape_dim + self.style_dim,
             dim=dim,
             num_layers=num_layers,
             num_heads=num_heads,
@@ -199,10 +175,6 @@ class DiffPoseTalk(ParametricModel):
             memory_width=memory_width,
             dropout=dropout,
         )
-
-    def personal_modules(self) -> list[nn.Module]:
-        """The style encoder."""
-        return [self.style_encoder]
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
         """Follow speech (``audio``) or ``style`` by other scales.

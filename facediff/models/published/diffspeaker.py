@@ -150,10 +150,6 @@ class DiffSpeaker(DiffusionModel):
             n_identities=len(self.identities),
         )
 
-    def personal_modules(self) -> list[nn.Module]:
-        """The table of speakers."""
-        return [self.network.style]
-
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """Change the number of denoising steps, or correct the published scheduler.
 

@@ -34,7 +34,7 @@ from facediff.models.published.lam_finishing import read_steps
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
 from facediff.spaces import Space
-from facediff.speech.frame_clock import STEP_RATE, FrameClock
+from facediff.speech.frame_clock import STEP_RATE
 from facediff.utils.ranges import Range
 
 EMOTION_RATE = 30
@@ -81,6 +81,7 @@ class EmoTalk(DirectModel):
     """
 
     checkpoint_options = ("emotion_config",)  # without it, a file could have weights fetched from anywhere
+    clock_rule = "up"  # a frame for every part of one that speech lasts
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="jonatasgrosman/wav2vec2-large-xlsr-53-english", edges=False
     )
@@ -138,19 +139,6 @@ class EmoTalk(DirectModel):
         """Save the arguments as every model does, with the emotion network's configuration in place of its source."""
         config = self.emotion_encoder.network.config.to_dict()
         super().keep_hyperparameters({**arguments, "emotion_config": config})
-
-    def personal_modules(self) -> list[nn.Module]:
-        """The table of persons."""
-        return [self.network.style]
-
-    @property
-    def clock(self) -> FrameClock:
-        """A frame for every part of one that speech lasts."""
-        return FrameClock(self.frame_rate, "up")
-
-    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
-        """All of the motion."""
-        return batch.frame_lengths
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of both speech networks side by side, at the frames."""

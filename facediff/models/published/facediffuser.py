@@ -105,10 +105,6 @@ class FaceDiffuser(DiffusionModel):
             n_identities=len(self.identities),
         )
 
-    def personal_modules(self) -> list[nn.Module]:
-        """The table of speakers."""
-        return [self.network.style]
-
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
         """There is one way to sample, over all steps.
 

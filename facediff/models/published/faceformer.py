@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from facediff import registry
 from facediff.data import Batch
@@ -57,10 +57,6 @@ class FaceFormer(OffsetModel):
             style=SpeakerTable(len(self.identities), self.dim),
             decoder=self.decoder_options,
         )
-
-    def personal_modules(self) -> list[nn.Module]:
-        """The table of speakers."""
-        return [self.network.style]
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The mean squared error of all coordinates."""

@@ -35,7 +35,6 @@ from facediff.models.published.recognition import (
 )
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import Space
-from facediff.speech.frame_clock import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
@@ -66,6 +65,7 @@ class LamAudio2Expression(DirectModel):
         options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
+    clock_rule = "up"  # a frame for every part of one that speech lasts
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder,
         source="facebook/wav2vec2-base-960h",
@@ -104,19 +104,6 @@ class LamAudio2Expression(DirectModel):
             hidden_dim=feed_forward_dim or 2 * dim,
             dropout=dropout,
         )
-
-    def personal_modules(self) -> list[nn.Module]:
-        """The table of speakers."""
-        return [self.network.style]
-
-    @property
-    def clock(self) -> FrameClock:
-        """A frame for every part of one that speech lasts."""
-        return FrameClock(self.frame_rate, "up")
-
-    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
-        """All of the motion."""
-        return batch.frame_lengths
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of the speech network, whose convolutions' output is resampled to the frames."""

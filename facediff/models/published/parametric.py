@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
+from facediff.errors import ArgumentError
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import Style
+from facediff.models.layers import Heads, Layers, Width
 from facediff.models.person_styles import PersonStyles
 from facediff.models.published.base import NO_STYLE, Alignment, PublishedModel
+from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions
 from facediff.speech.frame_clock import FrameClock
 from facediff.utils.ranges import Range
 
@@ -31,8 +35,20 @@ class ParametricModel(PublishedModel):
         shape_dim: coefficients of a person's shape that the network is conditioned on.
         alignment: speech is interpolated to the frames.
         unseen_identity: as in :class:`facediff.models.AnimationModel`; the methods know a speaker by a style clip.
+        style_dim: channels of the style.
+        style_layers: layers of the style encoder.
+        style_heads: its attention heads.
+        style_rows: rows of its table of positions.
+        style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
+            influence; ``frames`` gives each its own.
         options: those of :class:`~facediff.models.published.base.PublishedModel`.
+
+    Attributes:
+        style_encoder: of a clip; a method makes it by :attr:`make_style_encoder` in its place among its modules, on
+            which initial weights depend.
     """
+
+    style_encoder: ClipStyleEncoder
 
     motion_mean: Tensor
     motion_std: Tensor
@@ -46,9 +62,16 @@ class ParametricModel(PublishedModel):
         shape_dim: Annotated[int, Range(0, 1000)] = 0,
         alignment: Alignment = "interpolated",
         unseen_identity: IdentityPolicy = "style_only",
+        style_dim: Width = 128,
+        style_layers: Layers = 4,
+        style_heads: Heads = 4,
+        style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
+        style_positions: StylePositions = "published",
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(alignment=alignment, unseen_identity=unseen_identity, **options)
+        if style_dim % style_heads or style_dim % 2:
+            raise ArgumentError({"style_dim": style_dim}, "it must be even, and a multiple of its attention heads")
         self.plan_long_speech("extend")  # the methods cut speech into windows by themselves
         numbers = self.n_vertices * self.dims
         turned = () if self.space.is_vertices else self.space.rotations
@@ -60,9 +83,24 @@ class ParametricModel(PublishedModel):
         turning = self.space.head if not self.space.is_vertices else ()
         self.head_places = tuple(i for i, place in enumerate(self.modelled) if place in turning)
         self.resting = () if head else tuple(turning)
+        self.style_dim = style_dim
+        self.make_style_encoder = partial(
+            ClipStyleEncoder,
+            len(self.modelled),
+            style_dim,
+            num_layers=style_layers,
+            num_heads=style_heads,
+            feed_forward_dim=4 * style_dim,
+            rows=style_rows,
+            positions=style_positions,
+        )
         self.register_buffer("motion_mean", torch.zeros(numbers))
         self.register_buffer("motion_std", torch.ones(numbers))
         self.register_buffer("shapes", torch.zeros(len(self.identities), shape_dim))
+
+    def personal_modules(self) -> list[nn.Module]:
+        """The style encoder."""
+        return [self.style_encoder]
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Take the mean and the deviation of every channel from the training split."""

@@ -32,7 +32,6 @@ from facediff.models.published.autoregressive import PeriodicDecoder
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
 from facediff.models.published.convolutions import ConvolutionStack
 from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.speech.frame_clock import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
@@ -74,6 +73,7 @@ class UniTalker(DirectModel):
     """
 
     # WavLM base plus asks for no standardisation of its speech: the published B model hears the waveform as it is.
+    clock_rule = "rows"  # as many frames as speech lasts, rounded to even
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="microsoft/wavlm-base-plus", spec_augment=True, edges=False, do_normalize=False
     )
@@ -120,10 +120,6 @@ class UniTalker(DirectModel):
             components=components,
         )
 
-    def personal_modules(self) -> list[nn.Module]:
-        """The table of speakers."""
-        return [self.network.style]
-
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """The head's principal components are those of the training motion."""
         count = self.network.components
@@ -152,15 +148,6 @@ class UniTalker(DirectModel):
         return {name: Style(name, row) for name, row in zip(names, torch.eye(len(names)), strict=True)}
 
     # Frames.
-
-    @property
-    def clock(self) -> FrameClock:
-        """As many frames as speech lasts, rounded to even."""
-        return FrameClock(self.frame_rate, "rows")
-
-    def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
-        """All of the motion."""
-        return batch.frame_lengths
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of the speech network, resampled to the frames."""
