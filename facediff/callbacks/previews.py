@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -112,7 +113,7 @@ class SamplingPreview(Callback):
         self._drawn_epochs = 0
         self._drawn_step = -1
 
-    @property
+    @cached_property  # Lightning asks for it at every hook of every step
     def state_key(self) -> str:
         """Differs by the options, since several of these callbacks may be given."""
         return self._generate_state_key(

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from facediff.data.augmentation import Augmenter, read_augmentations
-from facediff.data.batch import Assets, Batch, Reference, Rig, Sample, collate
+from facediff.data.batch import Assets, Reference, Rig, Sample, collate
 from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Clip, Corpus, find_region, parse_name, read_manifest
 from facediff.data.dataset import (
     Aligner,
@@ -632,10 +632,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             "pin_memory": torch.cuda.is_available(),
             "persistent_workers": self.num_workers > 0,
         }
-
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Move every tensor of the batch."""
-        return batch.to(device)
 
 
 def channel_regions(space: Space) -> dict[str, Tensor]:

@@ -90,6 +90,7 @@ class ClipFolder:
     def __init__(self, root: Path, n_vertices: int) -> None:
         self.root = root
         self.n_vertices = n_vertices
+        self._whole: set[Path] = set()
 
     def names(self) -> list[str]:
         """The clips that have both files, sorted."""
@@ -113,7 +114,7 @@ class ClipFolder:
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
-        return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store)
+        return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store, self._whole)
 
     def expect(self, stretches: Sequence[Stretch]) -> None:
         """Nothing: the operating system reads files ahead."""

@@ -224,17 +224,23 @@ def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
 
 
-def read_stretch(path: Path, first: int, length: int, store: ArrayStore | None) -> npt.NDArray[np.float32]:
+def read_stretch(
+    path: Path, first: int, length: int, store: ArrayStore | None, whole: set[Path] | None = None
+) -> npt.NDArray[np.float32]:
     """Samples ``first`` to ``first + length`` at 16 kHz, (length,) float32, filled with zeros past the end.
 
     Of a 16 kHz mono file only these samples are read. Any other file is decoded as a whole once and kept in ``store``.
+    Files that were looked at to the end are kept in ``whole``, so that a training does so once.
 
     Raises:
         FaceDiffError: as :func:`read_speech`.
     """
     if not path.is_file() or not path.stat().st_size:
         return fit_length(read_speech(path), length)  # which reports what is wrong
-    refuse_cut_short(path)
+    if whole is None or path not in whole:
+        refuse_cut_short(path)
+        if whole is not None:
+            whole.add(path)
     with open_sound(path) as file:
         if file.samplerate == SAMPLE_RATE and file.channels == 1 and file.seekable():
             file.seek(min(first, file.frames))
