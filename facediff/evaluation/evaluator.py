@@ -192,8 +192,9 @@ def evaluate(
         lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in named.items()]
         definitions[METRICS] = "\n".join(["further metrics", *lines])
     rendered = {}
+    regions = {"lips": lips.indices} | ({} if upper_face is None else {"upper_face": upper_face.indices})
     if renders:
-        rendered = score_renders(renders, scorer, paired, lips, faces, corpus, frame_rate)
+        rendered = score_renders(renders, scorer, paired, regions, faces, corpus, frame_rate)
     results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
         truth=str(truth),
@@ -221,7 +222,7 @@ def score_renders(
     renders: Sequence[str],
     scorer: Scorer,
     paired: Mapping[str, tuple[Sequence[Pair], object]],
-    lips: Region,
+    regions: Mapping[str, Sequence[int]],
     faces: npt.NDArray[np.integer] | None,
     corpus: Path | None,
     frame_rate: float | None,
@@ -240,7 +241,7 @@ def score_renders(
         path = None if corpus is None else corpus / "wav" / f"{clip}.wav"
         return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
 
-    drawing = RenderScorer(metrics, faces=faces, lips=lips.indices, frame_rate=frame_rate, speech=speech)
+    drawing = RenderScorer(metrics, faces=faces, regions=regions, frame_rate=frame_rate, speech=speech)
     rows: dict[str, dict[str, list[dict[str, float]]]] = {}
     for method, (pairs, _) in paired.items():
         for pair in pairs:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, render_metric
-from facediff.render.rasteriser import Camera, Renderer
+from facediff.render.rasteriser import Camera, Renderer, portrait
 from facediff.runtime.graph_check import check_graph
 from facediff.runtime.graphs import open_session, run_session
 from facediff.speech.audio import SAMPLE_RATE
@@ -260,13 +260,17 @@ def read_render_metrics(texts: Sequence[str]) -> dict[str, RenderMetric]:
     return metrics
 
 
-def framing(metric: RenderMetric, template: Array, lips: Sequence[int]) -> Camera:
-    """The camera of a metric's pictures of a face (V, 3); the mouth is twice as wide as the lips, in the middle."""
+def framing(metric: RenderMetric, template: Array, regions: Mapping[str, Sequence[int]]) -> Camera:
+    """The camera of a metric's pictures of a face (V, 3).
+
+    The face is without shoulders, where its ``upper_face`` is known next to its ``lips``; the mouth is what is twice as
+    wide as the lips, in the middle.
+    """
     whole = Camera.framing(template)
     height, width = metric.size
     if metric.part == "face":
-        return Camera.framing(template, aspect=width / height)
-    mouth = template[list(lips)]
+        return Camera.framing(portrait(template, dict(regions)), aspect=width / height)
+    mouth = template[list(regions["lips"])]
     middle, half = (mouth.max(0) + mouth.min(0)) / 2, np.ptp(mouth, axis=0)
     half[1] = half[0] * height / width
     camera = Camera.framing(np.stack([middle - half, middle + half]), aspect=width / height, margin=0.0)
@@ -280,7 +284,7 @@ class RenderScorer:
     Args:
         metrics: by name.
         faces: (F, 3) triangles.
-        lips: lip vertices.
+        regions: vertices of the ``lips`` and, if known, of the ``upper_face``.
         frame_rate: frames a second.
         speech: gives the samples of a clip by its name; empty where there is none.
     """
@@ -290,11 +294,11 @@ class RenderScorer:
         metrics: Mapping[str, RenderMetric],
         *,
         faces: npt.NDArray[np.integer],
-        lips: Sequence[int],
+        regions: Mapping[str, Sequence[int]],
         frame_rate: float,
         speech: Callable[[str], Speech],
     ) -> None:
-        self.metrics, self.faces, self.lips = metrics, faces, lips
+        self.metrics, self.faces, self.regions = metrics, faces, regions
         self.frame_rate, self.speech = frame_rate, speech
 
     def score(self, clip: str, vertices: Array, template: Array) -> dict[str, float]:
@@ -310,7 +314,7 @@ class RenderScorer:
         for name, metric in self.metrics.items():
             key = (metric.part, metric.size)
             if key not in drawn:
-                camera = framing(metric, template, self.lips)
+                camera = framing(metric, template, self.regions)
                 renderer = Renderer(self.faces, template=template, size=metric.size, camera=camera)
                 drawn[key] = np.stack([renderer.render(frame) for frame in vertices])
             speech = self.speech(clip)

@@ -77,7 +77,7 @@ def test_a_graph_scores_what_is_rendered(faces: Path, capsys: pytest.CaptureFixt
             means = []
             for clip in ("a_1", "a_2"):
                 truth, motion = (np.load(faces / name / f"{clip}.npy") for name in ("truth", folder))
-                camera = framing(metric, truth.mean(0), [14, 15, 20, 21])
+                camera = framing(metric, truth.mean(0), {"lips": [14, 15, 20, 21]})
                 mesh = read_mesh(faces / "face.obj")
                 renderer = Renderer(mesh.faces, template=truth.mean(0), size=(32, 48), camera=camera)
                 means.append(np.mean([renderer.render(frame).mean() for frame in motion]) / 255)
