@@ -336,9 +336,9 @@ def read_poses(path: Path, config_path: Path, vertices: int) -> Poses:
     """Blendshapes and the settings of their solver."""
     arrays = read_arrays(path, remedy=REMEDY)
     names = _names(path, arrays, "poseNames")
-    if not names or names[0] != "neutral" or not 1 < len(names) <= MOST or len(set(names)) < len(names):
-        raise FaceDiffError(f"{path}: poseNames are {quoted(names)}; expected neutral, then different names; {REMEDY}")
-    names = names[1:]
+    names = [name for place, name in enumerate(names) if place or name != "neutral"]
+    if not 0 < len(names) <= MOST or len(set(names)) < len(names) or "neutral" in names:
+        raise FaceDiffError(f"{path}: poseNames are {quoted(names)}; expected different names of poses; {REMEDY}")
     deltas = np.empty((len(names), vertices, 3), np.float32)
     for index, name in enumerate(names):
         deltas[index] = _matrix(path, arrays, name, (vertices, 3))

@@ -224,7 +224,11 @@ HOSTILE: dict[str, tuple[str, Change]] = {
     "a flat face": ("shapes_mean_skin", arrays("model_data.npz", shapes_mean_skin=np.zeros((24, 3), np.float32))),
     "a mask outside": ("frontalMask", arrays("bs_skin.npz", frontalMask=np.array([24]))),
     "a pose that is missing": ("jawOpen", arrays("bs_skin.npz", jawOpen=None)),
-    "poses without neutral": ("poseNames", arrays("bs_skin.npz", poseNames=np.array(["a", "b"], "S8"))),
+    "neutral among the poses": (
+        "poseNames",
+        arrays("bs_skin.npz", poseNames=np.array(["a", "neutral"], "S8")),
+    ),
+    "poses without shapes": ("bs_skin.npz", arrays("bs_skin.npz", poseNames=np.array(["a", "b"], "S8"))),
     "a pair of three": (
         "bsSolveCancelPoses",
         edit("bs_skin_config.json", "blendshape_params", "bsSolveCancelPoses", value=[0, 0, 0, -1, -1, -1]),

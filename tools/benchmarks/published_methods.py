@@ -30,8 +30,18 @@ from facediff.models.published.autoregressive import AutoregressiveModel
 from facediff.models.published.base import PublishedModel
 from facediff.models.published.diffspeaker import DiffSpeaker
 from facediff.models.published.facediffuser import FaceDiffuser
+from facediff.spaces import VERTICES
+from facediff.spaces.layouts import layout
 
 SETS = {"VOCASET": (5023, 30.0, 8), "BIWI": (23_370, 25.0, 6)}
+LAYOUTS = {
+    "LamAudio2Expression": ("arkit", 30.0),
+    "UniTalker": ("arkit", 30.0),
+    "EmoTalk": ("arkit", 30.0),
+    "DiffPoseTalk": ("flame_diffposetalk", 25.0),
+    "ARTalk": ("flame_artalk", 25.0),
+}
+"""Methods that generate parameters, timed in these once in place of faces."""
 BASE = {"model_type": "wav2vec2", "hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12}
 LARGE = {
     "model_type": "wav2vec2",
@@ -57,12 +67,22 @@ DEEPSPEECH = {"inputs": 494, "first": 2048, "second": 2048, "third": 4096, "cell
 TOY_OPTIONS: dict[str, dict[str, Any]] = {
     "CodeTalker": {"num_layers": 1, "prior_dim": 16, "prior_layers": 1, "tokens": 2, "codes": 4},
     "FaceDiffuser": {"diffusion_steps": 8},
+    "EmoTalk": {"emotion_config": TOY, "emotion_dim": 2, "level_dim": 1, "person_dim": 1},
+    "DiffPoseTalk": {"num_heads": 2, "style_dim": 8, "style_heads": 2, "diffusion_steps": 2},
+    "ARTalk": {"num_heads": 2, "codec_dim": 8, "codec_heads": 2, "style_dim": 8, "style_heads": 2, "code_dim": 4},
     "Voca": {"components": 8},
 }
 """Sizes of methods that ``dim=8`` alone does not make small."""
 
-OPTIONS: dict[str, dict[str, Any]] = {"SelfTalk": {"lip_reader": "none"}}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "SelfTalk": {"lip_reader": "none"},
+    "EmoTalk": {"emotion_config": LARGE},
+    "LamAudio2Expression": {"transformer_layers": 6},
+}
 """Options of methods whose defaults are for training."""
+
+PROCESSOR_TIME = "--processor-time"
+"""Seconds of the processor in place of the clock's, for a machine that has other work."""
 
 WARM_UP = 4_000
 """Samples of an animation before the one that is timed, since the first one is slower."""
@@ -123,21 +143,30 @@ def made(name: str, faces: tuple[int, float, int], *, toy: bool) -> PublishedMod
     if encoder is DeepSpeechEncoder:
         config = {name: 8 if toy and size > 494 else size for name, size in DEEPSPEECH.items()}
     else:
-        config = TOY if toy else LARGE if "large" in encoder.keywords["source"] else BASE
+        source = encoder.keywords["source"]
+        config = TOY if toy else LARGE if "large" in source or "xls-r" in source else BASE
     encoder = partial(encoder, config=config)
     options = {**OPTIONS.get(name, {}), **({"dim": 8, **TOY_OPTIONS.get(name, {})} if toy else {})}
-    model = kind(n_vertices=vertices, identities=names, frame_rate=rate, audio_encoder=encoder, **options)
+    space = VERTICES
+    if name in LAYOUTS:
+        layout_name, rate = LAYOUTS[name]
+        space = layout(layout_name)
+        vertices = len(space.channels)
+    sizes = {"n_vertices": vertices, "identities": names, "frame_rate": rate, "space": space}
+    model = kind(**sizes, audio_encoder=encoder, **options)
     everything = torch.arange(vertices)
-    templates = {each: torch.randn(vertices, 3) for each in names}
-    model.adopt(Assets("none", True, "m", rate, names, templates, None, {"lips": everything, "upper_face": everything}))
+    templates = {each: torch.randn(vertices, space.dims) for each in names}
+    regions = {"lips": everything, "upper_face": everything}
+    model.adopt(Assets("none", True, "m", rate, names, templates, None, regions, space=space))
     return model.eval()
 
 
 def seconds_of(work: Callable[[], object]) -> float:
     """Seconds that some work takes."""
-    start = time.perf_counter()
+    clock = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
+    start = clock()
     work()
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def timed(model: PublishedModel, way: Way, speech: torch.Tensor, steps: int) -> float:
@@ -163,7 +192,7 @@ def rows_of(asked: argparse.Namespace) -> Iterator[tuple[str, ...]]:
     speech = 0.1 * torch.randn(round(asked.seconds * 16_000))
     for faces in asked.sets:
         for name, kind in methods().items():
-            if asked.methods and name not in asked.methods:
+            if (asked.methods and name not in asked.methods) or (name in LAYOUTS and faces != asked.sets[0]):
                 continue
             model = made(name, (30, *SETS[faces][1:]) if asked.toy else SETS[faces], toy=asked.toy)
             parameters = f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M"
@@ -174,7 +203,8 @@ def rows_of(asked: argparse.Namespace) -> Iterator[tuple[str, ...]]:
             literal = next((taken[way.name] for way in chosen if way.literal and len(chosen) > 1), None)
             for way, seconds in taken.items():
                 ratio = "" if literal is None or way == "literal" else f"{literal / seconds:.1f}"
-                yield f"`{name}`", faces, way, parameters, f"{seconds:.2f}", f"{seconds / asked.seconds:.3f}", ratio
+                shown = LAYOUTS[name][0] if name in LAYOUTS else faces
+                yield f"`{name}`", shown, way, parameters, f"{seconds:.2f}", f"{seconds / asked.seconds:.3f}", ratio
 
 
 def main() -> None:
@@ -185,6 +215,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS), help="sizes of faces")
     parser.add_argument("--methods", nargs="+", choices=list(methods()), help="these methods alone")
     parser.add_argument("--without-literal", action="store_true", help="leave out the slow ways of the published code")
+    parser.add_argument(PROCESSOR_TIME, action="store_true", help="count the processor's seconds, not the clock's")
     parser.add_argument("--toy", action="store_true", help="tiny networks and faces, to try the benchmark itself")
     asked = parser.parse_args()
     threads, load = torch.get_num_threads(), os.getloadavg()[0]

@@ -24,7 +24,10 @@ HPARAMS: dict[str, Callable[[Any], bool]] = {
 }
 """Options that such a file may hold, and whether a value fits; others are left to the checkpoint."""
 
-MODEL_HPARAMS = ("do_normalize", "epsilon", "num_heads", "chunks", "finish", "long_windows", "normalize_windows")
+MODEL_HPARAMS = (
+    *("do_normalize", "epsilon", "num_heads", "codec_heads", "style_heads"),
+    *("chunks", "finish", "long_windows", "normalize_windows"),
+)
 """Options of models and audio encoders that such a file may hold."""
 
 

@@ -228,7 +228,9 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     if "decoder.PPE.pe" in weights:
         period = read_period(weights, "decoder.PPE.pe", facts, any_rate=True)
         weights.ignore("decoder.biased_mask", "the attention's bias is computed by its formula")
-        weights.move_all("decoder.transformer_decoder.layers.", "network.transformer.layers.", LAYER_NAMES)
+        first = "0.self_attn.in_proj_weight"  # whatever the decoder's own name is
+        prefix = next((name.removesuffix(first) for name in weights.names("decoder.") if name.endswith(first)), "")
+        weights.move_all(prefix or "decoder.transformer_decoder.layers.", "network.transformer.layers.", LAYER_NAMES)
         return {**options, "decoder_type": "transformer", "period": period}
     weights.move_all("decoder.tcn.first_net.conv_layers.", "network.convolutions.layers.", AUTHORS_NAMES)
     return {**options, "style_dim": table.shape[1]}
