@@ -62,7 +62,7 @@ NO_PATHS = {
         "split",
     ),
     "splits",
-    *("subjects", "suffix", "topology", "truth_pattern", "unit"),
+    *("subjects", "suffix", "topology", "truth_layout", "truth_pattern", "unit", "file_unit", "render"),
 }
 """Texts that are no paths; a new option of type text either joins them or declares that it is read or written."""
 
