@@ -33,6 +33,8 @@ GRID = 72  # Points of the eyeball's depth across an eye's window
 WINDOW = 0.8  # Half of the window's size, in widths of the eye
 STILL = 0.004  # Lids that move by less than this share of the eye's width say nothing of the skin around
 OVER = 0.012  # A lid stays so far in front of the eyeball, as a share of the eye's width, or as far as it is at rest
+RADIUS = 0.42  # of an eyeball, about which a lid turns, in widths of the eye
+SWING = -0.5, 1.2  # Radians by which lashes turn with an upper lid that opens further, or shuts
 BALL = 0.45, 2.4  # Least and largest height of an eyeball, in widths of the eye
 
 
@@ -332,7 +334,7 @@ def _clearance(laid: Surface, field: LidField, ball: EyeballDepth, width: float)
     long = np.linalg.norm(laid.vertices[edge[:, 0]] - laid.vertices[edge[:, 1]], axis=1)
     count = len(laid.vertices)
     mean = np.bincount(edge[:, 0], long, count) / np.maximum(np.bincount(edge[:, 0], None, count), 1)
-    sag = np.minimum(np.square(mean[field.vertices]) / (8 * 0.42 * width), 0.1 * width)
+    sag = np.minimum(np.square(mean[field.vertices]) / (8 * RADIUS * width), 0.1 * width)
     return np.where(np.isfinite(rest), np.minimum(rest, OVER * width + sag), OVER * width + sag)
 
 
@@ -363,3 +365,31 @@ def with_lids(lids: list[EyeLids], vertices: Array, displacements: Array, edges:
             points = vertices[some] + displacements[:, some]
             into = eye.ball.at(points) + eye.clearance - points[..., 2]
             displacements[:, some, 2] += np.where(np.isfinite(into), np.maximum(into, 0.0), 0.0)
+
+
+def swing(lids: list[EyeLids], vertices: Array, lashes: Indices, roots: Indices, displacements: Array) -> Array:
+    """Displacements (T, A, 3) by which lashes turn about their roots with an upper lid, in the source's axes.
+
+    A lid turns about the eyeball's centre, and what grows from its edge turns with it: lashes that were only shifted
+    would stick out of a shut eye.
+
+    Args:
+        lids: of both eyes.
+        vertices: (Vt, 3) of the target at rest.
+        lashes: (A,) vertices of lashes.
+        roots: (A,) the vertices at the edges of the lids that they move with.
+        displacements: (T, Vt, 3) of the target's vertices.
+    """
+    turned = np.zeros((len(displacements), len(lashes), 3))
+    for eye in lids:
+        if eye.target is None:
+            continue
+        field = eye.target_field
+        some = np.flatnonzero(np.isin(roots, field.vertices[field.upper == 1.0]))
+        down = -displacements[:, roots[some]] @ field.axes[1]
+        angle = np.clip(down / (RADIUS * eye.target.opening.width), *SWING)
+        _, up, forwards = ((vertices[lashes[some]] - vertices[roots[some]]) @ field.axes.T).T
+        sine, less = np.sin(angle), np.cos(angle) - 1.0
+        turned[:, some] += (up * less - forwards * sine)[..., None] * field.axes[1]
+        turned[:, some] += (up * sine + forwards * less)[..., None] * field.axes[2]
+    return turned

@@ -26,7 +26,7 @@ from facediff.editing.correspondence import (
 from facediff.editing.face_features import facing, find_features, sides_of_pairs
 from facediff.editing.fit_check import FitReport, check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
-from facediff.editing.lids import with_lids, without_lids
+from facediff.editing.lids import swing, with_lids, without_lids
 from facediff.editing.placing import place_face
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
@@ -294,6 +294,12 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
             "ak,takd->tad", correspondence.follower_weights, carried[:, correspondence.follower_corners]
         )
         carried[:, correspondence.followers] = with_skin
+        # Lashes hang on one vertex at the edge of a lid.
+        hangs = (correspondence.follower_corners == correspondence.follower_corners[:, :1]).all(axis=1)
+        if lids is not None and hangs.any():
+            lashes, roots = correspondence.followers[hangs], correspondence.follower_corners[hangs, 0]
+            laid = carried @ np.linalg.inv(matrix).T
+            carried[:, lashes] += swing(lids, correspondence.laid.vertices, lashes, roots, laid) @ matrix.T
     return carried
 
 

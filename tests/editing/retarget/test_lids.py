@@ -8,7 +8,7 @@ import trimesh
 
 from facediff.animation import Animation
 from facediff.editing.face_features import Features, find_features
-from facediff.editing.lids import EyeLids, eye_lids, eyeball_depth, lid_edges, with_lids, without_lids
+from facediff.editing.lids import EyeLids, eye_lids, eyeball_depth, lid_edges, swing, with_lids, without_lids
 from facediff.editing.surface import Surface
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import eyelid_pairs
@@ -127,3 +127,27 @@ def test_lids_slide_over_eyeballs(animation: Animation, lids: tuple[Surface, Sur
         dives.append(max(depths))
     assert dives[0] > 0.0002
     assert dives[1] < 0.0001
+
+
+def test_lashes_turn_down_with_the_upper_lid(
+    animation: Animation, lids: tuple[Surface, Surface, list[EyeLids]]
+) -> None:
+    """Lashes keep their length, point down at a full blink, and those of the lower lid keep their direction."""
+    source, laid, eyes = lids
+    upper, lower = (np.concatenate([eye.target.rims[side][2:-2] for eye in eyes if eye.target]) for side in (0, 1))
+    roots = np.concatenate([upper, lower])
+    lashes = len(laid.vertices) + np.arange(len(roots))
+    outwards = np.array([0.0, 0.002, 0.008])
+    vertices = np.concatenate([laid.vertices, laid.vertices[roots] + outwards])
+    blink = animation.vertices[BLINK].astype(np.float64) - source.vertices
+    skin = carried(lids, np.stack([0 * blink, 0.5 * blink, blink])) - laid.vertices
+    moved = np.concatenate([skin, skin[:, roots]], axis=1)
+    turned = outwards + swing(eyes, vertices, lashes, roots, moved)
+    assert np.linalg.norm(turned, axis=2) == pytest.approx(np.linalg.norm(outwards))
+    pitch = np.rad2deg(np.arctan2(turned[..., 1], turned[..., 2]))
+    assert pitch[0] == pytest.approx(pitch[0, 0])
+    assert turned[:, len(upper) :] == pytest.approx(np.broadcast_to(outwards, turned[:, len(upper) :].shape))
+    full = pitch[2, : len(upper)]
+    assert np.median(pitch[0, 0] - full) > 25
+    assert (full < pitch[1, : len(upper)] + 1e-9).mean() > 0.9
+    assert np.median(full) < -10
