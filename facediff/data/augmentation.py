@@ -9,7 +9,7 @@ They are registered under the kind ``augmentation`` and chosen by name with thei
 
     --data.augmentations="[voice:semitones=5, room, noise:least=0, pauses]" --data.augmented_share=0.5
 
-Everything is NumPy and SciPy on whole clips; docs/voices.md has what each costs.
+Everything is NumPy and SciPy on whole clips; docs/voices.md lists each with its options.
 """
 
 from __future__ import annotations
