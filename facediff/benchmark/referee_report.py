@@ -152,7 +152,7 @@ def languages_and_costs(report: RefereeReport) -> list[Block]:
                 row.facts.get("commercial use", "unknown"),
             ]
         )
-    head = ["", *(f"closures, {LANGUAGES[code].name}" for code in spoken), "CPU s/s", "memory", "fps", "commercial use"]
+    head = ["closures in", *(LANGUAGES[code].name for code in spoken), "CPU s/s", "memory", "fps", "commercial use"]
     notes = [
         f"{row.name}: {title}: {value}"
         for row in report.rows
