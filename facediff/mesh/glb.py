@@ -81,10 +81,16 @@ class Glb:
 
     def entry(self, kind: str, index: object) -> dict[str, Any]:
         """An object by its number; numbers from the end, which Python would accept, are refused."""
-        listed = self.entries(kind)
+        listed = self.content.get(kind, [])
+        # Not by `entries`, which looks at all of them: a file has as many nodes as it likes, and each is asked for.
+        if not isinstance(listed, list):
+            raise ValueError(f"has {kind} that are no list of objects")
         if type(index) is not int or not 0 <= index < len(listed):
             raise ValueError(f"names {kind.removesuffix('s')} {str(index)[:20]}, which does not exist")
-        return listed[index]
+        entry = listed[index]
+        if not isinstance(entry, dict):
+            raise ValueError(f"has {kind} that are no list of objects")
+        return entry
 
     def numbers(self, index: object, form: str, kinds: tuple[str, ...], count: int | None = None) -> npt.NDArray[Any]:
         """An accessor's numbers (N, width); normalised whole numbers become those from -1 to 1 that they stand for.

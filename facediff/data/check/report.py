@@ -173,7 +173,7 @@ def _heading(report: CheckReport) -> str:
         return f"{report.root}: {f'raw distribution of {report.raw}' if report.raw else 'not recognised'}"
     module = f", data module {report.data_module}" if report.data_module else ""
     rate = f"{report.frame_rate:g} frames a second"
-    if report.stored_frame_rate != report.frame_rate:
+    if report.stored_frame_rate not in (None, report.frame_rate):
         rate += f" ({report.stored_frame_rate:g} on disk)"
     read = "headers only" if report.quick else "all files"
     return (

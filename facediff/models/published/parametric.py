@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
-from facediff.errors import ArgumentError
+from facediff.errors import ArgumentError, OptionError
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import Style
 from facediff.models.layers import Heads, Layers, Width
@@ -162,6 +163,11 @@ def window_at(
 
 def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Tensor, Tensor]:
     """Mean and deviation of some arrays of a file of statistics (``exp_mean``, ``exp_std`` …), one after the other."""
+    for name in (f"{key}_{part}" for key in keys for part in ("mean", "std")):
+        if not isinstance(content.get(name), Tensor) and np.asarray(content.get(name)).dtype.kind not in "fiu":
+            raise OptionError.naming(
+                f"{{statistics}}: has no numbers {name}; expected the file of the method's authors"
+            )
     mean, deviation = (
         torch.cat([torch.as_tensor(content[f"{key}_{name}"]).float().flatten() for key in keys])
         for name in ("mean", "std")
