@@ -43,7 +43,7 @@ def blendshapes(
     They are written as the table that Live Link Face records; what the table cannot say is in a .json next to it.
 
     Args:
-        animation: motion: .npz of `facediff animate`, or .npy
+        animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
         output: table to write
         shapes: folder of .obj or .ply files named jawOpen, mouthFunnel … with the face at rest as neutral, or a .glb
             with named targets, or "puppet" for those of the built-in face

@@ -30,7 +30,7 @@ def export(
     """Write animations as files of other programs. The suffix of OUT chooses the format.
 
     Args:
-        animations: motion: .npz of `facediff animate`, or .npy
+        animations: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
         output: file to write; formats below
         quiet: no progress bars
         files: how the files are written.

@@ -48,7 +48,7 @@ def retarget(
     """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.
 
     Args:
-        animation: motion: .npz of `facediff animate`, or .npy
+        animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
         target_mesh: the other face at rest: .obj, .ply, .glb …
         output: file to write
         correspondence: .npz to use if it exists, else to write for other animations

@@ -35,7 +35,8 @@ def view(
     first .npz given, if both have equally many vertices.
 
     Args:
-        animations: motions, shown side by side: .npz or .npy; four at most
+        animations: motions, shown side by side: .npz, .npy, or ARKit's weights (.csv of Live Link Face, .json); four at
+            most
         output: the page (.html)
         truth: what the animations are compared with: shown first, and in heat maps
         labels: names to show, in the order of the panels

@@ -262,8 +262,9 @@ def read(
 ) -> Animation:
     """Read a motion file: .npz as :meth:`Animation.save` writes it, or .npy of absolute vertices (T, V, 3) or (T, 3V).
 
-    What a bare array does not say is taken from the other arguments: first from those that name it, then from the
-    checkpoint, then from ``like``.
+    A .csv or .json of ARKit's weights, such as a take of Live Link Face, is played by the built-in face. What a bare
+    array does not say is taken from the other arguments: first from those that name it, then from the checkpoint, then
+    from ``like``.
 
     Args:
         path: the file.
@@ -337,7 +338,13 @@ class SourceReader:
         overrides, defaults = self.facts
         if lender is not None:
             defaults = complete(defaults or {}, facts_of(lender))
-        animation = read_animation(path, overrides, defaults)
+        from facediff.editing.recorded_weights import SUFFIXES, read_weights
+
+        if path.suffix.lower() in SUFFIXES:
+            recorded = read_weights(path)
+            animation = replace(recorded, **complete(overrides, facts_of(recorded)))
+        else:
+            animation = read_animation(path, overrides, defaults)
         animation.refuse_not_finite()
         return animation
 

@@ -1,0 +1,49 @@
+"""Recordings of ARKit's weights, such as a take of Live Link Face, as animations of the built-in face."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from facediff.animation import Animation
+from facediff.editing.procedural import move_head
+from facediff.errors import FaceDiffError
+from facediff.spaces.decoding import Decoder
+from facediff.spaces.files import even, read_parameters
+
+SUFFIXES = (".csv", ".json")
+"""Tables of Live Link Face or Audio2Face, and BEAT's files."""
+
+
+def read_weights(path: Path) -> Animation:
+    """Read a recording of ARKit's weights, and let the built-in face play it; the weights stay with the animation.
+
+    Raises:
+        FaceDiffError: if the file cannot be read, or holds other parameters.
+    """
+    from facediff.synthetic.known_faces import built_in_rig
+
+    clip = even(read_parameters(path))
+    if clip.space.kind != "arkit":
+        raise FaceDiffError(f"{path}: holds {clip.space.kind} parameters; expected weights of ARKit's shapes")
+    rig, space = built_in_rig(), clip.space
+    column = {name: row for row, name in enumerate(rig.names)}
+    nothing = np.zeros(rig.neutral.shape)
+    names = [space.channels[channel] for channel in space.face]
+    deltas = np.stack([rig.deltas[column[name]] if name in column else nothing for name in names])
+    decoder = Decoder(space, np.zeros(len(space.channels)), rig.neutral, deltas)
+    points = np.asarray(clip.values, np.float32)[..., None]
+    animation = Animation(
+        path.stem,
+        decoder.vertices(points),
+        rig.neutral.astype(np.float32),
+        clip.frame_rate,
+        faces=None if rig.faces is None else rig.faces.astype(np.int32),
+        unit=rig.unit,
+        metadata={"face": "the built-in one, which plays recorded weights"},
+    )
+    turns = decoder.head_turns(points)
+    if turns is not None and turns.any():
+        animation = move_head(animation, turns, 0 * turns)
+    return animation.made_of(space, decoder.values(points))
