@@ -35,6 +35,8 @@ OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
 WITHOUT_FACE = "none, a point stands for each channel"
 """Metadata ``face`` of motion in parameters that no face is known for."""
 
+PHONEMES = "phonemes"
+"""Metadata key: the phonemes of the speech as JSON, where they were given."""
 MOTION = "facediff.pipelines.motion"  # What shows, changes and writes animations
 
 

@@ -12,6 +12,7 @@ import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -468,8 +469,9 @@ class AnimationPipeline(ABC):
     def _closed(self, animation: Animation) -> Animation:
         """A sample whose lips touch where its phonemes say so, if their times are given."""
         alignment, transcript, speech = self.options.alignment, self.options.transcript, animation.speech
+        from facediff.animation.animation import PHONEMES
         from facediff.editing.closures import BUDGET, close_lips
-        from facediff.speech.phonemes import closed_times, read_alignment
+        from facediff.speech.phonemes import closed_times, phonemes_text, read_alignment
 
         if self._phonemes is None:
             if alignment is not None:
@@ -481,7 +483,8 @@ class AnimationPipeline(ABC):
             else:
                 return animation
         budget = self.options.closure_budget
-        return close_lips(animation, closed_times(self._phonemes), BUDGET if budget is None else budget)
+        closed = close_lips(animation, closed_times(self._phonemes), BUDGET if budget is None else budget)
+        return replace(closed, metadata={**closed.metadata, PHONEMES: phonemes_text(self._phonemes)})
 
 
 def read_scales(guidance: Scales | None) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -48,6 +49,17 @@ class TimedPhoneme:
     def plain(self) -> str:
         """The phoneme without stress marks."""
         return self.ipa.strip(STRESS)
+
+
+def phonemes_text(phonemes: Iterable[TimedPhoneme]) -> str:
+    """Phonemes as JSON: rows of start and end in seconds, the phoneme, and its word.
+
+    Example:
+        >>> phonemes_text([TimedPhoneme(0.1, 0.2, "m", word="mama")])
+        '[[0.1, 0.2, "m", "mama"]]'
+    """
+    rows = [[round(sound.start, 3), round(sound.end, 3), sound.ipa, sound.word] for sound in phonemes]
+    return json.dumps(rows, ensure_ascii=False)
 
 
 def phonemes_file(corpus: Path | None, clip: str) -> Path | None:

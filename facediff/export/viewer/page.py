@@ -31,7 +31,7 @@ from facediff.export.viewer.packing import (
     mouth_opening,
     pack_motion,
 )
-from facediff.export.viewer.posing import acted_curves, moods, pose_fields
+from facediff.export.viewer.posing import acted_curves, moods, pose_fields, sounds
 from facediff.registry import export_format
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.pages import fill, hash_source, script_data
@@ -178,6 +178,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
         "step": STEP,
         "chunkFrames": CHUNK_FRAMES,
         "sound": None if sound is None else blobs.add(sound),
+        "sounds": sounds(animations),
         "truth": truth,
         "heat": heat,
         "archive": ARCHIVE,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.animation import PHONEMES
 from facediff.editing import direction, procedural
 from facediff.editing.brows import brows_of
 from facediff.editing.controlled import ACTED
@@ -16,6 +18,7 @@ from facediff.editing.eyes import puppet_eyes
 from facediff.editing.face_shapes import own_shapes
 from facediff.errors import FaceDiffError
 from facediff.export.viewer.packing import Blobs, millimetres
+from facediff.utils.plain_files import parse_json
 
 FIELD_STEP = 0.01
 """Quantisation of displacements in mm: a vertex is off by less than 0.01 mm at a weight of 1."""
@@ -76,6 +79,25 @@ def acted_curves(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
         "acting": {name: packed(curve) for name, curve in curves.items()},
         "blinks": None if blinks is None else packed(blinks),
     }
+
+
+def sounds(animations: Sequence[Animation]) -> list[list[Any]]:
+    """Rows of start, end, phoneme and word of the first animation that has them; empty if none has."""
+    for animation in animations:
+        try:
+            rows = parse_json(animation.metadata.get(PHONEMES, "[]"), animation.name)
+        except FaceDiffError:  # metadata from elsewhere may say anything
+            continue
+        whole = isinstance(rows, list) and all(
+            isinstance(row, list)
+            and len(row) == 4
+            and all(isinstance(seconds, int | float) for seconds in row[:2])
+            and all(isinstance(text, str) for text in row[2:])
+            for row in rows
+        )
+        if whole and rows:
+            return rows
+    return []
 
 
 def moods() -> dict[str, list[dict[str, float | str]]]:

@@ -19,6 +19,7 @@ import pytest
 from facediff.animation import Animation, read_archive
 from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, curve, read_direction
 from facediff.export.format import linear_colours
+from facediff.speech.phonemes import TimedPhoneme, phonemes_text
 from facediff.synthetic.corpus import rig_of
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import CONTROLS
@@ -102,7 +103,11 @@ def downloaded(page: Page, folder: Path, action: Callable[[], object]) -> Path:
 
 
 def test_keys_come_back_as_they_were_and_their_curves_are_those_of_python(show: Show) -> None:
-    page = show([directed(), clicks(name="other")])
+    spoken = phonemes_text([TimedPhoneme(0.1, 0.5, "m", word=HOSTILE), TimedPhoneme(0.5, 1.4, "ɑː", word=HOSTILE)])
+    made = directed()
+    page = show([replace(made, metadata={**made.metadata, "phonemes": spoken}), clicks(name="other")])
+    assert page.evaluate("[sounds.ariaLabel ?? sounds.getAttribute('aria-label'), voice.hidden]") == [HOSTILE, False]
+    assert page.evaluate("sounds.getContext('2d').getImageData(0, 0, sounds.width, sounds.height).data.some(Boolean)")
     assert keys_in(page).rows() == KEYS.rows()
     times = np.linspace(-0.1, 3.1, 161)
     for name, easing, eased in (

@@ -23,7 +23,7 @@ function fillInformation(place, facts) {
     const rows = [
       ["mesh", `${animation.vertices} vertices, ${animation.triangles} triangles`],
       ["length", `${facts.frames} frames, ${facts.frameRate} a second`],
-      ...Object.entries(animation.metadata).filter(([name]) => name !== "direction" || !animation.direction),
+      ...Object.entries(animation.metadata).filter(([name]) => (name !== "direction" || !animation.direction) && (name !== "phonemes" || !facts.sounds.length)),
     ];
     place.append(make("h3", "", animation.name), describe(rows));
   }

@@ -43,6 +43,11 @@ class Player {
     this.plots = lines.length ? [new Curve(find("curve"), find("cursor"), lines, facts, toFrame, this.view)] : [];
     find("voice").hidden = !wav;
     if (wav) this.plots.push(new Waveform(find("waveform"), find("voice-cursor"), facts, this.wav, toFrame, this.view));
+    if (facts.sounds.length) {
+      find("sounds-place").hidden = find("voice").hidden = false;
+      find("waveform").parentElement.hidden = !wav;
+      this.plots.push(new Sounds(find("sounds"), find("sounds-cursor"), facts, toFrame, this.view));
+    }
     this.editor = new Editor(this);
     this.takes = new Takes(this);
     this.plots.push(this.editor);

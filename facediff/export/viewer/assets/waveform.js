@@ -62,3 +62,42 @@ class Waveform extends Plot {
     this.point(this.shown ?? 0);
   }
 }
+
+/** Words and phonemes under the waveform: those whose text has room. */
+class Sounds extends Plot {
+  constructor(canvas, cursor, facts, onSeek, view) {
+    super(canvas, cursor, facts, onSeek, view);
+    this.words = [];
+    for (const [start, end, , word] of facts.sounds) {
+      const last = this.words.at(-1);
+      if (!word) continue;
+      // Phonemes of a word follow each other; the same word twice begins again after a pause.
+      if (last && last[2] === word && Math.abs(start - last[1]) < 0.02) last[1] = end;
+      else this.words.push([start, end, word]);
+    }
+    canvas.setAttribute("aria-label", this.words.map(([, , word]) => word).join(" ") || "Phonemes of the speech");
+  }
+
+  draw() {
+    const pen = this.pen(), { view } = this;
+    const { high, colour } = pen, sounds = this.facts.sounds.map(([start, end, ipa]) => [start, end, ipa]);
+    const rows = this.words.length ? [this.words, sounds] : [sounds];
+    pen.textBaseline = "middle";
+    pen.save();
+    this.clip(pen);
+    rows.forEach((row, number) => {
+      const middle = ((number + 0.5) / rows.length) * high;
+      for (const [start, end, text] of row) {
+        if (!text || end < view.from || start > view.to) continue;
+        const left = this.x(start), right = this.x(end);
+        pen.fillStyle = colour("--line");
+        pen.fillRect(left, middle - high / rows.length / 2 + 1, 1, high / rows.length - 2);
+        pen.fillStyle = colour(number || rows.length === 1 ? "--quiet" : "--ink");
+        pen.textAlign = "center";
+        if (pen.measureText(text).width < right - left - 1) pen.fillText(text, (left + right) / 2, middle);
+      }
+    });
+    pen.restore();
+    this.point(this.shown ?? 0);
+  }
+}
