@@ -27,7 +27,7 @@ from facediff.metrics import (
 )
 from facediff.metrics.mouth import opening
 from facediff.speech.phonemes import TimedPhoneme, closures
-from facediff.synthetic.spoken_set import LANGUAGES, ClipMotion, OpenFace, SpokenClip, open_face, reference
+from facediff.synthetic.spoken_set import LANGUAGES, OpenFace, SpokenClip, SpokenMotion, open_face, reference
 from facediff.utils.lags import correlations, peak
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +37,7 @@ Ideal = Literal["higher", "lower", "zero", "one"]
 
 
 @dataclass(frozen=True)
-class Score:
+class RefereeScore:
     """A column.
 
     Attributes:
@@ -69,16 +69,22 @@ FURTHEST, OVERLAP = 0.4, 1.0
 """Seconds of delay that are looked at, either way, and seconds that must overlap."""
 
 SCORES = {
-    "closures": Score("closures", "higher", 2, "share of p, b and m in which the lips meet in at least one frame"),
-    "gap": Score("gap, mm", "lower", 2, "opening of the lips in p, b and m at its smallest, beyond that at rest; mean"),
-    "correlation": Score("opening", "higher", 2, "correlation of the mouth's opening with the reference's"),
-    "lag": Score("lag, ms", "zero", 0, "how late the opening is, by cross-correlation; negative is early"),
-    "lips": Score("lips", "one", 2, "how much the lips move, as a share of the reference (standard deviation)"),
-    "jitter": Score("jitter", "one", 2, "second over first differences of the lips in time, over the reference's"),
-    "step": Score("step", "one", 2, "how far the lips go from frame to frame, over the reference's"),
-    "upper_face": Score("brows, lids", "one", 2, "how much the upper face moves, as a share of the reference"),
-    "blinks": Score("blinks/min", None, 0, "blinks a minute"),
-    "head": Score("head, °", None, 1, "root mean square of the head's turn about its mean"),
+    "closures": RefereeScore(
+        "closures", "higher", 2, "share of p, b and m in which the lips meet in at least one frame"
+    ),
+    "gap": RefereeScore(
+        "gap, mm", "lower", 2, "opening of the lips in p, b and m at its smallest, beyond that at rest; mean"
+    ),
+    "correlation": RefereeScore("opening", "higher", 2, "correlation of the mouth's opening with the reference's"),
+    "lag": RefereeScore("lag, ms", "zero", 0, "how late the opening is, by cross-correlation; negative is early"),
+    "lips": RefereeScore("lips", "one", 2, "how much the lips move, as a share of the reference (standard deviation)"),
+    "jitter": RefereeScore(
+        "jitter", "one", 2, "second over first differences of the lips in time, over the reference's"
+    ),
+    "step": RefereeScore("step", "one", 2, "how far the lips go from frame to frame, over the reference's"),
+    "upper_face": RefereeScore("brows, lids", "one", 2, "how much the upper face moves, as a share of the reference"),
+    "blinks": RefereeScore("blinks/min", None, 0, "blinks a minute"),
+    "head": RefereeScore("head, °", None, 1, "root mean square of the head's turn about its mean"),
 }
 
 
@@ -119,7 +125,7 @@ class Tally:
         self._lags: list[Array] = []
         self._turns: list[Array] = []
 
-    def add(self, clip: SpokenClip, motion: ClipMotion, truth: ClipMotion) -> None:
+    def add(self, clip: SpokenClip, motion: SpokenMotion, truth: SpokenMotion) -> None:
         """Score one clip."""
         frames = min(len(motion.points), len(truth.points))
         points, true = motion.points[:frames], truth.points[:frames]
@@ -193,11 +199,11 @@ CLOSES, FOLLOWS, LIVELY, SHIVERS = 0.5, 0.1, 2.0, 1.6
 """Closures and correlation below which, and motion and jitter of the lips above which, a model has the fault already: a
 mouth that does not follow its speech loses nothing by another sentence."""
 
-Fault = Callable[[ClipMotion, ClipMotion, float, OpenFace], Array]
+Fault = Callable[[SpokenMotion, SpokenMotion, float, OpenFace], Array]
 """Spoils the points of a clip; it is handed the clip, another sentence, the frame rate and the face."""
 
 
-def delayed(motion: ClipMotion, _other: ClipMotion, frame_rate: float, _face: OpenFace) -> Array:
+def delayed(motion: SpokenMotion, _other: SpokenMotion, frame_rate: float, _face: OpenFace) -> Array:
     """Everything comes later."""
     times = np.maximum(np.arange(len(motion.points)) - DELAY * frame_rate, 0)
     before = times.astype(np.int64)
@@ -205,7 +211,7 @@ def delayed(motion: ClipMotion, _other: ClipMotion, frame_rate: float, _face: Op
     return np.asarray((1 - share) * motion.points[before] + share * motion.points[after])
 
 
-def muted(motion: ClipMotion, _other: ClipMotion, _frame_rate: float, face: OpenFace) -> Array:
+def muted(motion: SpokenMotion, _other: SpokenMotion, _frame_rate: float, face: OpenFace) -> Array:
     """Lips stay nearly as they are at rest; of channels, all of them do."""
     points = motion.points.copy()
     if points.shape[1:] != face.rest.shape:
@@ -215,13 +221,13 @@ def muted(motion: ClipMotion, _other: ClipMotion, _frame_rate: float, face: Open
     return points
 
 
-def trembling(motion: ClipMotion, _other: ClipMotion, _frame_rate: float, _face: OpenFace) -> Array:
+def trembling(motion: SpokenMotion, _other: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
     """The face shakes from frame to frame, the more a place moves."""
     noise = np.random.default_rng(len(motion.points)).normal(size=(len(motion.points), 1, 1))
     return np.asarray(motion.points + JITTER * noise * motion.points.std(axis=0))
 
 
-def wrong_sentence(motion: ClipMotion, other: ClipMotion, _frame_rate: float, _face: OpenFace) -> Array:
+def wrong_sentence(motion: SpokenMotion, other: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
     """Motion for what another sentence says; its last frame is held if it is shorter."""
     return np.asarray(other.points[np.minimum(np.arange(len(motion.points)), len(other.points) - 1)])
 
@@ -251,7 +257,7 @@ FAULTS = {
 
 
 @dataclass(frozen=True)
-class Seen:
+class FaultVerdict:
     """Whether a score sees a fault: its values of the sound model and of the spoilt one."""
 
     fault: str
@@ -291,10 +297,10 @@ class Judgement:
     openings: Array | None = None
     problem: str = ""
 
-    def seen(self) -> list[Seen]:
+    def seen(self) -> list[FaultVerdict]:
         """What each score that is for a fault says of it, where it says anything."""
         return [
-            Seen(fault, score, self.scores[score], values[score])
+            FaultVerdict(fault, score, self.scores[score], values[score])
             for fault, values in self.faults.items()
             for score in FAULTS[fault].seen_by
             if score in self.scores and score in values and not self.lacks(score)
@@ -314,7 +320,7 @@ class Judgement:
 
 
 def judge(
-    clips: Sequence[SpokenClip], motions: Mapping[str, ClipMotion], frame_rate: float, jaw: int | None
+    clips: Sequence[SpokenClip], motions: Mapping[str, SpokenMotion], frame_rate: float, jaw: int | None
 ) -> tuple[dict[str, float], dict[str, dict[str, float]], Array]:
     """The scores of a model, those of its planted faults, and the mouth's opening in the first clip.
 
@@ -336,7 +342,7 @@ def judge(
         for clip in clips:
             motion = motions[clip.name]
             points = fault.spoil(motion, motions[another(clip, clips).name], frame_rate, open_face())
-            spoilt.add(clip, ClipMotion(points, motion.head), truths[clip.name])
+            spoilt.add(clip, SpokenMotion(points, motion.head), truths[clip.name])
         faults[name] = spoilt.scores()
     return sound.scores(), faults, sound.opening(motions[clips[0].name].points)
 

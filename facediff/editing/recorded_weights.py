@@ -9,7 +9,7 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.editing.procedural import move_head
 from facediff.errors import FaceDiffError
-from facediff.spaces.decoding import Decoder
+from facediff.spaces.decoding import ChannelDecoder
 from facediff.spaces.files import even, read_parameters
 
 SUFFIXES = (".csv", ".json")
@@ -32,7 +32,7 @@ def read_weights(path: Path) -> Animation:
     nothing = np.zeros(rig.neutral.shape)
     names = [space.channels[channel] for channel in space.face]
     deltas = np.stack([rig.deltas[column[name]] if name in column else nothing for name in names])
-    decoder = Decoder(space, np.zeros(len(space.channels)), rig.neutral, deltas)
+    decoder = ChannelDecoder(space, np.zeros(len(space.channels)), rig.neutral, deltas)
     points = np.asarray(clip.values, np.float32)[..., None]
     animation = Animation(
         path.stem,

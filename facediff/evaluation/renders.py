@@ -56,7 +56,7 @@ class RenderMetric:
 
 
 @dataclass(frozen=True)
-class Graph:
+class RenderGraph:
     """A graph of ONNX, opened once it has been read."""
 
     path: Path
@@ -104,7 +104,7 @@ class OnnxScores(RenderMetric):
     """
 
     def __init__(self, *, graph: str = "", part: str = "face") -> None:
-        self.graph = Graph(Path(graph))
+        self.graph = RenderGraph(Path(graph))
         self.part = _part(part)
         shape = self.graph.inputs.get("frames", [])
         if len(shape) != 5 or shape[4] != 3 or not self.graph.inputs.keys() <= {"frames", "speech"}:
@@ -152,7 +152,7 @@ class SyncScores(RenderMetric):
     def __init__(self, *, video: str = "", audio: str = "", order: str = "bgr", reach: int = 15) -> None:
         if order not in ("bgr", "rgb") or reach < 1:
             raise FaceDiffError(f"sync: order is {order!r} and reach {reach}; expected bgr or rgb, and 1 or more")
-        self.video, self.audio = Graph(Path(video)), Graph(Path(audio))
+        self.video, self.audio = RenderGraph(Path(video)), RenderGraph(Path(audio))
         self.order, self.reach = order, reach
         ends = [list(graph.inputs.items()) for graph in (self.video, self.audio)]
         shapes = [end[0][1] if len(end) == 1 else [] for end in ends]
@@ -200,7 +200,7 @@ class SyncScores(RenderMetric):
             "offset": float(offsets[least]),
         }
 
-    def _embeddings(self, graph: Graph, which: int, windows: Array) -> Array:
+    def _embeddings(self, graph: RenderGraph, which: int, windows: Array) -> Array:
         """Embeddings (N, D), a few windows at a time, or one where the graph takes no more."""
         batch = graph.inputs[self.names[which]][0]
         step = batch if isinstance(batch, int) else 32

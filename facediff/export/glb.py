@@ -17,7 +17,7 @@ from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
 from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
-from facediff.mesh.obj_surface import Surface
+from facediff.mesh.obj_surface import ObjSurface
 from facediff.registry import export_format
 from facediff.render.rasteriser import to_linear
 
@@ -196,7 +196,7 @@ def make_document(
     rest: Array,
     morphs: Morphs,
     extras: dict[str, object],
-    surface: Surface | None = None,
+    surface: ObjSurface | None = None,
 ) -> GlbWriter:
     """The glTF document of one animated mesh at rest (V, 3), with its arrays."""
     document = GlbWriter({"asset": {"version": "2.0", "generator": "facediff"}})
@@ -276,7 +276,7 @@ def make_document(
     return document
 
 
-def add_materials(document: GlbWriter, surface: Surface) -> None:
+def add_materials(document: GlbWriter, surface: ObjSurface) -> None:
     """Give a document the materials of an .obj, with its pictures in the file."""
     images: dict[Path, int] = {}
     content, materials = document.content, []

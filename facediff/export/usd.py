@@ -21,7 +21,7 @@ from facediff.export.format import (
     pictures_of,
     surface_of,
 )
-from facediff.mesh.obj_surface import Surface
+from facediff.mesh.obj_surface import ObjSurface
 from facediff.registry import export_format
 from facediff.render.rasteriser import to_linear
 
@@ -115,7 +115,7 @@ def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> 
     return mesh
 
 
-def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surface: Surface, file: Path) -> None:  # noqa: ANN401
+def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surface: ObjSurface, file: Path) -> None:  # noqa: ANN401
     """Texture coordinates of the corners, and the materials of an .obj; pictures are written next to the file."""
     from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
 

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from facediff.spaces.decoding import Decoder
+from facediff.spaces.decoding import ChannelDecoder
 from facediff.speech.voice_activity import USUAL_GATE, EnergyGate
 from facediff.utils import SAMPLE_RATE
 
@@ -55,7 +55,7 @@ class LiveModel:
     look_ahead: float
     hop: float
     colours: npt.NDArray[np.uint8] | None = None
-    decoder: Decoder | None = None
+    decoder: ChannelDecoder | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     @property

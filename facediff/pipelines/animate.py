@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from facediff.editing.controlled import ControlledFace
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
-    from facediff.spaces.decoding import Decoder
+    from facediff.spaces.decoding import ChannelDecoder
     from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.stream import AnimationStream, VertexGenerator
     from facediff.speech.voice_activity import MouthAtRest
@@ -129,7 +129,7 @@ class AnimationPipeline(ABC):
         samples: bool,
         usual_gate: str,
         rest_weights: Callable[[], Array],
-        decoder: Decoder | None = None,
+        decoder: ChannelDecoder | None = None,
     ) -> None:
         import numpy as np
 

@@ -29,7 +29,7 @@ from facediff.spaces.files import even, read_parameters
 from facediff.spaces.rigs import decode_flame
 from facediff.spaces.rotations import convert
 from facediff.synthetic.known_faces import edition_of_mesh
-from facediff.synthetic.spoken_set import SPEAKER, ClipMotion, OpenFace, SpokenClip, open_face
+from facediff.synthetic.spoken_set import SPEAKER, OpenFace, SpokenClip, SpokenMotion, open_face
 from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class CandidateMotion:
     """
 
     candidate: Candidate
-    clips: Mapping[str, ClipMotion]
+    clips: Mapping[str, SpokenMotion]
     frame_rate: float
     jaw: int | None
     way: str
@@ -113,13 +113,13 @@ class Placement:
     jaw: int | None = None
     _correspondence: Correspondence | None = field(default=None, repr=False)
 
-    def values(self, values: npt.NDArray[np.floating], space: Space) -> ClipMotion:
+    def values(self, values: npt.NDArray[np.floating], space: Space) -> SpokenMotion:
         """Motion of channels (T, C)."""
         turn = next((turn for turn in space.rotations if turn.joint == "head"), None)
         head = None if turn is None else convert(values[:, list(turn.channels)], turn.form, "axis_angle")
         if space.kind == "arkit":
             self.way = "ARKit's shapes of the open face"
-            return ClipMotion(self._decoded(values, space), head)
+            return SpokenMotion(self._decoded(values, space), head)
         if space.kind == "flame" and self.flame is not None:
             still = values.copy()
             still[:, list(space.head)] = space_at_rest(space)[list(space.head)]
@@ -127,7 +127,7 @@ class Placement:
             rest = np.asarray(self.flame.template, np.float32)
             animation = Animation("FLAME", vertices, rest, 25.0, faces=np.asarray(self.flame.faces, np.int32))
             self.way = "FLAME's vertices, carried over"
-            return ClipMotion(self._carried(animation), head)
+            return SpokenMotion(self._carried(animation), head)
         jaw = next((turn for turn in space.rotations if turn.joint == "jaw"), None)
         if jaw is None:
             raise FaceDiffError(
@@ -136,9 +136,9 @@ class Placement:
         self.jaw = space.face.index(jaw.start)
         missing = "no FLAME model was given (--flame)" if space.kind == "flame" else "nothing says what they move"
         self.way = f"channels alone, since {missing}: the mouth's opening is the jaw's turn, and lips are not seen"
-        return ClipMotion(values[:, list(space.face), None].astype(np.float64), head)
+        return SpokenMotion(values[:, list(space.face), None].astype(np.float64), head)
 
-    def animation(self, animation: Animation) -> ClipMotion:
+    def animation(self, animation: Animation) -> SpokenMotion:
         """Motion of an animation."""
         head = None if animation.head is None else animation.head[:, :3]
         kind = animation.space.kind
@@ -155,7 +155,7 @@ class Placement:
             self.way = "the same topology"
             metres, points = metres_per_unit(still.unit), self.face.points
             moved = np.asarray(still.vertices[:, points], np.float64) - still.template[points]
-            return ClipMotion(self.face.rest + moved * metres, head)
+            return SpokenMotion(self.face.rest + moved * metres, head)
         try:
             carried = self._carried(still)
         except FaceDiffError:
@@ -164,7 +164,7 @@ class Placement:
             # A mesh that is no face, such as that of a checkpoint without FLAME's: its channels are still something.
             return self.values(animation.values, animation.space)
         self.way = f"{len(still.template)} vertices, carried over"
-        return ClipMotion(carried, head)
+        return SpokenMotion(carried, head)
 
     def _decoded(self, values: npt.NDArray[np.floating], space: Space) -> Array:
         """Weights of ARKit's shapes on the face; those that a space lacks are 0."""
@@ -224,7 +224,7 @@ def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Place
     options: RecordingKeywords = {} if identity is None else {"identity": identity}
     if candidate.style is not None:
         options["style"] = candidate.style
-    motions: dict[str, ClipMotion] = {}
+    motions: dict[str, SpokenMotion] = {}
     # The first call loads what is loaded late, so it is not counted.
     animator.animate(clips[0].samples, SAMPLE_RATE, name="first", **options)
     taken = 0.0
@@ -252,7 +252,7 @@ def _read(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placemen
 
     if candidate.motion is None or not candidate.motion.is_dir():
         raise FaceDiffError(f"{candidate.motion}: no such folder; expected motion that is called as the clips are")
-    motions: dict[str, ClipMotion] = {}
+    motions: dict[str, SpokenMotion] = {}
     frame_rate = None
     for clip in clips:
         files = [candidate.motion / f"{clip.name}{suffix}" for suffix in MOTION_SUFFIXES]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from facediff.models.base import AnimationModel
     from facediff.models.graphs import Graph, Graphs
     from facediff.models.inference import Style
-    from facediff.spaces.decoding import Decoder
+    from facediff.spaces.decoding import ChannelDecoder
     from facediff.speech.frame_clock import FrameClock
 
 Precision = Literal["float32", "float16", "int8"]
@@ -335,7 +335,7 @@ def channel_arrays(assets: Assets, faces: list[str]) -> dict[str, npt.NDArray[An
     from facediff.pipelines.trained import decoder_of, with_rig
 
     rigged = with_rig(assets)
-    decoders = [cast("Decoder", decoder_of(rigged, name)) for name in faces]
+    decoders = [cast("ChannelDecoder", decoder_of(rigged, name)) for name in faces]
     # Most corpora have one rig for all of their speakers.
     keys = [digest(decoder.deltas) for decoder in decoders]
     rigs = dict(zip(keys, (decoder.deltas for decoder in decoders), strict=True))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from facediff.models import AnimationModel, Style
     from facediff.pipelines.animate import Array
     from facediff.pipelines.directing import DirectedStream
-    from facediff.spaces.decoding import Decoder
+    from facediff.spaces.decoding import ChannelDecoder
 
 
 class TrainedPipeline(AnimationPipeline):
@@ -247,7 +247,7 @@ def with_rig(assets: Assets) -> Assets:
     return replace(assets, rig=Rig.of(LinearRig(names, places, moves, None, "m", WITHOUT_FACE), assets))
 
 
-def decoder_of(assets: Assets, identity: str) -> Decoder | None:
+def decoder_of(assets: Assets, identity: str) -> ChannelDecoder | None:
     """What turns a corpus's channels into the vertices of one of its speakers; None for a corpus of vertices.
 
     Raises:
@@ -255,11 +255,11 @@ def decoder_of(assets: Assets, identity: str) -> Decoder | None:
     """
     if assets.space.is_vertices:
         return None
-    from facediff.spaces.decoding import Decoder
+    from facediff.spaces.decoding import ChannelDecoder
 
     mesh, rig = assets.mesh, assets.rig
     assert rig is not None  # noqa: S101 - or assets.mesh would have raised
-    return Decoder(
+    return ChannelDecoder(
         assets.space,
         assets.template(identity).numpy()[:, 0],
         mesh.template(identity).numpy(),

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.runtime.graph_check import REMEDY, check_graph
 from facediff.spaces import VERTICES, Space
-from facediff.spaces.decoding import Decoder
+from facediff.spaces.decoding import ChannelDecoder
 from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.speech.windows import WindowPlan
@@ -417,14 +417,14 @@ def packed_deltas(rigs: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.int16]
     return np.rint(rigs / scales[..., None, None]).astype(np.int16), scales
 
 
-def decoder_of(description: Description, arrays: Arrays, face: int) -> Decoder | None:
+def decoder_of(description: Description, arrays: Arrays, face: int) -> ChannelDecoder | None:
     """What turns a folder's channels into the vertices of one of its faces; None for vertices."""
     if description.motion_space.is_vertices:
         return None
     rig = int(arrays["rigs"][face])
     deltas = arrays["deltas"][rig] * arrays["delta_scales"][rig, :, None, None]
     template = arrays["templates"][face].astype(np.float32)
-    return Decoder(description.motion_space, arrays["resting"][face], template, deltas.astype(np.float32))
+    return ChannelDecoder(description.motion_space, arrays["resting"][face], template, deltas.astype(np.float32))
 
 
 def copy_exported(source: Path, folder: Path) -> int:

@@ -27,7 +27,7 @@ from facediff.version import __version__
 if TYPE_CHECKING:
     import onnxruntime  # type: ignore[import-untyped]
 
-    from facediff.spaces.decoding import Decoder
+    from facediff.spaces.decoding import ChannelDecoder
 
 Array = npt.NDArray[np.float32]
 
@@ -102,7 +102,7 @@ class RuntimeModel(ExportedGraphs):
         face, conditions = self._face(RuntimeChoices(**choices))
         return RuntimeStream(self, face, conditions, plan or self.windows)
 
-    def decoder(self, face: int) -> Decoder | None:
+    def decoder(self, face: int) -> ChannelDecoder | None:
         """What turns channels into the vertices of a face, by its place; None for a model of vertices."""
         return decoder_of(self.description, self.arrays, face)
 

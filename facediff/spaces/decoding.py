@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Decoder:
+class ChannelDecoder:
     """What turns absolute channels of a speaker into vertices, and what else is known of them.
 
     Attributes:
@@ -30,7 +30,7 @@ class Decoder:
 
     Example:
         >>> space = Space("linear", ("jawOpen",))
-        >>> decoder = Decoder(space, np.zeros(1), np.zeros((2, 3)), np.ones((1, 2, 3)))
+        >>> decoder = ChannelDecoder(space, np.zeros(1), np.zeros((2, 3)), np.ones((1, 2, 3)))
         >>> decoder.vertices(np.full((1, 1, 1), 0.5)).tolist()
         [[[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]]
     """

@@ -191,7 +191,7 @@ class OpenFace:
 
 
 @dataclass(frozen=True, eq=False)
-class ClipMotion:
+class SpokenMotion:
     """What somebody makes of a clip.
 
     Attributes:
@@ -213,11 +213,11 @@ def open_face() -> OpenFace:
     return OpenFace(built_in_rig(SPEAKER), points, *own)
 
 
-def reference(clip: SpokenClip, frame_rate: float) -> ClipMotion:
+def reference(clip: SpokenClip, frame_rate: float) -> SpokenMotion:
     """How the built-in corpus performs a clip."""
     number = int(clip.name.rpartition("_")[2]) - 1
     spoken = Utterance(clip.samples, clip.phonemes)
     performed, _ = perform_clip(_performed(clip.text, number, clip.voice), spoken, 0, frame_rate)
     rig = rig_of(SPEAKER)[:, open_face().points].astype(np.float64)
     # Turns of a few degrees about three axes are nearly the axis-angle of all of them.
-    return ClipMotion(rig[0] + np.tensordot(performed.weights, rig[1:], 1), np.deg2rad(performed.head))
+    return SpokenMotion(rig[0] + np.tensordot(performed.weights, rig[1:], 1), np.deg2rad(performed.head))

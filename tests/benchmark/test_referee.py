@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from facediff.benchmark.referee import FAULTS, SCORES, Judgement, Score, Tally, judge
+from facediff.benchmark.referee import FAULTS, SCORES, Judgement, RefereeScore, Tally, judge
 from facediff.pipelines.candidates import Candidate, CandidateMotion, perform
-from facediff.synthetic.spoken_set import ClipMotion, SpokenClip, open_face, reference, spoken_set
+from facediff.synthetic.spoken_set import SpokenClip, SpokenMotion, open_face, reference, spoken_set
 from facediff.utils.hub import BUNDLED
 
 
@@ -48,7 +48,7 @@ def test_the_reference_scores_as_itself() -> None:
 def test_a_known_delay_gap_and_turn_are_measured() -> None:
     clip, face = clips()[0], open_face()
     truth = reference(clip, 50.0)
-    late = ClipMotion(np.concatenate([truth.points[:1]] * 3 + [truth.points[:-3]]), None)
+    late = SpokenMotion(np.concatenate([truth.points[:1]] * 3 + [truth.points[:-3]]), None)
     tally = Tally(50.0)
     tally.add(clip, late, truth)
     assert tally.scores()["lag"] == pytest.approx(60.0, abs=2)
@@ -57,7 +57,7 @@ def test_a_known_delay_gap_and_turn_are_measured() -> None:
     turns = np.zeros((len(points), 3))
     turns[::2, 1] = np.deg2rad(4)
     open_mouth = Tally(50.0)
-    open_mouth.add(clip, ClipMotion(points, turns), truth)
+    open_mouth.add(clip, SpokenMotion(points, turns), truth)
     scores = open_mouth.scores()
     assert scores["gap"] == pytest.approx(3.0, abs=0.5)
     assert scores["closures"] == 0
@@ -72,7 +72,7 @@ def test_channels_are_scored_by_their_jaw() -> None:
         truth = reference(clip, 25.0)
         gap = truth.points[:, face.lip_pairs[:, 0]] - truth.points[:, face.lip_pairs[:, 1]]
         jaw = np.linalg.norm(gap, axis=-1).mean(1)
-        motions[clip.name] = ClipMotion(np.stack([0 * jaw, 30 * jaw], 1)[..., None])
+        motions[clip.name] = SpokenMotion(np.stack([0 * jaw, 30 * jaw], 1)[..., None])
     scores, faults, openings = judge(clips(), motions, 25.0, 1)
     assert scores["correlation"] == pytest.approx(1)
     assert "closures" not in scores
@@ -92,4 +92,4 @@ def test_scores_know_which_way_is_better() -> None:
     assert lag.badness(-80) > lag.badness(20)
     assert lips.badness(0.5) == pytest.approx(lips.badness(2.0))
     assert SCORES["closures"].badness(0.9) < SCORES["closures"].badness(0.5)
-    assert Score("x", "one", 1, "").badness(0.0) == float("inf")
+    assert RefereeScore("x", "one", 1, "").badness(0.0) == float("inf")

@@ -18,7 +18,7 @@ from facediff.live.model import LiveModel, usual_gate
 from facediff.live.options import LiveOptions
 from facediff.registry import Kind
 from facediff.spaces import Rotation, Space
-from facediff.spaces.decoding import Decoder
+from facediff.spaces.decoding import ChannelDecoder
 from facediff.speech.voice_activity import EnergyGate, Openness, read_gate
 from tests.fakes.live import FakeSound, Kept, device, fake_model
 
@@ -127,7 +127,7 @@ def test_weights_of_a_model_of_channels_are_sent_as_they_are(speech: Path) -> No
 
     fake = fake_model()
     facts = {"neutral": neutral, "start": lambda: Channels(fake.start(), np.zeros((4, 3), np.float32))}
-    model = LiveModel(**{**vars(fake), **facts, "decoder": Decoder(space, np.zeros(4), neutral, deltas)})
+    model = LiveModel(**{**vars(fake), **facts, "decoder": ChannelDecoder(space, np.zeros(4), neutral, deltas)})
     options = LiveOptions(speech=str(speech), to=["keep:1?weights=true", "keep:2"])
     perform(options, lambda: model, str, weights=True)
     assert MADE[0].performance is not None
