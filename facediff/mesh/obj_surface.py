@@ -37,7 +37,7 @@ class Material:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ObjSurface:
     """What an .obj says of its surface.
 
     Attributes:
@@ -68,7 +68,7 @@ def has_uvs(path: Path) -> bool:
         return any(line.startswith(b"vt ") for line in stream)
 
 
-def read_surface(path: Path, n_triangles: int) -> Surface:
+def read_surface(path: Path, n_triangles: int) -> ObjSurface:
     """Texture coordinates and materials of an .obj.
 
     Args:
@@ -119,7 +119,7 @@ def read_surface(path: Path, n_triangles: int) -> Surface:
     used = np.unique(np.array(of_face))
     every = list(names)
     materials = tuple(library.get(every[number], Material(every[number] or "surface")) for number in used)
-    return Surface(coordinates, table, materials, np.searchsorted(used, of_face), tuple(lost))
+    return ObjSurface(coordinates, table, materials, np.searchsorted(used, of_face), tuple(lost))
 
 
 def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, Material]:

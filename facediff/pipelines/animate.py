@@ -274,10 +274,12 @@ class AnimationPipeline(ABC):
     @cached_property
     def _target_beyond_surface(self) -> tuple[bool, bool]:
         """Whether the target mesh is a .glb that wears more than its surface, or an .obj with texture coordinates."""
+        if self.options.target_mesh is None:
+            return False, False
         from facediff.mesh.glb import wears_more
         from facediff.mesh.obj_surface import has_uvs
 
-        target = Path(self.options.target_mesh or "")
+        target = Path(self.options.target_mesh)
         return wears_more(target), has_uvs(target)
 
     @contextmanager
