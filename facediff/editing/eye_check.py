@@ -98,6 +98,7 @@ def check_eyes(
             gap, hole = _still_seen(whole, posed, target, eye)
             gaps.append(gap)
             holes.append(hole)
+            # Painted lids of the source may not shut either: what is left open there is no fault of the target.
             expected.append(_still_seen(face, original, source, eye)[0])
             passed.append(_overshoot(new[eye], whole.vertices, posed))
             inside.append(_inside_ball(whole, posed, target, eye))
@@ -214,6 +215,7 @@ def _inside_ball(rest: Surface, posed: Array, features: Features, eye: int) -> f
         return 0.0
     some = np.unique(np.concatenate([opening.upper_seeds, opening.lower_seeds]))
     before, after = (points[some, 2] - ball.at(points[some]) for points in (rest.vertices, posed))
+    # A vertex that is not in front of the ball at rest is judged as if it lay on its surface there.
     before = np.where(np.isfinite(before), before, 0.0)
     dives = np.isfinite(after) & (after < np.minimum(before, 0.0) - DEEP * opening.width)
     return float(dives.mean())
@@ -263,6 +265,8 @@ def _forehead(
             continue
         now = np.linalg.norm(posed[pairs[some, 0]] - posed[pairs[some, 1]], axis=1)
         change = np.abs(np.log(np.maximum(now, 1e-12) / long[some]))
+        # An edge that halves counts as one that doubles. One of 200 may do what it likes: scans have slivers whose
+        # length is noise.
         stretch = max(stretch, float(np.expm1(np.quantile(change, 0.995))))
         turned |= (_face_normals(posed, faces) * normals).sum(axis=1) < 0
         moving |= moves[faces].any(axis=1)

@@ -126,6 +126,7 @@ class RegularisedSolver:
         weights = np.zeros((len(vertices), len(self._factor)))
         last = np.zeros(len(self._used))
         towards = self._scale * self.options.temporal * (TEMPORAL if self.options.temporal_term == "corrected" else 1.0)
+        # Frames are solved for one after the other, since the temporal term asks for the weights of the frame before.
         for frame, pose in enumerate(vertices):
             moved = (pose.astype(np.float64) - self.neutral)[self._rows].ravel()
             last = self._frame(self._shapes @ moved + towards * last, last)
@@ -137,6 +138,8 @@ class RegularisedSolver:
         weights = least_squares(self._matrix, right, lower, upper, last)
         if not self._cancel:
             return weights
+        # Of two shapes that exclude one another the stronger is kept, and all others are solved for again without the
+        # weaker one, whose share they then take over. Its bound is not quite 0, which the published solver needs.
         for i, j in self._cancel:
             upper[j if weights[i] >= weights[j] else i] = EXCLUDED
         return least_squares(self._matrix, right, lower, upper, weights)

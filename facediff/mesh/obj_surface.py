@@ -94,6 +94,7 @@ def read_surface(path: Path, n_triangles: int) -> ObjSurface:
             elif word == "f":
                 listed = [corner.split("/") for corner in rest.split()]
                 numbers = [int(corner[1]) if len(corner) > 1 and corner[1] else 0 for corner in listed]
+                # Numbers count from 1, or backwards from the coordinates read so far if they are negative; 0 is none.
                 places = [number - 1 if number > 0 else len(uvs) + number if number else -1 for number in numbers]
                 # Polygons become fans, as in the mesh itself.
                 corners += [(places[0], b, c) for b, c in zip(places[1:-1], places[2:], strict=True)]
@@ -163,6 +164,7 @@ def _beside(path: Path, name: str) -> Path | None:
     folder = path.resolve().parent
     relative = PurePosixPath(name.replace("\\", "/"))
     for candidate in (relative, PurePosixPath(relative.name)):
+        # Resolved first, so that neither `..` nor a link leads out of the folder: files from elsewhere name anything.
         file = (folder / candidate).resolve()
         if file.is_relative_to(folder) and file.is_file():
             return file

@@ -24,6 +24,7 @@ from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_STEPS
 
 # The model is there already, where an animation is asked for.
 OF_THE_MODEL = {"checkpoint", "quiet", "device", "commercial_only", "threads"}
+OF_A_FILE = {"own_shapes"}  # `Animation.drive` writes it
 
 
 def plain(hint: object) -> object:
@@ -34,7 +35,7 @@ def plain(hint: object) -> object:
 @pytest.mark.parametrize(
     ("options", "keywords", "without"),
     [
-        (AnimationOptions, AnimateKeywords, OF_THE_MODEL),
+        (AnimationOptions, AnimateKeywords, OF_THE_MODEL | OF_A_FILE),
         (ExportOptions, ExportKeywords, {"footer", "quiet", "speech_file"}),
     ],
 )

@@ -148,7 +148,6 @@ def test_a_seed_that_decides_nothing_is_refused(
         (["--seed", "-1"], "--seed -1"),
         (["--seed", "9" * 20], "--seed 999"),
         (["--samples", "0"], "--samples 0"),
-        (["--takes", "2"], "--samples"),
         (["--correspondence", "m.npz"], "give --target-mesh as well"),
         (["--target-mesh", "none.obj"], "no such file"),
         (["--expressiveness", "chin=2"], "chin"),

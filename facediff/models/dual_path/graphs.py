@@ -93,6 +93,8 @@ class StepGraph(nn.Module):
         dynamic = network.heard_style(style, features, mask)
         tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), dynamic], dim=-1))
 
+        # Two windows of long speech are joined within the denoising step, so that both go on from one motion. The graph
+        # hands out what it joined, since the next window's graph runs later and elsewhere.
         def blend(now: Tensor) -> Tensor:
             kept.append(torch.lerp(before, now, share[..., None]))
             return kept[0]
@@ -129,7 +131,9 @@ def graphs_of(model: DualPathModel) -> Graphs:
         model.choose_low_latency()
         quick = model.sampler
     preconditioned = model.motion_space.preconditioning is not None
+    # A folded sampler goes on in the network's width; preconditioning works on components, which are few already.
     folded = model.sampling_space == "folded" and not preconditioned
+    # Example sizes: neither is 1, which the exporter would take for a constant instead of a size that may change.
     batch, frames, width = 2, 50, network.coordinates
     dim = network.embed.out_features
     state = dim if folded else width

@@ -160,11 +160,14 @@ class LamAudio2Expression(DirectModel):
         window = SAMPLE_RATE * CONTEXT_FRAMES // 30
         for start in range(0, len(speech), samples):
             chunk = speech[start : start + samples]
+            # The network always hears a window of one length, as its caller's buffer is: the chunk at its end, and
+            # silence or the speech before it in front. Only the frames of the chunk are kept.
             before = speech.new_zeros(window - len(chunk))
             past = speech[max(0, start - len(before)) : start] if context else speech[:0]
             before[len(before) - len(past) :] = past
             heard = torch.cat([before, chunk])
             count = self.frames_of(len(heard))
+            # Rounded down as the published code does: a chunk of no whole number of frames gives one frame more.
             first = int(CONTEXT_FRAMES - len(chunk) / SAMPLE_RATE * 30)
             window_clip = with_speech(clip, heard, count)
             motion = super().generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
@@ -229,6 +232,7 @@ class LamNetwork(nn.Module):
         mask: Bool[Tensor, "batch frames"] | None,
     ) -> Float[Tensor, "batch frames dim"]:
         """Speech that knows its speaker."""
+        # The authors' map of a one-hot speaker has a bias: it is added to mixtures of speakers as well.
         style = (self.style(weights) + self.style_bias)[:, None].expand(-1, features.shape[1], -1)
         x = self.encoder(torch.cat([self.dropout(self.audio_map(features)), style.to(features)], -1), mask)
         for layer in self.transformer:

@@ -84,7 +84,6 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
         (["--sway", "0"], "--sway 0: "),
         (["--eyes", "none.json"], "eyes none.json: no such file"),
         (["--controls-seed", "-1"], "--controls-seed -1: "),
-        (["--directing-seed", "1"], "--controls-seed"),
     ],
 )
 def test_words_are_checked_before_anything_is_made(words: list[str], sentence: str) -> None:

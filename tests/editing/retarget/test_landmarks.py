@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -284,8 +285,8 @@ def test_six_landmarks_cure_a_mask_that_is_refused_without() -> None:
 
 def test_the_manual_lists_the_names_with_their_vertices() -> None:
     page = (Path(__file__).parents[3] / "docs" / "own_mesh.md").read_text(encoding="utf-8")
-    for name, words in NAMES.items():
-        assert f"| `{name}` | {words} | {puppet_landmarks()[name]} | {FLAME[name]} |" in page
+    rows = dict(re.findall(r"^\| `(\w+)` \| [^|]+ \| (\d+ \| \d+) \|$", page, re.MULTILINE))
+    assert rows == {name: f"{puppet_landmarks()[name]} | {FLAME[name]}" for name in NAMES}
 
 
 @pytest.mark.parametrize("first", ["nan,nan", "inf,inf", "1.5,2.5", "-1,-1", "1e3,1e3"])
