@@ -37,6 +37,8 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
 QUICK = ("slit mask", "few triangles")
 EYES_REST = ("mask", "scan", "painted eyes", "decimated head", "few triangles")
 """Heads whose eyes are one skin, or whose lids have too few triangles to meet without a hole."""
+RAGGED = ("re-meshed head",)
+"""Heads in whose lips no line is found: refused, as the manual says."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FAMILY])
@@ -45,8 +47,8 @@ def test_a_head_from_elsewhere_speaks_or_is_refused(animation: Animation, name: 
     mesh = Mesh(head.vertices, head.faces.astype(np.int32))
     found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
     made, found, report = carry_checked(animation, found, mesh)
-    assert report.good == head.alive, report.faults
-    if not head.alive:
+    assert report.good == (head.alive and name not in RAGGED), report.faults
+    if not report.good:
         return
     assert report.lip_ratio is not None
     assert report.lip_ratio <= 0.2
