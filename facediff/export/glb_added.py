@@ -41,21 +41,36 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
         FaceDiffError: if the file is no readable .glb, or not the mesh of the animation.
     """
     try:
-        glb = open_glb(target)
-        for kind in ("buffers", "bufferViews", "accessors"):
-            glb.entries(kind)  # refuses what is no list, to which the writer could not append
-        writer = GlbWriter(glb.content, glb.binary)
-        parts = list(placed_parts(glb))
-        total = sum(len(part.local) for part in parts)
-        if total != len(animation.template):
-            raise FaceDiffError(
-                f"{target}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
-                f"animation was carried to"
-            )
+        glb, writer = open_to_add(target)
+        parts = parts_of(glb, animation)
         _animate(glb, writer, parts, animation, tolerance_mm / 1000 / metres_per_unit(animation.unit))
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again") from error
     writer.write(path)
+
+
+def open_to_add(target: Path) -> tuple[Glb, GlbWriter]:
+    """A .glb from elsewhere, and a writer that appends to its content; the errors are those of reading it."""
+    glb = open_glb(target)
+    for kind in ("buffers", "bufferViews", "accessors"):
+        glb.entries(kind)  # refuses what is no list, to which the writer could not append
+    return glb, GlbWriter(glb.content, glb.binary)
+
+
+def parts_of(glb: Glb, animation: Animation) -> list[Placed]:
+    """The placed parts of a .glb that an animation was carried to.
+
+    Raises:
+        FaceDiffError: if the animation has another number of vertices.
+    """
+    parts = list(placed_parts(glb))
+    total = sum(len(part.local) for part in parts)
+    if total != len(animation.template):
+        raise FaceDiffError(
+            f"{glb.source}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
+            f"animation was carried to"
+        )
+    return parts
 
 
 def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animation, tolerance: float) -> None:

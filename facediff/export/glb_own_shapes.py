@@ -19,9 +19,10 @@ from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, Weights, arkit_weights, has_arkit_weights, solve
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError
+from facediff.export.glb_added import open_to_add, parts_of
 from facediff.export.glb_writer import GlbWriter
 from facediff.mesh.glb import POSITIONS, Glb, open_glb, whole
-from facediff.mesh.glb_scene import node_matrix, placed_nodes, placed_parts
+from facediff.mesh.glb_scene import node_matrix, placed_nodes
 from facediff.mesh.glb_shapes import target_names
 from facediff.spaces.arkit import ARKIT, arkit_name, plain
 from facediff.spaces.files.tables import gaze
@@ -119,12 +120,9 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
         FaceDiffError: as :func:`own_shapes`, or if the animation is on another mesh.
     """
     try:
-        glb = open_glb(target)
-        for kind in ("buffers", "bufferViews", "accessors"):
-            glb.entries(kind)  # refuses what is no list, to which the writer could not append
+        glb, writer = open_to_add(target)
         own = _own_shapes(glb)
         weights = arkit_weights(animation) if has_arkit_weights(animation) else _solved(glb, own, animation)
-        writer = GlbWriter(glb.content, glb.binary)
         _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise _unreadable(target, error) from error
@@ -226,13 +224,7 @@ def _bones(glb: Glb) -> dict[str, int]:
 
 def _solved(glb: Glb, own: OwnShapes, animation: Animation) -> Weights:
     """Weights of the avatar's own shapes that come nearest to an animation of its mesh."""
-    parts = list(placed_parts(glb))
-    total = sum(len(part.local) for part in parts)
-    if total != len(animation.template):
-        raise FaceDiffError(
-            f"{glb.source}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
-            f"animation was carried to"
-        )
+    parts, total = parts_of(glb, animation), len(animation.template)
     check_array(glb.source, (2, len(own.binds), total, 3), 8)
     deltas, first = np.zeros((len(own.binds), total, 3)), 0
     for part in parts:

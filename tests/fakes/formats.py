@@ -8,15 +8,13 @@ from __future__ import annotations
 import sys
 import tarfile
 import tempfile
-from functools import partial
 from pathlib import Path
 
 import lightning.pytorch as pl
 
-from facediff import registry
 from facediff.cli.app import main
 from facediff.models import DualPathDiffusion
-from tests.fakes.tiny import SEEN, VERTICES, Tiny, write_tiny
+from tests.fakes.tiny import Tiny, tiny_model_options, write_tiny
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,17 +25,7 @@ def write(folder: Path) -> None:
     pl.seed_everything(0)
     with tempfile.TemporaryDirectory() as corpus:
         data = Tiny(root=str(write_tiny(Path(corpus) / "tiny")))
-        model = DualPathDiffusion(
-            n_vertices=VERTICES,
-            identities=SEEN,
-            frame_rate=25.0,
-            dim=8,
-            diffusion_steps=40,
-            audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=8, num_layers=1),
-            style_encoder=partial(registry.style_encoder.tcn_gru_transformer, num_layers=1),
-            decoder=partial(registry.decoder.style_transformer, num_layers=1),
-            sampler=partial(registry.sampler.ddim, steps=3),
-        )
+        model = DualPathDiffusion(**tiny_model_options() | {"dim": 8})
         trainer = pl.Trainer(accelerator="cpu", max_epochs=2, logger=False, enable_checkpointing=False)
         trainer.fit(model, data)
         trainer.save_checkpoint(checkpoint)

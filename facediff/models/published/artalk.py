@@ -22,14 +22,14 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
 from facediff.models.published.clip_style import convert_style
 from facediff.models.published.diffposetalk_checkpoints import count_layers
-from facediff.models.published.parametric import ParametricModel, window_at
+from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
 from facediff.models.published.recognition import (
     AuthorsWeights,
     CheckpointFacts,
@@ -361,7 +361,7 @@ class ARTalk(ParametricModel):
         return motion
 
 
-class ChunkStream(SpeechStream):
+class ChunkStream(PieceStream):
     """Animates speech that arrives in pieces, chunk by chunk: the very frames that the whole recording gives.
 
     A frame is certain four seconds and four frames later at most: a chunk, and half of the longest filter.
@@ -393,11 +393,8 @@ class ChunkStream(SpeechStream):
         Raises:
             FaceDiffError: if the stream was finished.
         """
-        self._refuse_finished()
-        self._wave = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)])
-        while len(self._wave) >= self.model.chunk_samples:
-            self._next(self._wave[: self.model.chunk_samples], self.model.scales[-1])
-            self._wave = self._wave[self.model.chunk_samples :]
+        for chunk in self._pieces(samples, self.model.chunk_samples):
+            self._next(chunk, self.model.scales[-1])
         end = self._first + len(self._raw)
         certain = end - LONGEST_FILTER // 2 if end >= LONGEST_FILTER else 0
         return self._given(certain if self.model.smooth else end)
@@ -416,12 +413,7 @@ class ChunkStream(SpeechStream):
         if left:
             self._next(F.pad(self._wave, (0, self.model.chunk_samples - len(self._wave))), left)
         end = self._first + len(self._raw)
-        total = end if frames is None else frames
-        if not end or total < self.frames:
-            raise FaceDiffError(
-                f"frames: {total} are none, or fewer than the {self.frames} that were given out already"
-            )
-        wanted = total - self.frames
+        wanted = self._left(end, frames)
         motion = self._given(end)[:, :wanted]
         return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
 

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError, OptionError, choices
+from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
@@ -42,7 +42,7 @@ from facediff.models.published.diffposetalk_network import (
     clamped,
     guided,
 )
-from facediff.models.published.parametric import ParametricModel, window_at
+from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
@@ -415,7 +415,7 @@ class DiffPoseTalk(ParametricModel):
         return noisy
 
 
-class WindowStream(SpeechStream):
+class WindowStream(PieceStream):
     """Animates speech that arrives in pieces in the method's own windows, each of which continues the one before it.
 
     A frame is certain a window after its moment at most. Of a recording as a whole the speech network hears all windows
@@ -451,13 +451,10 @@ class WindowStream(SpeechStream):
         Raises:
             FaceDiffError: if the stream was finished.
         """
-        self._refuse_finished()
-        self._wave = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)])
-        size, parts = self.model.window_samples, []
-        while len(self._wave) >= size:
-            parts.append(self._next(self._wave[:size], self.model.window_frames))
-            self._wave = self._wave[size:]
-        return self._counted(parts)
+        model = self.model
+        return self._counted(
+            [self._next(piece, model.window_frames) for piece in self._pieces(samples, model.window_samples)]
+        )
 
     @torch.inference_mode()
     def finish(self, frames: int | None = None) -> Motion:
@@ -470,12 +467,7 @@ class WindowStream(SpeechStream):
         self._refuse_finished()
         self._finished = True
         left = self.model.frames_of(self._sums[0] + len(self._wave)) - self.frames
-        total = self.frames + left if frames is None else frames
-        if self.frames + left < 1 or total < self.frames:
-            raise FaceDiffError(
-                f"frames: {total} are none, or fewer than the {self.frames} that were given out already"
-            )
-        wanted = total - self.frames
+        wanted = self._left(self.frames + left, frames)
         motion = self._counted([self._next(self._wave, left)[:, :wanted]] if left > 0 else [])
         return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
 

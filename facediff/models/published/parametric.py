@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
-from facediff.errors import ArgumentError, OptionError
+from facediff.errors import ArgumentError, FaceDiffError, OptionError
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.inference import Style
+from facediff.models.inference import SpeechStream, Style
 from facediff.models.layers import Heads, Layers, Width
 from facediff.models.person_styles import PersonStyles
 from facediff.models.published.base import NO_STYLE, Alignment, PublishedModel
@@ -173,3 +174,31 @@ def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Te
         for name in ("mean", "std")
     )
     return mean, deviation.clamp_min(1e-9)
+
+
+class PieceStream(SpeechStream):
+    """Animates speech that arrives in a method's own pieces of one length, instead of facediff's windows."""
+
+    _wave: Float[Tensor, " samples"]
+    """Speech that is not animated yet, shorter than a piece; set by the constructors below."""
+
+    def _pieces(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32], size: int) -> Iterator[Tensor]:
+        """The pieces of so many samples that are whole with more speech."""
+        self._refuse_finished()
+        self._wave = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)])
+        while len(self._wave) >= size:
+            piece, self._wave = self._wave[:size], self._wave[size:]
+            yield piece
+
+    def _left(self, end: int, frames: int | None) -> int:
+        """Frames to give out at the end, of all that the speech has or of so many.
+
+        Raises:
+            FaceDiffError: if there are none, or more were given out already.
+        """
+        total = end if frames is None else frames
+        if end < 1 or total < self.frames:
+            raise FaceDiffError(
+                f"frames: {total} are none, or fewer than the {self.frames} that were given out already"
+            )
+        return total - self.frames
