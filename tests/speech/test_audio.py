@@ -15,8 +15,7 @@ import pytest
 import soundfile
 
 from facediff.errors import FaceDiffError
-from facediff.speech.audio import read_speech, read_stretch
-from facediff.speech.cut_short import cut_short
+from facediff.speech.audio import cut_short, read_speech, read_stretch
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.limits import SAMPLE_RATES
 

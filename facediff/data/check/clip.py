@@ -16,8 +16,7 @@ import numpy.typing as npt
 from facediff.data.check.report import Findings, relative
 from facediff.data.storage import open_motion, rig_path
 from facediff.errors import FaceDiffError
-from facediff.speech.audio import open_sound
-from facediff.speech.cut_short import CUT, cut_short
+from facediff.speech.audio import CUT, cut_short, open_sound
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.checksums import sha256
 from facediff.utils.limits import LIMITS

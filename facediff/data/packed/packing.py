@@ -48,8 +48,7 @@ from facediff.data.prepare.runner import refuse_foreign, version
 from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, motion_path, open_motion, refuse_out_of_range
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.spaces.space import metres_per_unit
-from facediff.speech.audio import open_sound
-from facediff.speech.cut_short import refuse_cut_short
+from facediff.speech.audio import open_sound, refuse_cut_short
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import in_order, run_tasks
 from facediff.utils.limits import LIMITS, quoted
