@@ -18,6 +18,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import keyword
+import sys
 import threading
 import types
 import typing
@@ -31,6 +32,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.utils.plain_options import is_path
 from facediff.utils.ranges import mismatch
 
 T = TypeVar("T", bound=type)
@@ -370,6 +372,33 @@ def alias_path(component: type) -> str:
             if component in (entry.implementation, entry.alias):
                 return f"{__name__}.{kind.kind}.{entry.name}"
     return f"{component.__module__}.{component.__qualname__}"
+
+
+def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
+    """The class of an import path, if it is registered or its module is imported already; else None.
+
+    Args:
+        kind: where it may be registered; its entries are imported first, so that a plug-in is found.
+        path: the import path.
+        base: what the class must be a subclass of.
+    """
+    if not isinstance(path, str) or not is_path(path):
+        return None
+    module, _, name = path.rpartition(".")
+    if module == f"facediff.registry.{kind.kind}":
+        return kind.get(name) if name in kind.names() else None
+    kind.load()
+    # The module must be imported already: importing what a file names would run code that the file chose.
+    # Not getattr, which may make a lazily loaded package import the module that the file asks for.
+    place = sys.modules.get(module)
+    implementation = vars(place).get(name) if isinstance(place, types.ModuleType) else None
+    if not isinstance(implementation, type):
+        return None
+    return (
+        implementation
+        if issubclass(implementation, base) or implementation in [entry.implementation for entry in kind]
+        else None
+    )
 
 
 # Constructor arguments are checked where they enter: against their type, and against the range that it states.

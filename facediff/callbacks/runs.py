@@ -18,7 +18,7 @@ from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import LockedError, atomic, locked, sweep
-from facediff.utils.hub import check_model_source, check_training_source, model_path
+from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 STATE_KEY = "facediff_training_state"
 """Where a checkpoint holds what Lightning does not keep."""
@@ -118,7 +118,7 @@ def find_scored(trainer: Trainer, asked: str | None) -> Path | None:
             raise FaceDiffError(f"--ckpt_path {asked}: there is no {path}; expected a .ckpt file of `facediff fit`")
         return path
     check_model_source(asked, "--ckpt_path")
-    return model_path(asked)
+    return local_model(asked)
 
 
 def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:

@@ -25,7 +25,7 @@ from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.registry import defaults, plain
 from facediff.utils.files import config_dir
-from facediff.utils.hub import check_model_source, check_training_source, model_path
+from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
@@ -65,7 +65,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
         check_model_source(checkpoint, "--ckpt_path")
         if name == "fit":
             check_training_source(checkpoint)
-        path = model_path(checkpoint)
+        path = local_model(checkpoint)
         options = change_values(options, lambda flag, value: str(path) if flag == "--ckpt_path" else value)
         options = [*words_of_checkpoint(name, path, options), *options]
     if name == "test":
@@ -187,14 +187,17 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
     from facediff.data import SpeechMotionDataModule
     from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.data.check.layouts import by_name
-    from facediff.models.checkpoint_reading import find_class
     from facediff.utils.plain_options import is_path
 
     named = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")
     if chosen is not None and "." in chosen:
         find_own_module(chosen)
         by_name(chosen, None)
-    elif chosen is None and is_path(named) and find_class(registry.corpus, named, SpeechMotionDataModule) is None:
+    elif (
+        chosen is None
+        and is_path(named)
+        and registry.find_class(registry.corpus, named, SpeechMotionDataModule) is None
+    ):
         raise FaceDiffError(
             f"{path}: was trained on the corpus {named}, which is not known here and was not imported. If it is your "
             f"own, add  {option}{named}  and run the command in the folder of its file; docs/own_data.md says how to "

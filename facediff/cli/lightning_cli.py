@@ -47,8 +47,8 @@ from facediff.utils.limits import brief
 from facediff.utils.progress import on_terminal
 from facediff.utils.ranges import Range, mismatch
 
-LINKS = ("n_vertices", "identities", "frame_rate", "space")
-"""Constructor arguments of a model that the data module knows."""
+LINKS = ("n_vertices", "identities", "frame_rate", "space", "faces")
+"""Constructor arguments of a model that the data module knows; not every model has ``faces``."""
 
 
 def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> FaceDiffCLI:

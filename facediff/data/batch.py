@@ -75,7 +75,9 @@ class Batch:
     """Several clips, padded to the longest.
 
     The fields are those of :class:`Sample` with a batch dimension; a field that only some of the clips have is None.
-    The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of ``audio``.
+    The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of ``audio``. Where several
+    corpora are trained on together, ``face`` names the one of :attr:`SpeechMotionDataModule.further` that all clips are
+    from; it is empty for the data module's own.
     """
 
     audio: Float[Tensor, "batch samples"]
@@ -97,6 +99,7 @@ class Batch:
     style: Float[Tensor, "batch style_dim"] | None = None
     window: Int[Tensor, "batch 2"] | None = None
     partner_frames: Int[Tensor, "batch frames"] | None = None
+    face: str = ""
 
     @property
     def mask(self) -> Bool[Tensor, "batch frames"]:

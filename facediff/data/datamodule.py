@@ -35,13 +35,15 @@ from facediff.data.dataset import (
     ResumableLoader,
 )
 from facediff.data.measuring import measure_components, measure_scale, measure_windows
+from facediff.data.mixing import mixed_loader
 from facediff.data.packed.stores import address_of, is_packed
 from facediff.data.storage import ChannelFolder, ClipStorage
 from facediff.errors import ArgumentError, FaceDiffError, choices
-from facediff.registry import defaults, keeps_arguments, plain
+from facediff.registry import corpus as corpora
+from facediff.registry import defaults, find_class, keeps_arguments, plain
 from facediff.spaces import VERTICES, Space
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
-from facediff.utils.plain_options import read_options
+from facediff.utils.plain_options import is_name, read_options
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
 
@@ -123,6 +125,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             ``regions/eyelid_pairs.txt`` if None.
         face: the same for the face, to which a model can be restricted, e.g. ``FLAME_masks.pkl:face``; the corpus has
             no such region if None.
+        further_corpora: corpora of other faces to train on in addition, for a model of many faces: options of their
+            data modules by a name for the face, with the corpus under ``corpus``, such as ``{mask: {corpus: PuppetMask,
+            batch_size: 8}}``. Each batch is of one corpus, and an epoch has all batches of all of them.
     """
 
     corpus_name: ClassVar[str]
@@ -171,6 +176,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         upper_face: str | None = None,
         eyelid_pairs: str | None = None,
         face: str | None = None,
+        further_corpora: dict[str, dict[str, Any]] | None = None,
     ) -> None:
         super().__init__()
         if not str(root):
@@ -214,6 +220,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.pair_sentences = False
         self.window_context = (0, 0)
         self.aligner: Aligner | None = None
+        self.further = {name: further_corpus(name, options) for name, options in (further_corpora or {}).items()}
         self._assets: Assets | None = None
 
     options_path = "data"
@@ -255,7 +262,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def licences(self) -> tuple[Licence, ...]:
         """The labels of everything that is trained on: the corpus, and every imported speaker."""
-        return merged([self.corpus_licence()], map(person_licence, self.people))
+        further = [data.licences() for data in self.further.values()]
+        return merged([self.corpus_licence()], map(person_licence, self.people), *further)
 
     # Methods that a corpus overrides.
 
@@ -298,11 +306,16 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return True
 
     def prepare_data(self) -> None:
-        """Report the clips that a complete corpus has and this folder has not; called on one process only."""
+        """Report the clips that a complete corpus has and this folder has not; called on one process only.
+
+        A corpus that makes its folder does so before it calls this.
+        """
         missing = {split: len(names) for split, names in self.missing_clips().items() if names}
         if missing:
             counts = ", ".join(f"{count} of {split}" for split, count in missing.items())
             print(f"{self.corpus_name}: missing clips, which are left out: {counts}", flush=True)
+        for data in self.further.values():
+            data.prepare_data()
 
     # The clips.
 
@@ -558,13 +571,39 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     # The loaders.
 
-    def train_dataloader(self) -> DataLoader[list[Sample]]:
-        """Shuffled training batches, each process its own."""
-        return self._loader("train", training=True)
+    @property
+    def faces(self) -> dict[str, dict[str, Any]]:
+        """What a model's sizes follow from, for every corpus of :attr:`further`, as plain data."""
+        return {
+            name: {
+                "n_vertices": data.n_vertices,
+                "identities": data.identities,
+                "frame_rate": data.frame_rate,
+                "space": None if data.space.is_vertices else data.space.state(),
+            }
+            for name, data in self.further.items()
+        }
 
-    def val_dataloader(self) -> DataLoader[list[Sample]]:
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Shuffled training batches, each process its own."""
+        return self._mixed("train", training=True)
+
+    def val_dataloader(self) -> DataLoader[Any]:
         """Validation batches."""
-        return self._loader("val")
+        return self._mixed("val")
+
+    def _mixed(self, split: str, *, training: bool = False) -> DataLoader[Any]:
+        """A loader of this corpus, or of this and all further ones."""
+        own = self._loader(split, training=training)
+        if not self.further:
+            return own
+        loaders = {"": own}
+        for name, data in self.further.items():
+            data.trainer = self.trainer
+            loaders[name] = data._loader(split, training=training)
+        mixed = mixed_loader(loaders, **self._loader_options())
+        mixed.progress = self._progress
+        return mixed
 
     def test_dataloader(self) -> list[DataLoader[list[Sample]]]:
         """One loader per test split, in the order of :attr:`test_splits`."""
@@ -632,6 +671,29 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             "pin_memory": torch.cuda.is_available(),
             "persistent_workers": self.num_workers > 0,
         }
+
+
+def further_corpus(name: str, options: dict[str, Any]) -> SpeechMotionDataModule:
+    """The data module of another face, from its options.
+
+    Raises:
+        ArgumentError: if they name no registered corpus, or have further corpora themselves.
+    """
+    option = f"further_corpora.{name}"
+    named = options.get("corpus")
+    # A checkpoint states these options too: as anywhere in it, a class must be registered, or imported already.
+    path = f"facediff.registry.corpus.{named}" if named in corpora.names() else named
+    module = find_class(corpora, path, SpeechMotionDataModule)
+    if not is_name(name) or module is None or "further_corpora" in options:
+        raise ArgumentError(
+            {option: options},
+            f"expected the options of a data module with corpus=NAME, one of {', '.join(corpora.names())}",
+        )
+    try:
+        data: SpeechMotionDataModule = module(**{key: value for key, value in options.items() if key != "corpus"})
+    except TypeError as error:  # an option that the corpus does not have
+        raise ArgumentError({option: options}, f"{named} refuses its options ({error})") from error
+    return data
 
 
 def channel_regions(space: Space) -> dict[str, Tensor]:

@@ -262,9 +262,10 @@ class ResumableLoader(DataLoader[list[Sample]]):
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Continue there."""
-        if isinstance(self.sampler, ClipBatches):
-            self.sampler.seed = state["seed"]  # a config may leave the seed to chance
-            self.sampler.resume(state["epoch"], state["batches"])
+        sampler: Any = self.sampler
+        if hasattr(sampler, "resume"):
+            sampler.seed = state["seed"]  # a config may leave the seed to chance
+            sampler.resume(state["epoch"], state["batches"])
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:

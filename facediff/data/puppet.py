@@ -294,6 +294,7 @@ class Puppet(SpeechMotionDataModule):
         """Make the corpus if it does not exist; called on one process only."""
         if self.packed is None:
             self.edition.make(self.root)
+        super().prepare_data()
 
     def channel_folder(self) -> ClipStorage:
         """Weights, head and gaze."""
@@ -383,6 +384,7 @@ class PuppetMask(SpeechMotionDataModule):
             second_edition.generate_second(
                 self.root, seed=self.seed, workers=min(4, processors()), production=second_edition.MASK
             )
+        super().prepare_data()
 
     def split_of(self, clip: Clip) -> str | None:
         """By the table of clips."""

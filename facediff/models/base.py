@@ -11,7 +11,7 @@ import functools
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal, Self
@@ -415,6 +415,15 @@ class AnimationModel(PersonStyles, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("facediff's models train and test on a SpeechMotionDataModule; pass datamodule=…")
+        self.use_corpus(data, stage)
+
+    def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
+        """Take a corpus's assets, and measure what training needs of it.
+
+        Args:
+            data: the corpus.
+            stage: of the trainer: fit, validate, test or predict.
+        """
         if stage != "predict":
             _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
         if stage == "fit":
@@ -444,13 +453,17 @@ class AnimationModel(PersonStyles, ABC):
                 data,
             )
 
+    def own_modules(self) -> Iterator[nn.Module]:
+        """The modules that belong to the model's own corpus: all, by itself."""
+        return self.modules()
+
     def attach_mesh(self) -> None:
         """Give the mesh to those mesh encoders that have none yet; their tables are kept in the checkpoint.
 
         Raises:
             FaceDiffError: if one needs a mesh and the corpus has none.
         """
-        waiting = [m for m in self.modules() if isinstance(m, MeshEncoder) and not m.attached]
+        waiting = [m for m in self.own_modules() if isinstance(m, MeshEncoder) and not m.attached]
         if not waiting:
             return
         if self.assets.faces is None:
@@ -489,7 +502,7 @@ class AnimationModel(PersonStyles, ABC):
         weights = self.coordinate_weights(data)
         if self.geometry is not None:
             self.geometry.copy_(weights)
-        waiting = [module for module in self.modules() if isinstance(module, PrincipalComponents)]
+        waiting = [module for module in self.own_modules() if isinstance(module, PrincipalComponents)]
         count = max([at_least, *(module.count for module in waiting)])
         if not count:
             return None

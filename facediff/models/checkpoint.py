@@ -17,11 +17,10 @@ from facediff.models.checkpoint_reading import (
     assets_of,
     build,
     component_finders,
-    find_class,
     open_content,
     read_content,
 )
-from facediff.registry import corpus
+from facediff.registry import corpus, find_class
 from facediff.utils.licences import require_cleared
 from facediff.utils.plain_options import read_options, unknown_class
 

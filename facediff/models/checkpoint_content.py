@@ -36,6 +36,9 @@ IMPORTED = "imported"
 STYLES_KEY = "facediff_styles"
 """Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
 
+FACES_KEY = "facediff_faces"
+"""Where a checkpoint of a model of many faces keeps, for every face but the first, what the face's own model would."""
+
 StyleSource = Literal["reference", "person"]
 MotionScale = Literal["unit", "none"]
 

@@ -24,9 +24,7 @@ from __future__ import annotations
 
 import io
 import os
-import sys
 import threading
-import types
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -42,13 +40,14 @@ from torch.nn.modules.module import (
 )
 
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, choices
+from facediff.models.checkpoint_content import FACES_KEY
 from facediff.models.pretrained import read_model
-from facediff.registry import COMPONENTS, Kind, model
+from facediff.registry import COMPONENTS, find_class, model
 from facediff.spaces import Space
-from facediff.utils.hub import model_path
+from facediff.utils.hub import model_path, split_face
 from facediff.utils.limits import LIMITS, quoted
-from facediff.utils.plain_options import Components, is_name, is_path, is_plain_text, read_options, unknown_class
+from facediff.utils.plain_options import Components, is_name, is_plain_text, read_options, unknown_class
 from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
 
 M = TypeVar("M", bound=LightningModule)
@@ -62,6 +61,35 @@ SPARE_NUMBERS, SPARE_TENSORS = 2**25, 1000
 """What a model may register in addition to four times its weights."""
 
 
+FACES_PREFIX = "further_faces."
+"""What the names of these faces' weights begin with, in front of the face's name."""
+
+
+def face_content(checkpoint: dict[str, Any], face: str, path: object) -> dict[str, Any]:
+    """The content of a checkpoint of many faces as that of one face's own model, without anything of its training.
+
+    Args:
+        checkpoint: of many faces.
+        face: the name of one that is not the first.
+        path: the file, for messages.
+
+    Raises:
+        FaceDiffError: if there is no such face, or it is damaged.
+    """
+    faces = checkpoint.get(FACES_KEY)
+    if not isinstance(faces, dict) or face not in faces or not isinstance(faces[face], dict):
+        names = [str(name)[:100] for name in faces] if isinstance(faces, dict) else []
+        known = choices(face, names) if names else "it is a model of one face; omit the name"
+        raise FaceDiffError(f"{path}: has no further face {quoted(face)}: {known}")
+    prefix = f"{FACES_PREFIX}{face}."
+    weights = {key.removeprefix(prefix): own for key, own in checkpoint["state_dict"].items() if key.startswith(prefix)}
+    counted = (FORMAT_KEY, "pytorch-lightning_version", "epoch", "global_step")
+    shared = {name: checkpoint[name] for name in counted if name in checkpoint}
+    content: dict[str, Any] = {**shared, **faces[face], "state_dict": weights}
+    check_content(content, path)
+    return content
+
+
 @contextmanager
 def open_content(
     path: str | os.PathLike[str] | IO[bytes], *, weights: bool = True
@@ -69,19 +97,24 @@ def open_content(
     """The content of a checkpoint or of a model folder, of which only the outer form is checked, and its name.
 
     Args:
-        path: a checkpoint, which may be open; a model folder; or a name of the Hugging Face hub.
+        path: a checkpoint, which may be open; a model folder; a name of the Hugging Face hub; or one face of any of
+            them, as :func:`facediff.utils.hub.split_face` reads it.
         weights: whether to read the weights of a model folder too.
 
     Raises:
         FaceDiffError: if there is none, or it is damaged.
     """
-    if isinstance(path, str | os.PathLike) and (folder := model_path(path)).is_dir():
-        content = read_model(folder, weights=weights)
-        check_content(content, path)
-        yield content, str(path)
-        return
+    face = None
+    if isinstance(path, str | os.PathLike):
+        path, face = split_face(path)
+        if (folder := model_path(path)).is_dir():
+            content = read_model(folder, weights=weights or face is not None)
+            check_content(content, path)
+            yield content if face is None else face_content(content, face, path), str(path)
+            return
     with open_checkpoint(path) as (stream, name):
-        yield read_file(stream, name), name
+        content = read_file(stream, name)
+        yield content if face is None else face_content(content, face, path), name
 
 
 def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
@@ -119,7 +152,7 @@ def read_content(path: str | os.PathLike[str] | IO[bytes], base: type[LightningM
 @contextmanager
 def checked_file(path: str | os.PathLike[str] | IO[bytes], base: type[LightningModule]) -> Iterator[IO[bytes]]:
     """An open checkpoint at its beginning, after all checks, for Lightning, which must read it itself."""
-    if isinstance(path, str | os.PathLike) and model_path(path).is_dir():
+    if isinstance(path, str | os.PathLike) and (split_face(path)[1] is not None or model_path(path).is_dir()):
         content = read_content(path, base)
         build(str(path), content, base)
         buffer = io.BytesIO()
@@ -197,7 +230,7 @@ def model_of(path: Path | str, hparams: Mapping[str, Any], base: type[M]) -> tup
             Space.from_state(space)
         except FaceDiffError as error:
             raise FaceDiffError(f"{path}: {error}. The file is damaged") from error
-    kept = ("_class_path", "_instantiator", "identities", "space")
+    kept = ("_class_path", "_instantiator", "identities", "space", "faces")
     arguments = read_options(
         str(path),
         implementation,
@@ -208,7 +241,32 @@ def model_of(path: Path | str, hparams: Mapping[str, Any], base: type[M]) -> tup
         if not arguments.get(name, 0) > 0:
             raise FaceDiffError(f"{path}: its {name} is {quoted(hparams.get(name))}; expected a number above zero")
     LIMITS.check("vertices", arguments["n_vertices"], path)
-    return implementation, {**arguments, "identities": list(identities), "space": space}
+    sizes = {} if "faces" not in hparams else {"faces": sizes_of_faces(path, hparams["faces"])}
+    return implementation, {**arguments, "identities": list(identities), "space": space, **sizes}
+
+
+def sizes_of_faces(path: Path | str, faces: object) -> dict[str, dict[str, Any]]:
+    """The sizes of further faces, as :attr:`facediff.data.SpeechMotionDataModule.faces` gives them, after checks.
+
+    Raises:
+        FaceDiffError: if they are anything else. Numbers are left to the constructor, which knows their ranges.
+    """
+    error = FaceDiffError(f"{path}: its faces are {quoted(faces)}; expected sizes by name. The file is damaged")
+    if not isinstance(faces, dict) or not all(map(is_name, faces)):
+        raise error
+    for sizes in faces.values():
+        if not isinstance(sizes, dict) or sizes.keys() != {"n_vertices", "identities", "frame_rate", "space"}:
+            raise error
+        names = sizes["identities"]
+        if not isinstance(names, list) or not all(map(is_name, names)):
+            raise error
+        LIMITS.check("identities", len(names), path)
+        if not isinstance(sizes["n_vertices"], int) or not isinstance(sizes["frame_rate"], int | float):
+            raise error
+        LIMITS.check("vertices", sizes["n_vertices"], path)
+        if sizes["space"] is not None:
+            Space.from_state(sizes["space"])
+    return faces
 
 
 def build(path: Path | str, checkpoint: dict[str, Any], base: type[M]) -> M:
@@ -339,30 +397,3 @@ def component_finders() -> Components:
         "sampler": samplers.Sampler,
     }
     return {name: partial(find_class, kind, base=bases.get(name, torch.nn.Module)) for name, kind in COMPONENTS.items()}
-
-
-def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
-    """The class of an import path, if it is registered or its module is imported already; else None.
-
-    Args:
-        kind: where it may be registered; its entries are imported first, so that a plug-in is found.
-        path: the import path.
-        base: what the class must be a subclass of.
-    """
-    if not isinstance(path, str) or not is_path(path):
-        return None
-    module, _, name = path.rpartition(".")
-    if module == f"facediff.registry.{kind.kind}":
-        return kind.get(name) if name in kind.names() else None
-    kind.load()
-    # The module must be imported already: importing what a file names would run code that the file chose.
-    # Not getattr, which may make a lazily loaded package import the module that the file asks for.
-    place = sys.modules.get(module)
-    implementation = vars(place).get(name) if isinstance(place, types.ModuleType) else None
-    if not isinstance(implementation, type):
-        return None
-    return (
-        implementation
-        if issubclass(implementation, base) or implementation in [entry.implementation for entry in kind]
-        else None
-    )

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError, OptionError
-from facediff.models.checkpoint_content import CheckpointContent
+from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
 from facediff.models.model_card import Facts, card, check_languages, read_scores
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
@@ -164,6 +164,8 @@ def content_of(model: CheckpointContent) -> dict[str, Any]:
         }
     for key in ("hyper_parameters", DATA_OPTIONS_KEY):
         content[key] = without_paths(content.get(key, {}))
+    if FACES_KEY in content:
+        content[FACES_KEY] = without_paths(content[FACES_KEY])
     return content
 
 

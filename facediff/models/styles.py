@@ -403,8 +403,7 @@ def face_of_array(
     """
     from facediff.data import SpeechMotionDataModule
     from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-    from facediff.models.checkpoint_reading import find_class
-    from facediff.registry import corpus
+    from facediff.registry import corpus, find_class
 
     path, assets, source = opened.path, model.assets, model.data_source
     templates, rate = dict(assets.templates), assets.frame_rate

@@ -56,6 +56,21 @@ def hub_id(source: str | os.PathLike[str]) -> tuple[str, str | None] | None:
     return match["name"], match["revision"]
 
 
+def split_face(source: str | os.PathLike[str]) -> tuple[str, str | None]:
+    """A model of many faces and the face that is named after a colon; None for the whole model.
+
+    Example:
+        >>> split_face("runs/best.ckpt:mask"), split_face("demo/puppet.ckpt")
+        (('runs/best.ckpt', 'mask'), ('demo/puppet.ckpt', None))
+    """
+    text = os.fspath(source)
+    model, colon, face = text.rpartition(":")
+    # Neither a drive letter nor a file whose name has a colon.
+    if len(model) < 2 or not re.fullmatch(r"[\w.-]+", face) or os.path.lexists(text):
+        return text, None
+    return (model, face) if os.path.exists(model) or hub_id(model) is not None else (text, None)  # noqa: PTH110
+
+
 def is_hub_name(text: str) -> bool:
     """Whether a text can name a model on the hub, without a revision."""
     match = _ID.fullmatch(text)
@@ -70,6 +85,7 @@ def check_model_source(source: str | os.PathLike[str], option: str = "") -> None
         option: the option that names it, for messages.
     """
     shown = f"{option} {source}".strip()
+    source, _ = split_face(source)
     if os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
         for name in (CONFIG, WEIGHTS, ASSETS):
             if not (Path(source) / name).is_file():
@@ -143,8 +159,19 @@ def model_path(source: str | os.PathLike[str]) -> Path:
         FaceDiffError: if there is none, or it cannot be fetched.
     """
     check_model_source(source)
+    source, _ = split_face(source)
     named = hub_id(source)
     return Path(source) if named is None else fetch(*named)
+
+
+def local_model(source: str | os.PathLike[str]) -> Path:
+    """As :func:`model_path`, with the face after it where one is named.
+
+    Raises:
+        FaceDiffError: as :func:`model_path`.
+    """
+    path, face = model_path(source), split_face(source)[1]
+    return path if face is None else path.with_name(f"{path.name}:{face}")
 
 
 def model_files(source: str | os.PathLike[str]) -> list[Path]:

@@ -1,5 +1,6 @@
 """Dual-path style diffusion."""
 
+from facediff.models.dual_path.many_faces import ManyFaces
 from facediff.models.dual_path.model import DualPathDiffusion
 
-__all__ = ["DualPathDiffusion"]
+__all__ = ["DualPathDiffusion", "ManyFaces"]

@@ -90,6 +90,13 @@ class Conditions:
         return Conditions(audio, style, self.mask.expand(times, -1))
 
 
+TRUNK = (
+    *("audio_encoder", "style_encoder", "style_tokens", "step_embedding", "fusion", "fused_norm", "decoder"),
+    *("no_speech", "no_style"),
+)
+"""Parts of a network that depend neither on the face nor on its speakers."""
+
+
 class DualPathNetwork(nn.Module):
     """Predicts clean motion from noisy motion under speech, identity and style.
 
@@ -150,6 +157,11 @@ class DualPathNetwork(nn.Module):
         self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None
         self.speech_style = speech_style
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
+
+    def share_trunk(self, other: DualPathNetwork) -> None:
+        """Replace the parts whose sizes no corpus decides by those of another network, which then learn from both."""
+        for name in TRUNK:
+            setattr(self, name, getattr(other, name))
 
     @property
     def style_dim(self) -> int:
