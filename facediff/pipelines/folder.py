@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-from facediff.animation import Animation
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.animation.style_files import style_paths
 from facediff.editing.controls import check_controls, keys_file
@@ -20,6 +19,7 @@ from facediff.export import FORMATS, check_export
 from facediff.pipelines.animate import check_options
 from facediff.pipelines.opening import open_pipeline
 from facediff.speech.audio import read_recording
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
@@ -35,6 +35,9 @@ TABLE = 40
 
 FEW = 20
 """Recordings of which workers of a cluster are asked beforehand whether they see them."""
+
+FITTED_SECONDS = 10
+"""Speech that the fit of a target mesh is judged by."""
 
 Animate = Callable[[Path, Path], list[Path] | None]
 """Animates a recording (first) and writes a file (second), whole or not at all; returns all files that it wrote."""
@@ -84,12 +87,9 @@ def animate_folder(
     found = recordings(speech)
     correspondence = None if options.correspondence is None else Path(options.correspondence)
     if options.target_mesh is not None and correspondence is not None and not correspondence.exists():
-        from facediff.editing.retargeting import retarget
-
-        # Otherwise every process would fit the mesh, and a second run would find a file that decides the outputs and
+        # Otherwise every process would fit the mesh, and a second run would see a file that decides the outputs and
         # that the records of the first one do not know.
-        neutral = replace(neutral_face(options), name=str(options.checkpoint))
-        retarget(neutral, Path(options.target_mesh), correspondence)
+        write_correspondence(replace(options, quiet=True, samples=1), found)
     if (directions := directions_folder(options)) is not None:
         check_directions(options, found, directions)
     quiet, export = replace(options, quiet=True), replace(export, quiet=True)
@@ -175,16 +175,25 @@ def computes_on_processor(options: AnimationOptions) -> bool:
     return on_processor(options.device)
 
 
-def neutral_face(options: AnimationOptions) -> Animation:
-    """One frame of the neutral face."""
-    if is_exported(options.checkpoint):
-        pipeline = open_pipeline(replace(options, target_mesh=None, correspondence=None))
-        return pipeline.bare(pipeline.facts["template"][None])
-    from facediff.models.checkpoint import read_assets
-    from facediff.pipelines.trained import facts_of
+def write_correspondence(options: AnimationOptions, files: Sequence[Path]) -> None:
+    """Fit the target mesh and write its correspondence, judged by how the first readable recording moves it.
 
-    facts = facts_of(read_assets(Path(options.checkpoint)), options.identity)
-    return Animation(name="face", vertices=facts["template"][None], **facts)
+    Raises:
+        FaceDiffError: if the fit is poor, or no recording can be read.
+    """
+    problems = []
+    for file in files:
+        try:
+            speech = read_recording(file, options.max_seconds)
+        except FaceDiffError as error:  # the batch will say so of this recording, and goes on with others
+            problems.append(error)
+            continue
+        pipeline = open_pipeline(options)
+        if directions_folder(options) is not None:
+            pipeline.direct(None)
+        with pipeline.animations(speech[: FITTED_SECONDS * SAMPLE_RATE], file.stem):
+            return
+    raise problems[0]
 
 
 def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: list[str]) -> Animate:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from facediff.animation import read_archive
 from facediff.cli.app import main
@@ -313,3 +314,18 @@ def test_animate_takes_a_folder(
     capsys.readouterr()
     assert main(command) == 1
     assert "3 recordings: 2 up to date, 1 failed" in capsys.readouterr().out
+
+
+def test_a_mesh_without_a_mouth_is_refused_before_a_recording_is_animated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A new map is judged by a recording's motion, as for one recording; a neutral face opens no mouth."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a_broken.wav").write_text("no sound")
+    shutil.copy(ROOT / "docs" / "examples" / "speech.wav", tmp_path / "in")
+    trimesh.creation.icosphere(2, 0.1).export(tmp_path / "ball.obj")
+    before = sorted(tmp_path.rglob("*"))
+    mesh = ["--target-mesh", str(tmp_path / "ball.obj"), "--correspondence", str(tmp_path / "map.npz")]
+    assert main(["animate", str(tmp_path / "in"), *mesh, "-o", str(tmp_path / "out")]) == 2
+    assert "ball.obj: no line between its lips" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
