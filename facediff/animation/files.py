@@ -14,9 +14,9 @@ import numpy.typing as npt
 from facediff.animation.animation import OUT_OF_RANGE, Animation, Channels
 from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import Space
-from facediff.utils.arrays import in_range, open_vertices, read_arrays
+from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
-from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, quoted
+from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, in_range, quoted
 from facediff.utils.plain_files import json_text, parse_json
 
 T = TypeVar("T")

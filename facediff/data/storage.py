@@ -13,8 +13,8 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.spaces import Space
 from facediff.speech.audio import read_stretch
-from facediff.utils.arrays import ArrayStore, in_range, open_array, open_vertices
-from facediff.utils.limits import COORDINATE, LIMITS, quoted
+from facediff.utils.arrays import ArrayStore, open_array, open_vertices
+from facediff.utils.limits import COORDINATE, LIMITS, in_range, quoted
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Folders with absolute vertices, in order of preference; the second is ProbTalk3D's."""

@@ -29,9 +29,9 @@ from facediff.metrics import (
 from facediff.metrics.base import Clips, LengthRule, Pooling, align
 from facediff.metrics.channels import Moment
 from facediff.metrics.one_pass import one_pass
-from facediff.utils.arrays import in_range, open_vertices
+from facediff.utils.arrays import open_vertices
 from facediff.utils.jobs import run_tasks
-from facediff.utils.limits import COORDINATE
+from facediff.utils.limits import COORDINATE, in_range
 from facediff.utils.workers import WorkerDied
 
 METRICS = "metrics"  # Stands in place of a protocol's name where metrics were chosen by name

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.utils.arrays import in_range
-from facediff.utils.limits import COORDINATE
+from facediff.utils.limits import COORDINATE, in_range
 
 Array = npt.NDArray[np.float64]
 

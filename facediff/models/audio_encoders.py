@@ -20,7 +20,7 @@ from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
 from facediff.speech.cepstra import mel_filters
-from facediff.speech.frame_clock import CONVOLUTIONS, convolved
+from facediff.speech.windows import CONVOLUTIONS, convolved
 from facediff.utils.limits import quoted
 from facediff.utils.ranges import Range
 

@@ -27,14 +27,13 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.channel_weights import ChannelWeights, channel_weights
-from facediff.models.checkpoint_content import MotionScale, StyleSource
+from facediff.models.checkpoint_content import MotionScale, PersonStyles, StyleSource
 from facediff.models.checkpoint_reading import checked_file
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, with_usual_styles
 from facediff.models.inference import Prediction
 from facediff.models.mesh_encoders import MeshEncoder
-from facediff.models.person_styles import PersonStyles
+from facediff.models.motion_space import PrincipalComponents, Projection
 from facediff.models.pretrained import publish
-from facediff.models.principal import PrincipalComponents, Projection
 from facediff.registry import keeps_arguments
 from facediff.spaces import Space
 from facediff.speech.windows import WindowPlan

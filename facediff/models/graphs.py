@@ -25,7 +25,7 @@ from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, Lengths, Waves
 from facediff.models.layers import of_frames
 from facediff.models.samplers import Sampler
-from facediff.speech.frame_clock import FrameClock
+from facediff.speech.windows import FrameClock
 
 Axes = dict[int, str]
 """Which axes of an input have any length: ``batch``, ``samples``, ``frames``."""

@@ -24,8 +24,7 @@ from facediff.data import Assets, Batch, Reference, Sample, collate
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.speech.audio import samples_for
-from facediff.speech.frame_clock import FrameClock
-from facediff.speech.windows import LOW_LATENCY, MotionWindow, SpeechWindows, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, FrameClock, MotionWindow, SpeechWindows, WindowPlan
 
 if TYPE_CHECKING:
     from facediff.models.graphs import Graphs

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.data.batch import UNKNOWN_IDENTITY
-from facediff.models.principal import PrincipalComponents
+from facediff.models.motion_space import PrincipalComponents
 
 COMPONENTS = 64
 """Principal components that get gains of their own."""

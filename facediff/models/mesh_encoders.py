@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
 from facediff.models.layers import Frames, Share, Width, exporting
-from facediff.models.principal import PrincipalComponents
+from facediff.models.motion_space import PrincipalComponents
 from facediff.registry import mesh_encoder
 from facediff.utils.ranges import Dims, Range, Vertices
 

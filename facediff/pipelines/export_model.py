@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from facediff.models.graphs import Graph, Graphs
     from facediff.models.inference import Style
     from facediff.spaces.decoding import ChannelDecoder
-    from facediff.speech.frame_clock import FrameClock
+    from facediff.speech.windows import FrameClock
 
 Precision = Literal["float32", "float16", "int8"]
 

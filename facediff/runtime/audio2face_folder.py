@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.utils.arrays import in_range, read_arrays
-from facediff.utils.limits import LIMITS, check_number, quoted
+from facediff.utils.arrays import read_arrays
+from facediff.utils.limits import LIMITS, check_number, in_range, quoted
 from facediff.utils.plain_files import load_json
 
 Array = npt.NDArray[np.float32]

@@ -21,9 +21,8 @@ from facediff.errors import FaceDiffError
 from facediff.runtime.graph_check import REMEDY, check_graph
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.decoding import ChannelDecoder
-from facediff.speech.frame_clock import FrameClock, Rule
 from facediff.speech.voice_activity import OFF, USUAL_GATE
-from facediff.speech.windows import WindowPlan
+from facediff.speech.windows import FrameClock, Rule, WindowPlan
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
 from facediff.utils.limits import quoted
@@ -80,7 +79,7 @@ class Description:
         generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
             said of the loop is 0, empty, and ``last_step`` −1, as in a model that predicts no mean.
         blending: where windows go over into one another: in all ``steps`` of the loop, or in the ``motion``.
-        clock: how the model counts frames, as :class:`~facediff.speech.frame_clock.FrameClock` takes it.
+        clock: how the model counts frames, as :class:`~facediff.speech.windows.FrameClock` takes it.
         style_source: what a style is: of a ``reference`` motion; a training ``identity``; ``none`` if there are none.
         longest: frames at most of what is animated in one pass; 0 for any number.
         drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.

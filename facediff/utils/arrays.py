@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic
-from facediff.utils.limits import COORDINATE, LIMITS, brief, check_array, quoted
+from facediff.utils.limits import LIMITS, brief, check_array, quoted
 
 # NumPy parses a file's header with Python's own parser, which two threads that read at the same time can break in
 # Python 3.11 (SystemError, "AST constructor recursion depth mismatch").
@@ -179,12 +179,6 @@ def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]
     if any(size < 0 for size in shape):
         raise ValueError(f"its shape is {quoted(shape)}")
     return shape, fortran, dtype
-
-
-def in_range(array: npt.NDArray[Any]) -> bool:
-    """Whether all numbers are finite, and none is larger than :data:`~facediff.utils.limits.COORDINATE`."""
-    # Minimum and maximum are NaN if any number is, and no comparison with NaN is true.
-    return not array.size or bool(float(array.min()) >= -COORDINATE and float(array.max()) <= COORDINATE)
 
 
 class ArrayStore:

@@ -12,8 +12,12 @@ import os
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 
 @dataclass(frozen=True)
@@ -197,6 +201,12 @@ def check_array(source: object, shape: tuple[int, ...], item_bytes: int) -> None
         raise FaceDiffError(f"{source}: declares an array of shape {quoted(shape)}; the file is damaged")
     # An axis of length 0 takes no memory, but a walk along the other axes takes its time.
     LIMITS.check("bytes", math.prod(max(1, size) for size in shape) * max(1, item_bytes), source)
+
+
+def in_range(array: npt.NDArray[Any]) -> bool:
+    """Whether all numbers are finite, and none is larger than :data:`COORDINATE`."""
+    # Minimum and maximum are NaN if any number is, and no comparison with NaN is true.
+    return not array.size or bool(float(array.min()) >= -COORDINATE and float(array.max()) <= COORDINATE)
 
 
 _LEAVES = {str, bytes, int, float, bool, type(None)}

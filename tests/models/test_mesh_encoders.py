@@ -18,7 +18,7 @@ from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.mesh.hierarchy import MeshHierarchy, mesh_hierarchy
 from facediff.models.mesh_encoders import ComponentMeshEncoder, MeshEncoder, SpiralMeshEncoder
-from facediff.models.principal import PrincipalComponents
+from facediff.models.motion_space import PrincipalComponents
 from tests.fakes.meshes import relief
 
 DIM, ROWS, COLUMNS = 7, 14, 12

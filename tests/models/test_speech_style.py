@@ -15,7 +15,7 @@ from facediff.data import Batch
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.dual_path.graphs import StepGraph
-from facediff.models.speech_style import MEMORY, REACH, RIDGE, SpeechStyle
+from facediff.models.dual_path.network import MEMORY, REACH, RIDGE, SpeechStyle
 from facediff.speech.windows import WindowPlan
 from tests.fakes.tiny import Tiny
 

@@ -22,7 +22,7 @@ from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import DecoderFactory, StyleTransformer
 from facediff.models.dual_path.graphs import graphs_of
-from facediff.models.dual_path.network import Conditions, DualPathNetwork, Hidden, TokenForm
+from facediff.models.dual_path.network import Conditions, DualPathNetwork, Hidden, SpeechStyle, TokenForm
 from facediff.models.folding import (
     Blend,
     ConditionalDenoiser,
@@ -37,8 +37,7 @@ from facediff.models.layers import Share, Weight, Width
 from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import ComponentMeshEncoder, LinearMeshEncoder, MeshEncoderFactory
-from facediff.models.motion_space import ComponentMotion, MotionSpaceFactory, Preconditioning, VertexMotion
-from facediff.models.principal import Projection
+from facediff.models.motion_space import ComponentMotion, MotionSpaceFactory, Preconditioning, Projection, VertexMotion
 from facediff.models.samplers import (
     DpmSolverSampler,
     NoiseProcess,
@@ -53,7 +52,6 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
-from facediff.models.speech_style import SpeechStyle
 from facediff.speech.windows import LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
@@ -111,8 +109,8 @@ class DualPathDiffusion(AnimationModel):
         style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide, and is taken
             from the speech where none is given.
         style_from_speech: learn what speech says of the style, by a regression beside the training that changes
-            nothing else (:class:`~facediff.models.speech_style.SpeechStyle`); where no style is given, an identity's
-            usual one is then changed as the speech asks.
+            nothing else (:class:`~facediff.models.dual_path.network.SpeechStyle`); where no style is given, an
+            identity's usual one is then changed as the speech asks.
         speech_dropout: share of training clips whose speech is hidden, together with whatever else may be hidden, so
             that speech can guide.
         speech_guidance: how much more than it has learnt the model follows the speech; 1 or, with ``speech_dropout``,

@@ -37,7 +37,7 @@ from facediff.models.graphs import (
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.registry import component_class
-from facediff.speech.frame_clock import FrameClock, Rule
+from facediff.speech.windows import FrameClock, Rule
 from facediff.utils.plain_options import fits, parameters
 
 Alignment = Literal["auto", "pairs", "interpolated"]

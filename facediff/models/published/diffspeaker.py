@@ -46,7 +46,7 @@ from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.published.squared_errors import squared_errors
 from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.speech.frame_clock import FrameClock
+from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
 Scheduler = Literal["published", "ddim"]

@@ -34,7 +34,7 @@ from facediff.models.published.lam_finishing import read_steps
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
 from facediff.spaces import Space
-from facediff.speech.frame_clock import STEP_RATE
+from facediff.speech.windows import STEP_RATE
 from facediff.utils.ranges import Range
 
 EMOTION_RATE = 30

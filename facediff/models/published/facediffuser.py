@@ -36,7 +36,7 @@ from facediff.models.published.diffusion import (
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.samplers import cosine_betas
 from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.speech.frame_clock import FrameClock, Rule
+from facediff.speech.windows import FrameClock, Rule
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 

@@ -14,13 +14,13 @@ from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError, OptionError
+from facediff.models.checkpoint_content import PersonStyles
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import SpeechStream, Style
 from facediff.models.layers import Heads, Layers, Width
-from facediff.models.person_styles import PersonStyles
 from facediff.models.published.base import NO_STYLE, Alignment, PublishedModel
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions
-from facediff.speech.frame_clock import FrameClock
+from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
 DEAD = 0.01

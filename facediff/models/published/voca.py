@@ -27,7 +27,7 @@ from facediff.models.layers import Width, exporting, frame_mask, sliding
 from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
 from facediff.models.published.squared_errors import squared_errors
-from facediff.speech.frame_clock import FrameClock
+from facediff.speech.windows import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 from facediff.utils.tensorflow_files import read_graph
