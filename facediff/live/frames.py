@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, checks_arguments, receiver
+from facediff.spaces.rotations import convert
 from facediff.utils import SAMPLE_RATE
 
 Array = npt.NDArray[np.float32]
@@ -40,6 +41,8 @@ class LiveFrame:
         weights: of the performance's blendshapes (len(shapes),), from 0 to 1, and in radians what turns; None if no
             receiver needs them.
         dropped: frames that were dropped so far, before this one.
+        head: how the head moves as a whole (6,), if controls or acting move it: a rotation about the origin, axis-angle
+            in radians, and then a shift. The vertices have been moved by it; the weights are those of the face without.
     """
 
     index: int
@@ -48,11 +51,17 @@ class LiveFrame:
     vertices: Array
     weights: Array | None = None
     dropped: int = 0
+    head: npt.NDArray[np.float64] | None = None
 
     @property
     def lag(self) -> float:
         """Seconds since its speech arrived."""
         return monotonic() - self.heard
+
+    @property
+    def turned(self) -> npt.NDArray[np.float64]:
+        """Yaw, pitch and roll of the head (3,) in radians, about a right-handed face's axes; 0 if nothing moves it."""
+        return np.zeros(3) if self.head is None else convert(self.head[None, :3], "axis_angle", "euler")[0]
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from facediff.live.frames import LiveFrame, Receiver
 from facediff.live.model import LiveModel
 from facediff.live.sources import Speech, SpeechSource
 from facediff.live.timing import Lags, Pacer, SpokenClock, Thinning
+from facediff.mesh.flame import rotations
 from facediff.speech.audio import samples_for
 from facediff.utils import SAMPLE_RATE
 
@@ -169,6 +170,7 @@ class _Ready:
     ready: float
     vertices: Array
     values: Array | None
+    head: npt.NDArray[np.float64] | None
 
 
 class Loop:
@@ -310,7 +312,7 @@ class Loop:
                 self.summary.computing.add(now - began)
             recent.append((now - began, len(samples) / SAMPLE_RATE))
             self._measure(recent)
-            ready = self._ready(points, ready, gaps, now)
+            ready = self._ready(points, stream.heads, ready, gaps, now)
         if fed and not self._abandoned:
             self._thinning.stride = 1  # nothing waits any more, and the last frame shuts the mouth
             before, began = stream.made, time.monotonic()
@@ -319,7 +321,7 @@ class Loop:
             self.summary.busy += now - began
             if stream.made > before:
                 self.summary.computing.add(now - began)
-            self._ready(points, ready, gaps, now)
+            self._ready(points, stream.heads, ready, gaps, now)
 
     def _measure(self, recent: deque[tuple[float, float]]) -> None:
         """Find out whether the model is fast enough; if not, little speech may wait for it once frames are left out."""
@@ -341,7 +343,14 @@ class Loop:
                 f"shorter --overlap, or end other programs"
             )
 
-    def _ready(self, points: Array, first: int, gaps: deque[tuple[int, int]], now: float) -> int:
+    def _ready(
+        self,
+        points: Array,
+        heads: npt.NDArray[np.float64] | None,
+        first: int,
+        gaps: deque[tuple[int, int]],
+        now: float,
+    ) -> int:
         """Queue frames of the stream, the first of which has the number ``first``; the number of the next."""
         if not len(points):
             return first
@@ -356,7 +365,8 @@ class Loop:
                 spoken = self.clock.spoken((index + 1) / self.model.frame_rate)
                 if place == 0:
                     self.pacer.ready(spoken, now)
-                self._frames.append(_Ready(index, spoken, now, frame_offsets, values[place]))
+                head = None if heads is None else heads[place]
+                self._frames.append(_Ready(index, spoken, now, frame_offsets, values[place], head))
             self._changed.notify()
         return first + len(points)
 
@@ -383,7 +393,7 @@ class Loop:
                 continue
             if weights[0] != frame.index and self._solve is not None and not self._late(frame):
                 began = time.monotonic()
-                weights = frame.index, self._solve(frame.vertices)
+                weights = frame.index, self._solve(self._still(frame))
                 solving = time.monotonic() - began
             else:
                 solving = 0.0
@@ -413,6 +423,14 @@ class Loop:
         newer = self._frames and self._frames[-1].index > frame.index
         return bool(newer) and time.monotonic() > self.pacer.due(frame.spoken) + self.model.hop
 
+    def _still(self, frame: _Ready) -> Array:
+        """Offsets of a frame's vertices whose head does not move as a whole, which shapes of a face cannot say."""
+        if frame.head is None or not frame.head.any():
+            return frame.vertices
+        neutral = self.model.neutral
+        (turn,) = rotations(frame.head[None, :3])
+        return np.asarray((neutral + frame.vertices - frame.head[3:]) @ turn - neutral, np.float32)
+
     def _send(self, frame: _Ready, weights: Array | None, solving: float) -> None:
         began = time.monotonic()
         out = LiveFrame(
@@ -422,6 +440,7 @@ class Loop:
             vertices=frame.vertices,
             weights=weights,
             dropped=self.summary.dropped + self._backlog.dropped,
+            head=frame.head,
         )
         self._each(self.receivers, lambda receiver: receiver.send(out))
         now = time.monotonic()

@@ -23,6 +23,10 @@ class MotionStream(Protocol):
     def made(self) -> int:
         """Frames that the model has generated so far; some of them may wait to be certain."""
 
+    @property
+    def heads(self) -> npt.NDArray[np.float64] | None:
+        """How the head moved as a whole in the frames that were given last (m, 6); None if nothing moves it."""
+
     def feed(self, samples: Array, /) -> Array:
         """Take samples (n,) at 16 kHz, and give the frames (m, points, dims) that are certain now."""
 

@@ -323,14 +323,17 @@ class AnimationPipeline(ABC):
         if face is not None:
             face.refuse_whole_animation()
 
-        def finish(points: Array, start: int, acted: npt.NDArray[np.float64] | None) -> Array:
+        def finish(
+            points: Array, start: int, acted: npt.NDArray[np.float64] | None
+        ) -> tuple[Array, npt.NDArray[np.float64] | None]:
             vertices = self.shown(points)
             if not len(vertices):
-                return vertices
+                return vertices, None
             animation = self.bare(vertices)
             if face is not None:
                 animation = face.apply(animation, seed=self.seed, start=start, acted=acted)
-            return self.posed(animation, points).vertices
+            animation = self.posed(animation, points)
+            return animation.vertices, animation.head
 
         return AnimationStream(
             self.generator(),

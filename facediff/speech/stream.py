@@ -17,9 +17,10 @@ from facediff.utils import SAMPLE_RATE
 
 Array = npt.NDArray[np.float32]
 Acted = npt.NDArray[np.float64]
-Finish = Callable[[Array, int, Acted | None], Array]
+Finish = Callable[[Array, int, Acted | None], tuple[Array, Acted | None]]
 """Makes vertices (m, V, 3) of frames of a model's points (m, points, dims), the first of which has a number, with what
-acting does in each of them (m, 5): decoding, controls."""
+acting does in each of them (m, 5): decoding, controls. And how the head moves in them as a whole (m, 6), if it does, as
+:attr:`facediff.animation.Animation.head`."""
 
 
 class VertexGenerator(Protocol):
@@ -57,7 +58,12 @@ class AnimationStream:
         performer: acts; None for no acting.
         finish: makes vertices of the model's frames, with the animation controls; None for the frames as they are.
         rate: sample rate of the speech.
+
+    Attributes:
+        heads: how the head moved as a whole in the frames that were given last (m, 6); None if nothing moves it.
     """
+
+    heads: Acted | None = None
 
     def __init__(
         self,
@@ -85,6 +91,7 @@ class AnimationStream:
 
     def feed(self, samples: Array) -> Array:
         """Take samples (n,), and give the frames (m, V, 3) that are certain now; m may be 0."""
+        self.heads = None
         return self._feed(samples if self._convert is None else self._convert(samples, False))
 
     def finish(self) -> Array:
@@ -93,6 +100,7 @@ class AnimationStream:
         Raises:
             FaceDiffError: if the speech was shorter than a frame.
         """
+        self.heads = None
         resampled = [] if self._convert is None else [self._feed(self._convert(np.zeros(0, np.float32), True))]
         vertices = self.generator.finish()
         frames = self.generator.frames
@@ -126,6 +134,7 @@ class AnimationStream:
         if self._rest is not None:
             vertices = self._rest.apply(vertices, opened)
         if self._finish is not None:
-            vertices = self._finish(vertices, self._finished, None if self._performer is None else acted)
+            vertices, heads = self._finish(vertices, self._finished, None if self._performer is None else acted)
+            self.heads = heads if self.heads is None or heads is None else np.concatenate([self.heads, heads])
         self._finished += count
         return vertices

@@ -27,6 +27,8 @@ class FakeStream:
         cost: seconds of computing for each second of speech.
     """
 
+    heads: np.ndarray | None = None
+
     def __init__(self, cost: float = 0.0) -> None:
         self.cost, self.made, self.heard = cost, 0, 0
 

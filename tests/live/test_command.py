@@ -165,6 +165,8 @@ def test_weights_of_blendshapes_are_solved_for(speech: Path, monkeypatch: pytest
 class Moved:
     """A stream whose frames begin at a neutral face."""
 
+    heads = None
+
     def __init__(self, stream: Any, neutral: np.ndarray) -> None:  # noqa: ANN401
         self.stream, self.neutral = stream, neutral
 

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from facediff.errors import FaceDiffError
 from facediff.live.frames import LiveFrame
@@ -167,6 +168,34 @@ def test_speech_weights_and_the_end_reach_the_receivers() -> None:
     assert solved == list(range(15))  # once a frame, in order
     weights = [float(frame.weights[0]) for frame in kept.frames if frame.weights is not None]
     assert weights == pytest.approx(np.arange(15) / 100)
+
+
+class Turning(FakeStream):
+    """The same frames by a head that turns, about an axis of its own in each frame, and shifts."""
+
+    def _frames(self, count: int) -> np.ndarray:
+        first = self.made
+        plain = super()._frames(count)
+        turns = np.random.default_rng(first).normal(size=(count, 3))
+        self.heads = np.concatenate([turns, np.full((count, 3), 0.5)], axis=1)
+        return np.asarray([Rotation.from_rotvec(turn).apply(frame) + 0.5 for turn, frame in zip(turns, plain)])  # noqa: B905
+
+
+def test_weights_are_those_of_a_head_that_does_not_move() -> None:
+    kept, solved = Kept(weights=True), list[np.ndarray]()
+
+    def solve(offsets: np.ndarray) -> np.ndarray:
+        solved.append(offsets)
+        return offsets[:1, 0]
+
+    Loop(fake_model(Turning), Spoken(0.3), [kept], solve=solve, report=str).run()
+    expected = np.zeros((15, 4, 3))
+    expected[:, 0, 0] = np.arange(15)
+    np.testing.assert_allclose(solved, expected, atol=1e-5)
+    for frame, still in zip(kept.frames, expected, strict=True):
+        assert frame.head is not None
+        moved = Rotation.from_rotvec(frame.head[:3]).apply(still) + frame.head[3:]
+        np.testing.assert_allclose(frame.vertices, moved, atol=1e-5)
 
 
 def test_receiver_that_fails_does_not_stop_the_others() -> None:

@@ -18,12 +18,16 @@ from pylivelinkface import FaceBlendShape, PyLiveLinkFace
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_message import OscMessage
 from pythonosc.osc_packet import OscPacket
+from scipy.spatial.transform import Rotation
 
 from facediff.errors import FaceDiffError
 from facediff.live.frames import Performance, open_receiver
 from facediff.live.receivers.sending import Outbox
 from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
+from facediff.spaces.files.clips import ParameterClip
+from facediff.spaces.files.tables import live_link_header, live_link_rows
+from facediff.spaces.layouts import layout
 from facediff.spaces.visemes import visemes
 from tests.live.conftest import FRAME_RATE, Opened, at_rate, frame, weights_of
 
@@ -89,6 +93,22 @@ def mirrored_gaze(weights: NDArray[np.floating]) -> list[float]:
         pitch = 0.61 * look[f"eyeLookDown{side}"] - 0.44 * look[f"eyeLookUp{side}"]
         turns += [yaw, pitch, yaw * pitch]
     return turns
+
+
+def test_a_head_that_turns_is_sent_as_a_table_has_it(opened: Opened, listener: Listener) -> None:
+    yaw, pitch, roll = 0.3, -0.2, 0.1
+    turn = Rotation.from_euler("YXZ", [yaw, pitch, roll]).as_rotvec()
+    moved = replace(frame(3), head=np.array([*turn, 0.01, 0.02, 0.03]))
+    opened(f"livelink://127.0.0.1:{listener.port}").send(moved)
+    values = decode(listener.take()[0])["values"]
+    expected = ParameterClip("nod", np.array([[*weights_of(3), yaw, pitch, roll, *[0] * 6]]), layout("live_link"), 30)
+    written = dict(zip(live_link_header(), next(iter(live_link_rows(expected))), strict=True))
+    columns = [float(written[name]) for name in ("HeadYaw", "HeadPitch", "HeadRoll")]
+    assert values[len(ARKIT) : len(ARKIT) + 3] == pytest.approx(columns, abs=1e-6)  # type: ignore[index]
+    assert abs(columns[0]) == pytest.approx(yaw, abs=1e-6)
+    opened(f"osc://127.0.0.1:{listener.port}").send(moved)
+    found = {each.address: each.params for each in messages(listener.take(2))}
+    assert found["/facediff/head"] == pytest.approx([yaw, pitch, roll], abs=1e-6)
 
 
 def test_the_fields_of_a_live_link_datagram(opened: Opened, listener: Listener, performance: Performance) -> None:
@@ -173,6 +193,7 @@ def test_plain_osc_has_an_address_for_each_weight(opened: Opened, listener: List
     opened(f"osc://127.0.0.1:{listener.port}?prefix=/me/face").send(frame(5, dropped=2))
     found = {each.address: each.params for each in messages(listener.take(2))}
     index, seconds, lag, dropped = found.pop("/me/face/frame")
+    assert found.pop("/me/face/head") == [0.0, 0.0, 0.0]
     assert (index, dropped) == (5, 2)
     assert seconds == pytest.approx(5 / FRAME_RATE)
     assert 0.1 <= lag < 5
@@ -297,6 +318,7 @@ def test_shapes_that_a_face_lacks_stay_at_zero_and_others_are_left_out(
     receiver.close()
     assert found.pop("/facediff/weight/jawOpen") == 0.25
     found.pop("/facediff/frame")
+    found.pop("/facediff/head")
     assert len(found) == 51
     assert set(found.values()) == {0.0}
 

@@ -170,6 +170,15 @@ def test_stream_is_the_file_however_it_is_cut(model: facediff.Animator, speech: 
         parts = list(model.stream(np.array_split(speech, pieces), **options))
         np.testing.assert_array_equal(np.concatenate(parts), whole)
     assert len(parts) > 1
+    heads = []
+    with model.open(model._options(None, **options)) as pipeline:
+        stream = pipeline.stream()
+        for piece in np.array_split(speech, 5):
+            stream.feed(piece)
+            heads.append(stream.heads)
+        stream.finish()
+    turned = np.concatenate([part for part in [*heads, stream.heads] if part is not None])
+    np.testing.assert_array_equal(turned, model.animate(speech, 16_000, **options).head)
     with pytest.raises(FaceDiffError, match="blinks"):
         model.stream([], direction=rows("blinks", 3))
 

@@ -180,6 +180,8 @@ def write_in_real_time(
 class LevelFace:
     """A stream whose jaw opens with the largest sample of each frame, as soon as the frame has been heard."""
 
+    heads = None
+
     def __init__(self) -> None:
         self.made = 0
         self._speech = np.zeros(0, np.float32)

@@ -5,7 +5,8 @@ The first line describes the performance and the last one its end; between them,
 - ``{"type": "performance", "format": "facediff live 1", "subject", "frame_rate", "unit", "shapes", "metadata"}``, with
   ``neutral`` (V, 3) and ``faces`` (F, 3) where frames have vertices;
 - ``{"type": "frame", "index", "time", "lag", "dropped", "weights": {name: weight}}``, with ``vertices`` (V, 3), offsets
-  from the neutral face, where they are asked for. Seconds, and as :class:`~facediff.live.frames.LiveFrame` means them;
+  from the neutral face, where they are asked for, and with ``head``, its yaw, pitch and roll in radians, where
+  controls or acting move it. Seconds, and as :class:`~facediff.live.frames.LiveFrame` means them;
 - ``{"type": "end", "frames", "dropped"}``: lines with frames that were sent, and frames that never reached this client.
 """
 
@@ -101,6 +102,8 @@ class JsonLines(Receiver):
         }
         if self.needs_weights and frame.weights is not None:
             content["weights"] = dict(zip(self._shapes, np.round(frame.weights, 6).astype(float).tolist(), strict=True))
+        if frame.head is not None:
+            content["head"] = [round(angle, 6) for angle in frame.turned.tolist()]
         if self.with_vertices:
             content["vertices"] = _rounded(frame.vertices)
         sink.write(line(content))

@@ -47,7 +47,7 @@ class LiveLink(UdpReceiver):
     The timecode begins at the time of day at which the first frame is sent and goes on with the numbers of the frames:
     where frames were dropped, numbers are missing. Rotations of head and eyes are those of a model of channels, in the
     app's mirrored frame. Elsewhere those of the eyes follow the weights of the ``eyeLook`` shapes as in the app's
-    recordings, and those of the head are 0.
+    recordings, and those of the head are what controls and acting turn it by.
 
     Args:
         address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
@@ -87,7 +87,7 @@ class LiveLink(UdpReceiver):
         number = (self._first + frame.index) % int(DAY * self._rate)
         weights, rotations = np.split(self._weights.of(frame), [len(ORDER)])
         if not self._turning:
-            rotations = np.concatenate([np.zeros(3), gaze(ORDER, weights[None])[0]])
+            rotations = np.concatenate([frame.turned, gaze(ORDER, weights[None])[0]])
         values = [*weights.tolist(), *mirrored(rotations).tolist()]
         rate = self._rate.numerator, self._rate.denominator
         return [self._head + struct.pack(f">ifiiB{len(values)}f", number, 0.0, *rate, len(values), *values)]

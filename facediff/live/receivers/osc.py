@@ -122,8 +122,9 @@ class Vmc(_Osc):
 class Osc(_Osc):
     """Plain OSC addresses, for TouchDesigner, Max, Pure Data and one's own programs.
 
-    A frame is ``/facediff/frame index seconds lag dropped`` (a whole number, two floats, a whole number) and a
-    ``/facediff/weight/jawOpen weight`` for each of ARKit's 52 shapes, in bundles of at most 1 400 bytes.
+    A frame is ``/facediff/frame index seconds lag dropped`` (a whole number, two floats, a whole number),
+    ``/facediff/head yaw pitch roll`` in radians, and a ``/facediff/weight/jawOpen weight`` for each of ARKit's 52
+    shapes, in bundles of at most 1 400 bytes.
 
     Args:
         address: ``osc://HOST:PORT``; this machine's port 9000 by default.
@@ -138,11 +139,16 @@ class Osc(_Osc):
             raise FaceDiffError(
                 f"{OPTION} {self.name}: prefix is {prefix!r}; expected parts of an OSC address, as in /facediff"
             )
-        self._frame = f"{prefix}/frame"
+        self._frame, self._turned = f"{prefix}/frame", f"{prefix}/head"
         self._parts = [message(f"{prefix}/weight/{name}", 0.0)[:-4] for name in ARKIT]
 
     def messages(self, frame: LiveFrame) -> list[bytes]:
         """The messages of a frame, in their order."""
         weights = self._weights.of(frame).tolist()
         head = message(self._frame, frame.index, float(frame.time), float(frame.lag), frame.dropped)
-        return [head, *(part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights, strict=True))]
+        turned = message(self._turned, *frame.turned.tolist())
+        return [
+            head,
+            turned,
+            *(part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights, strict=True)),
+        ]
