@@ -142,7 +142,7 @@ def animate(
             retry_failed=batch.retry_failed,
         )
     from facediff.pipelines.animate import check_options, direction_for
-    from facediff.pipelines.opening import open_pipeline
+    from facediff.pipelines.trained import open_pipeline
     from facediff.speech.audio import read_recording
     from facediff.speech.voice_activity import speech_problems
     from facediff.utils.hub import may_have_weights

@@ -86,7 +86,7 @@ def live_model(options: AnimationOptions) -> LiveModel:
     import numpy as np
 
     from facediff.live.model import LiveModel, usual_gate
-    from facediff.pipelines.opening import open_pipeline
+    from facediff.pipelines.trained import open_pipeline
     from facediff.speech.voice_activity import USUAL_GATE, read_gate
 
     pipeline = open_pipeline(options)

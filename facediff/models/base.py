@@ -27,8 +27,8 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.channel_weights import ChannelWeights, channel_weights
+from facediff.models.checkpoint import checked_file
 from facediff.models.checkpoint_content import MotionScale, PersonStyles, StyleSource
-from facediff.models.checkpoint_reading import checked_file
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, with_usual_styles
 from facediff.models.inference import Prediction
 from facediff.models.mesh_encoders import MeshEncoder
@@ -583,6 +583,6 @@ class AnimationModel(PersonStyles, ABC):
         Raises:
             FaceDiffError: as :func:`facediff.models.checkpoint.read_checkpoint`.
         """
-        with checked_file(checkpoint_path, AnimationModel) as stream:
+        with checked_file(checkpoint_path) as stream:
             model: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
         return model

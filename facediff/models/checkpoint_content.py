@@ -2,7 +2,7 @@
 
 :class:`CheckpointContent` is the part of a model that writes and reads it, and :class:`PersonStyles` the one that
 encodes the speakers from all of their motion, in place of one reference clip (``style_source=person``). How an
-untrusted file is read stands in :mod:`facediff.models.checkpoint_reading`.
+untrusted file is read stands in :mod:`facediff.models.checkpoint`.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from facediff.editing.controls import check_controls, keys_file
 from facediff.errors import FaceDiffError, OptionError, choices, printable
 from facediff.export import FORMATS, check_export
 from facediff.pipelines.animate import check_options
-from facediff.pipelines.opening import open_pipeline
+from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.batch import FileTask, Recipe, run_batch

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import check_options, direction_for
-from facediff.pipelines.opening import open_pipeline
+from facediff.pipelines.trained import open_pipeline
 from facediff.speech.pcm import pcm
 from facediff.utils.files import atomic, check_writable
 

@@ -1,4 +1,7 @@
-"""A trained model as a pipeline: motion generated with PyTorch, in one pass, by windows and in streams."""
+"""The pipeline for a model, whichever kind it is; and the one for a trained model, which generates with PyTorch.
+
+Short speech is generated in one pass, long speech and streams by windows.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
 from facediff.spaces.rigs import LinearRig
 from facediff.utils.files import valid_text
-from facediff.utils.hub import model_name
+from facediff.utils.hub import is_audio2face, is_exported, model_name
 from facediff.utils.licences import licence_metadata
 
 if TYPE_CHECKING:
@@ -27,6 +30,25 @@ if TYPE_CHECKING:
     from facediff.pipelines.animate import Array
     from facediff.pipelines.directing import DirectedStream
     from facediff.spaces.decoding import ChannelDecoder
+
+
+def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
+    """The pipeline for the model that the options name: trained, with PyTorch, or exported, without.
+
+    Example::
+
+        pipeline = open_pipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))
+        pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), ExportOptions())
+    """
+    if is_audio2face(options.checkpoint):
+        from facediff.pipelines.audio2face import Audio2FacePipeline
+
+        return Audio2FacePipeline(options)
+    if is_exported(options.checkpoint):
+        from facediff.pipelines.exported import ExportedPipeline
+
+        return ExportedPipeline(options)
+    return TrainedPipeline(options)
 
 
 class TrainedPipeline(AnimationPipeline):

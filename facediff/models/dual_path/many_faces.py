@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.base import SIZES
+from facediff.models.checkpoint import face_content
 from facediff.models.checkpoint_content import FACES_KEY
-from facediff.models.checkpoint_reading import face_content
 from facediff.models.dual_path.model import DualPathDiffusion
 from facediff.models.motion_space import ComponentMotion
 from facediff.registry import model
@@ -48,7 +48,7 @@ class ManyFaces(DualPathDiffusion):
                 {"style_source": "person"}, "expected reference: further faces keep no speakers' styles"
             )
         shared = {name: value for name, value in options.items() if name not in SIZES}
-        # Named as in facediff.models.checkpoint_reading.FACES_PREFIX.
+        # Named as in facediff.models.checkpoint.FACES_PREFIX.
         self.further_faces = nn.ModuleDict(
             {name: DualPathDiffusion(**sizes, **shared) for name, sizes in (faces or {}).items()}
         )

@@ -26,8 +26,8 @@ from facediff.data.batch import ASSETS_KEY
 from facediff.data.corpus import read_templates
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.metrics import Region
+from facediff.models.checkpoint import check_weights
 from facediff.models.checkpoint_content import IMPORTED
-from facediff.models.checkpoint_reading import check_weights
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.recognition import (
     RECOGNISERS,
