@@ -16,7 +16,6 @@ import numpy as np
 
 from facediff.animation.animation import WITHOUT_FACE
 from facediff.animation.options import AnimationOptions
-from facediff.editing.direction import Direction
 from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
 from facediff.spaces.rigs import LinearRig
@@ -26,6 +25,7 @@ from facediff.utils.licences import licence_metadata
 
 if TYPE_CHECKING:
     from facediff.data import Assets, Reference
+    from facediff.editing.direction import Direction
     from facediff.models import AnimationModel, Style
     from facediff.pipelines.animate import Array
     from facediff.pipelines.directing import DirectedStream
