@@ -16,7 +16,7 @@ from facediff.animation.options import (
 )
 from facediff.errors import FaceDiffError
 from facediff.live.options import LiveOptions
-from facediff.utils.hub import check_animating_source, is_audio2face, may_have_weights, model_or_bundled
+from facediff.utils.hub import BUNDLED, check_animating_source, is_audio2face, may_have_weights, model_or_bundled
 from facediff.utils.option import Option
 
 SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
@@ -45,7 +45,8 @@ def live(
 
     For example:
       facediff live --microphone --to browser
-      facediff live speech.wav --checkpoint demo/puppet.ckpt --to livelink://127.0.0.1:11111 --shapes puppet
+      facediff live speech.wav --to livelink://127.0.0.1:11111
+      facediff live speech.wav --checkpoint demo/puppet.ckpt --to vmc --shapes puppet
       arecord -q -f S16_LE -r 16000 -t raw | facediff live puppet-onnx - --to jsonl:-
 
     Args:
@@ -77,7 +78,12 @@ def live(
     from facediff.pipelines.animate import check_options
 
     check_options(options)
-    performance = replace(performance, speech=None if speech is None else str(speech))
+    shapes = performance.shapes
+    if shapes is None and model == BUNDLED:
+        from facediff.editing.shapes import BUILT_IN
+
+        shapes = Path(BUILT_IN)
+    performance = replace(performance, speech=None if speech is None else str(speech), shapes=shapes)
     perform(performance, lambda: live_model(options), print_report, weights=may_have_weights(model))
 
 

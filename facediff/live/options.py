@@ -28,7 +28,8 @@ class LiveOptions(CheckedOptions):
         rate: sample rate of samples on standard input
         to: where the frames go: scheme://host:port, a scheme alone, or scheme:file; may be repeated (docs/live.md, and
             `facediff components receiver`)
-        shapes: blendshapes for receivers that take weights: folder of meshes, .glb with targets, or "puppet" (built in)
+        shapes: blendshapes for receivers that take weights: folder of meshes, .glb with targets, or "puppet" (built in;
+            the default for the model that comes with facediff)
         sound: where the speech is played, delayed to match: off, out (a sound device; out:NAME for one by its name), or
             receivers (the page in the browser) (default: receivers for a recording, else off)
         seconds: end after so much speech

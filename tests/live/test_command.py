@@ -18,6 +18,7 @@ from facediff.live.model import LiveModel, usual_gate
 from facediff.live.options import LiveOptions
 from facediff.registry import Kind
 from facediff.spaces import Rotation, Space
+from facediff.spaces.arkit import ARKIT
 from facediff.spaces.decoding import ChannelDecoder
 from facediff.speech.voice_activity import EnergyGate, Openness, read_gate
 from tests.fakes.live import FakeSound, Kept, device, fake_model
@@ -138,6 +139,15 @@ def test_weights_of_a_model_of_channels_are_sent_as_they_are(speech: Path) -> No
         np.testing.assert_allclose(frame.vertices, frame.index / 100 * deltas[0], atol=1e-5)
     with pytest.raises(FaceDiffError, match="shapes"):
         perform(options, fake_model, str, weights=True)
+
+
+def test_the_model_that_comes_with_facediff_has_its_own_shapes(speech: Path) -> None:
+    """Weights without an option: that model's face is the built-in one."""
+    assert facediff(["live", str(speech), "--to", "keep:1?weights=true", "--quiet"]) == 0
+    performance = MADE[0].performance
+    assert performance is not None
+    assert set(ARKIT) <= set(performance.shapes)
+    assert all(frame.weights is not None and len(frame.weights) == len(performance.shapes) for frame in MADE[0].frames)
 
 
 def test_weights_of_blendshapes_are_solved_for(speech: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
