@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from facediff import registry
 from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder
 from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed
@@ -35,13 +36,14 @@ def adapt(
     *,
     checkpoint: Checkpoint,
     person: Annotated[str | None, Option(metavar="DIR", reads=True)] = None,
+    face: Annotated[str | None, Option(metavar="CORPUS")] = None,
     voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
     low_latency: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_LOW_LATENCY_STEPS)] = None,
     audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     output: Output,
     mode: Mode = "finetune",
-    train: Literal["all", "person"] = "all",
+    train: Literal["all", "person", "head"] | None = None,
     epochs: Annotated[ranges.Epochs, Option(metavar="N")] = 60,
     learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE")] = 5e-4,
     data_root: Folder = None,
@@ -52,10 +54,11 @@ def adapt(
     yes: bool = False,
     licence: LicenceOptions,
 ) -> None:
-    """Fine-tune a checkpoint on a new speaker, or adapt its audio encoder to other voices or to low latency.
+    """Fine-tune a checkpoint on a new speaker or a new face, or adapt its audio encoder to voices or to low latency.
 
-    With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --voices,
-    its audio encoder is distilled to be robust to other voices, rooms and noise; with --low-latency, to need no more
+    With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --face, a
+    dual-path model gets a new head for another topology, or for channels, from a minute of motion. With --voices, its
+    audio encoder is distilled to be robust to other voices, rooms and noise; with --low-latency, to need no more
     than 0.12 s of speech ahead, and a smaller encoder may take its place. The corpus that the checkpoint was trained on
     must be on this machine.
 
@@ -63,6 +66,7 @@ def adapt(
         checkpoint: trained model (.ckpt)
         person: folder that `facediff data import-person` wrote, or the name of a speaker of the corpus who was not
             trained on and has clips that belong to no split
+        face: corpus of another face, by its registered name or as package.module.Class; --data-root is its folder
         voices: distil the audio encoder to be robust to other voices, rooms and noise, in so many steps (600 if no
             number); --mode, --epochs and --learning-rate are for --person
         low_latency: distil the audio encoder for low latency, in so many steps (1500 if no number)
@@ -72,7 +76,8 @@ def adapt(
             docs/voices.md)
         output: checkpoint to write (.ckpt)
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
-        train: train all weights, or those of identity and style only (person)
+        train: train all weights, those of identity and style only (person), or those of the face only (head); by
+            default all with --person, and head with --face
         epochs: epochs over the training clips
         learning_rate: falls to 0 as a cosine
         data_root: where the corpus is, if not where it was in training
@@ -86,17 +91,22 @@ def adapt(
     """
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
-    if sum(choice is not None for choice in (person, voices, low_latency)) != 1:
+    if sum(choice is not None for choice in (person, face, voices, low_latency)) != 1:
         raise FaceDiffError(
-            "--person, --voices, --low-latency: expected one of them: a new speaker, robustness to other voices, or an "
-            "audio encoder of low latency"
+            "--person, --face, --voices, --low-latency: expected one of them: a new speaker, another face, robustness "
+            "to other voices, or an audio encoder of low latency"
         )
+    if face is not None and (corpus is not None or mode != "finetune"):
+        raise FaceDiffError("--face: names the corpus, on which alone the head is trained; omit --corpus and --mode")
+    train = train or ("all" if face is None else "head")
+    if train == "head" and face is None:
+        raise FaceDiffError("--train head: is for --face; give all or person")
     if augmentation and voices is None:
         raise FaceDiffError("--augmentation: is an option of --voices; give --voices as well")
     if audio_encoder is not None and low_latency is None:
         raise FaceDiffError("--audio-encoder: is an option of --low-latency; give --low-latency as well")
     check_model_source(checkpoint, "--checkpoint")
-    if person is None:
+    if person is None and face is None:
         from facediff.models.audio_distillation import LOW_LATENCY_DISTILLATION, DistillationOptions
 
         if low_latency is not None:
@@ -115,14 +125,18 @@ def adapt(
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.cli.lightning import exit_statuses
     from facediff.cli.trainer_options import explained
-    from facediff.models.adaptation import train_only, with_extra_identities
+    from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
     from facediff.models.checkpoint import build_model, read_checkpoint
     from facediff.utils.licences import require_cleared
     from facediff.utils.progress import on_terminal
 
     started = time.monotonic()
     content = read_checkpoint(checkpoint)
-    name, data = adaptation_data(checkpoint, content, person, mode, data_root, corpus)
+    if person is not None:
+        name, data = adaptation_data(checkpoint, content, person, mode, data_root, corpus)
+    else:
+        data = corpus_of_face(str(face), data_root)
+        name = data.identities[0]
     model = build_model(checkpoint, content)
     if licence.commercial_only:
         require_cleared(checkpoint, model.licences)
@@ -133,11 +147,11 @@ def adapt(
         speakers = ", ".join(sorted(data.corpus.templates))
         raise FaceDiffError(f"--person {person}: neither a person's folder nor a speaker of the corpus ({speakers})")
     clips = data.clips("train")
-    if not any(clip.identity == name for clip in clips):
+    if person is not None and not any(clip.identity == name for clip in clips):
         raise FaceDiffError(f"--person {person}: no clip of {name} lies outside the corpus's test split")
     confirm_cost(yes, "--epochs", seconds=CLIP_SECONDS * epochs * len(clips))
     seed_everything(seed, verbose=False)
-    model = with_extra_identities(model, list(data.identities))
+    model = with_extra_identities(model, list(data.identities)) if face is None else with_new_face(model, data)
     model.provenance = {"parent": model_name(checkpoint)}
     model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
     train_only(model.train(), train)
@@ -159,12 +173,12 @@ def adapt(
     for parameter in model.parameters():
         parameter.requires_grad_(True)
     trainer.save_checkpoint(output)
-    seconds = sum(data.corpus.frames(clip) for clip in clips if clip.identity == name) / data.frame_rate
+    seconds = sum(data.corpus.frames(clip) for clip in clips if face or clip.identity == name) / data.frame_rate
     # Pictures need a mesh, which a corpus may lack.
     target = "speech.npz" if model.assets.faces is None else "speech.mp4"
     command = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", target]
     tell(
-        f"{output}: adapted to {name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
+        f"{output}: adapted to {face or name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
         f"next: {shlex.join(command)}"
     )
 
@@ -260,6 +274,20 @@ def write_distilled(
             content[key] = {**content[key], **weights}
     AtomicCheckpointIO().save_checkpoint(content, output)
     return error
+
+
+def corpus_of_face(face: str, root: Path | None) -> SpeechMotionDataModule:
+    """The data module of ``--face``, with its usual options."""
+    from facediff.cli.data import find_own_module
+    from facediff.data.check.layouts import by_name
+
+    find_own_module(face)
+    module = by_name(face, None) if "." in face else registry.corpus.get(face)
+    try:
+        data: SpeechMotionDataModule = module(**{} if root is None else {"root": str(root)})
+    except TypeError as error:
+        raise FaceDiffError(f"--face {face}: give the corpus's folder with --data-root") from error
+    return data
 
 
 def adaptation_data(

@@ -1,4 +1,4 @@
-"""Adapting a trained model to a new speaker: a row more in its identity table, and which weights are trained."""
+"""Adapting a trained model to a new speaker, by a row more in its identity table, or to a new face, by a new head."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import torch
 from lightning.pytorch.cli import instantiate_module
 from torch import Tensor
 
+from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
-from facediff.models.base import AnimationModel
+from facediff.models.base import SIZES, AnimationModel
+from facediff.models.dual_path import DualPathDiffusion
 
-Part = Literal["all", "person"]
-"""What is trained: everything, or only what holds identity and style."""
+Part = Literal["all", "person", "head"]
+"""What is trained: everything, only what holds identity and style, or only what belongs to one face."""
 
 
 def with_extra_identities(model: AnimationModel, identities: list[str]) -> AnimationModel:
@@ -42,6 +44,34 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     grown.adopt(replace(model.assets, identities=identities))
     grown.licences, grown.provenance = model.licences, model.provenance
     return grown
+
+
+def with_new_face(model: AnimationModel, data: SpeechMotionDataModule) -> AnimationModel:
+    """A model of another face with the trunk of a trained dual-path model, and a head that knows nothing yet.
+
+    Args:
+        model: a trained dual-path model, of one face or of many.
+        data: the new face's corpus, whose folder is there.
+
+    Raises:
+        FaceDiffError: if it is no dual-path model.
+    """
+    if not isinstance(model, DualPathDiffusion):
+        raise FaceDiffError(
+            f"--face: {type(model).__name__} has no trunk that other faces could share; expected a checkpoint of "
+            f"DualPathDiffusion or ManyFaces"
+        )
+    shared = {key: value for key, value in model.hparams.items() if key not in SIZES and not key.startswith("_")}
+    shared.pop("faces", None)
+    sizes = {name: getattr(data, name) for name in SIZES}
+    face: DualPathDiffusion = instantiate_module(DualPathDiffusion, {**shared, **sizes})
+    face.network.share_trunk(model.network)
+    face.adopt(data.assets().with_motion_scale(data.motion_scale()))
+    face.attach_mesh()
+    face.measure(data)
+    face.scale_like(model, data)
+    face.licences = model.licences
+    return face
 
 
 def with_audio_encoder(model: AnimationModel, encoder: dict[str, Any]) -> AnimationModel:
@@ -87,6 +117,12 @@ def train_only(model: AnimationModel, part: Part) -> None:
         FaceDiffError: if the model has nothing of that part.
     """
     if part == "all":
+        return
+    if part == "head":
+        trunk = model.network.trunk() if isinstance(model, DualPathDiffusion) else []
+        shared = {id(parameter) for parameter in trunk}
+        for parameter in model.parameters():
+            parameter.requires_grad_(id(parameter) not in shared and parameter.requires_grad)
         return
     chosen = {id(p) for module in model.personal_modules() for p in module.parameters()}
     if not chosen:

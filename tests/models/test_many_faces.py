@@ -18,6 +18,7 @@ from lightning.pytorch import Callback, Trainer
 from facediff import registry
 from facediff.callbacks import EmaWithWarmup
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
+from facediff.cli.app import main
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
@@ -214,6 +215,39 @@ def test_a_resumed_training_equals_a_whole_one(
     resumed = train(tmp_path / "stopped", resume=str(next((tmp_path / "stopped").rglob("last.ckpt"))))
     assert whole.keys() == resumed.keys()
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_a_new_face_costs_a_head(roots: dict[str, Path], trained: Path, tmp_path: Path) -> None:
+    words = ["--checkpoint", str(trained), "--face", "tests.models.test_many_faces.Halved", "--yes", "--quiet"]
+    words += [
+        "--data-root",
+        str(roots["halved"]),
+        "--accelerator",
+        "cpu",
+        "--epochs",
+        "2",
+        "-o",
+        str(tmp_path / "new.ckpt"),
+    ]
+    assert main(["adapt", *words]) == 0
+    before, after = load_model(trained), load_model(tmp_path / "new.ckpt")
+    assert isinstance(before, ManyFaces)
+    assert isinstance(after, DualPathDiffusion)
+    assert not isinstance(after, ManyFaces)
+    assert after.n_vertices == VERTICES // 2
+    for one, other in zip(before.network.trunk(), after.network.trunk(), strict=True):
+        assert torch.equal(one, other)
+    assert bool(after.network.unembed.weight.any())  # it starts from zero
+    assert float(after.motion_space.sizes[0]) == pytest.approx(float(before.motion_space.sizes[0]), rel=1e-4)
+    assert after.animate(torch.zeros(8000), identity="A").vertices.shape[1:] == (VERTICES // 2, 3)
+
+
+@pytest.mark.parametrize("words", [["--corpus", "Tiny"], ["--mode", "joint"], ["--person", "C"]])
+def test_options_that_do_not_go_with_a_new_face_are_refused(
+    trained: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["adapt", "--checkpoint", str(trained), "--face", "Puppet", "-o", "x.ckpt", *words]) == 2
+    assert "--face" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

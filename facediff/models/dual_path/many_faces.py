@@ -20,7 +20,6 @@ from facediff.models.base import SIZES
 from facediff.models.checkpoint import face_content
 from facediff.models.checkpoint_content import FACES_KEY
 from facediff.models.dual_path.model import DualPathDiffusion
-from facediff.models.motion_space import ComponentMotion
 from facediff.registry import model
 
 
@@ -95,20 +94,7 @@ class ManyFaces(DualPathDiffusion):
             face.data_options = dict(data.further[name].hparams)
             face.licences = self.licences  # the trunk has learnt from everything
             if untrained and stage == "fit":
-                self._scale_alike(face, data.further[name])
-
-    def _scale_alike(self, face: DualPathDiffusion, data: SpeechMotionDataModule) -> None:
-        """Give a face's largest movement the size of the first face's.
-
-        Unit variance of a coordinate says little: 60 weights are smaller as a whole than the coordinates of 6 000
-        vertices by a factor of 20, and the same noise would hide another share of them.
-        """
-        spaces = self.motion_space, face.motion_space
-        if face.assets.motion_scale is None or not all(isinstance(space, ComponentMotion) for space in spaces):
-            return
-        own, other = (float(cast(ComponentMotion, space).components.deviations[0]) for space in spaces)
-        face.adopt(face.assets.with_motion_scale(face.assets.motion_scale * own / other))
-        face.measure(data)
+                face.scale_like(self, data.further[name])
 
     def on_fit_start(self) -> None:
         """Say for every corpus in which form training motion is wanted."""

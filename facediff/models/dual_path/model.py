@@ -263,6 +263,24 @@ class DualPathDiffusion(AnimationModel):
         space.fit(self.process.signal, covariance)
         return shapes
 
+    def scale_like(self, other: DualPathDiffusion, data: SpeechMotionDataModule) -> None:
+        """Give the largest movement the size that it has in another face's model.
+
+        Unit variance of a coordinate says little: 60 weights are smaller as a whole than the coordinates of 6 000
+        vertices by a factor of 20, and the same noise would hide another share of them.
+
+        Args:
+            other: a measured model.
+            data: this model's corpus, on which it has been measured too.
+        """
+        own, theirs = self.motion_space, other.motion_space
+        scale = self.assets.motion_scale
+        if scale is None or not isinstance(own, ComponentMotion) or not isinstance(theirs, ComponentMotion):
+            return
+        ratio = float(theirs.components.deviations[0] / own.components.deviations[0])
+        self.adopt(self.assets.with_motion_scale(scale * ratio))
+        self.measure(data)
+
     def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "points dims"]:
         """The motion space's weights of regions, of those that the corpus lists."""
         weighted = self.weighted_assets

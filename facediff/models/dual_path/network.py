@@ -168,6 +168,12 @@ class DualPathNetwork(nn.Module):
         for name in TRUNK:
             setattr(self, name, getattr(other, name))
 
+    def trunk(self) -> list[nn.Parameter]:
+        """The weights of :data:`TRUNK`."""
+        parts = [getattr(self, name) for name in TRUNK]
+        own = [part for part in parts if isinstance(part, nn.Parameter)]
+        return own + [weight for part in parts if isinstance(part, nn.Module) for weight in part.parameters()]
+
     @property
     def style_dim(self) -> int:
         """Numbers of a style vector: F_dyn, and with :class:`SpeechStyle` how much of what the speech asks is added."""
