@@ -484,11 +484,7 @@ FORMAT = "facediff generation metrics 1"
 
 
 def means_of(content: object, source: object) -> dict[str, dict[str, float | None]]:
-    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave.
-
-    Raises:
-        FaceDiffError: if it is anything else.
-    """
+    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave."""
     means: dict[str, dict[str, float | None]] = {}
     try:
         if not isinstance(content, dict) or content["format"] != FORMAT:

@@ -123,11 +123,7 @@ def export_model(
 
 
 def require_onnx() -> None:
-    """Refuse to begin without the packages.
-
-    Raises:
-        MissingExtraError: naming the extra.
-    """
+    """Refuse to begin without the packages."""
     import importlib.util
 
     for package in ("onnx", "onnxscript", "onnxruntime"):

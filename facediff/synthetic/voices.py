@@ -77,11 +77,7 @@ class Synthesiser(ABC):
 
     @abstractmethod
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
-        """Speak a sentence; the same arguments give the same samples.
-
-        Raises:
-            FaceDiffError: if the program fails.
-        """
+        """Speak a sentence; the same arguments give the same samples."""
 
 
 def open_voice(name: str) -> Synthesiser:

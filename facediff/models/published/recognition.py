@@ -115,11 +115,7 @@ class AuthorsWeights:
         return [name for name in self.tensors if name.startswith(prefix)]
 
     def get(self, name: str) -> Tensor:
-        """A tensor, which counts as used.
-
-        Raises:
-            FaceDiffError: if it is missing.
-        """
+        """A tensor, which counts as used."""
         if name not in self.tensors:
             raise FaceDiffError(
                 f"{self.source}: lacks the tensor {name}; give the checkpoint of the whole model, as its authors "
@@ -129,22 +125,14 @@ class AuthorsWeights:
         return self.tensors[name]
 
     def shape(self, name: str, dims: int = 2) -> tuple[int, ...]:
-        """The shape of a tensor.
-
-        Raises:
-            FaceDiffError: if it is missing, or has another number of dimensions.
-        """
+        """The shape of a tensor."""
         shape = tuple(self.get(name).shape)
         if len(shape) != dims or not all(shape):
             raise FaceDiffError(f"{self.source}: its tensor {name} has the shape {shape}; expected {dims} dimensions")
         return shape
 
     def move(self, old: str, new: str) -> None:
-        """Use a tensor under another name.
-
-        Raises:
-            FaceDiffError: if it is missing, or another one has that name.
-        """
+        """Use a tensor under another name."""
         if new in self.renamed:
             raise FaceDiffError(
                 f"{self.source}: holds {self._origins[new]} and {old}, which are the same tensor; expected one of them"

@@ -167,11 +167,7 @@ def faces(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
 
 
 def released_array(root: Path, folder: str, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An array of the data release.
-
-    Raises:
-        FaceDiffError: if it cannot be read or has another shape.
-    """
+    """An array of the data release."""
     path = root / folder / name
     if not path.is_file():
         raise OptionError.naming(f"{{data_root}} {root}: has no {folder}/{name}; expected UniTalker's data release")
