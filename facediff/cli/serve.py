@@ -8,7 +8,7 @@ from typing import Annotated
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.hub import model_or_bundled
+from facediff.utils.hub import is_audio2face, model_or_bundled
 from facediff.utils.option import Option
 from facediff.utils.server import LOOPBACK, require_server
 
@@ -50,6 +50,8 @@ def serve(
     from facediff.runtime.site import make_site, serve_site, write_site
 
     model = model_or_bundled(model)
+    if is_audio2face(model):
+        raise FaceDiffError(f"{model}: the page has no Audio2Face-3D; animate with it by `facediff animate` or `live`")
     read_folder(model)  # before anything is fetched
     site = make_site(model, web_runtime(runtime, say=tell), recordings or ())
     if output is not None:

@@ -200,3 +200,9 @@ def test_live_needs_no_windows(
     assert main(words) == 0
     lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     assert len(lines) >= 5  # a slow machine drops frames
+
+
+@pytest.mark.usefixtures("content")
+def test_the_page_of_serve_refuses_it(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", str(folder), "-o", str(tmp_path / "site")]) == 2
+    assert "Audio2Face-3D" in capsys.readouterr().err
