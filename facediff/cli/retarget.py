@@ -61,7 +61,7 @@ def retarget(
         show: picture of both faces at the widest mouth, a full blink and raised brows
         accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
-            (default for a .glb from a .glb that has textures, skins or targets)
+            (default for a .glb from a .glb that has materials, skins or targets)
         bare_face: write the animated surface alone, without what else the target .glb has
         own_shapes: of a target .glb, drive its own shapes (ARKit's, VRM's or Oculus' names) and its bones for head,
             eyes and jaw, and add none. Weights go by name where the motion has ARKit's or is of the built-in face,

@@ -217,12 +217,12 @@ def open_glb(path: Path) -> Glb:
 
 
 def wears_more(path: Path) -> bool:
-    """Whether a file is a .glb with what its surface alone lacks: images, skins or targets of shapes."""
+    """Whether a file is a .glb with what its surface alone lacks: materials, skins or targets of shapes."""
     if path.suffix.lower() != ".glb":
         return False
     try:
         glb = open_glb(path)
         parts = [part for mesh in range(len(glb.entries("meshes"))) for part in glb.primitives(mesh)]
-        return bool(glb.entries("images") or glb.entries("skins") or any("targets" in part for part in parts))
+        return bool(glb.entries("materials") or glb.entries("skins") or any("targets" in part for part in parts))
     except ValueError:  # the reader of meshes says what is wrong
         return False

@@ -269,7 +269,7 @@ class AnimationPipeline(ABC):
         """
         from facediff.export import write_animations
 
-        # What a surface alone lacks would be lost: textures, skins and targets of a .glb, coordinates of an .obj.
+        # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates of an .obj.
         wears_more, has_uvs = self._target_beyond_surface
         is_dressed = output.suffix in (".glb", ".fbx") and export.output_unit is None and wears_more
         into = Path(self.options.target_mesh or "") if is_dressed or has_uvs else None

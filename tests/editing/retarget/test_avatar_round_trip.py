@@ -196,6 +196,13 @@ def test_the_command_writes_into_the_avatar_unless_the_bare_face_is_asked_for(
     assert not wears_more(tmp_path / "talk.npz")
 
 
+def test_an_avatar_of_a_plain_colour_keeps_it(tmp_path: Path) -> None:
+    bare = {"asset": {"version": "2.0"}, "meshes": [{"primitives": [{"attributes": {}}]}]}
+    (tmp_path / "bare.glb").write_bytes(pack(bare, b""))
+    (tmp_path / "plain.glb").write_bytes(pack({**bare, "materials": [{"name": "skin"}]}, b""))
+    assert [wears_more(tmp_path / name) for name in ("bare.glb", "plain.glb")] == [False, True]
+
+
 def test_a_mesh_shown_twice_moves_where_it_should(tmp_path: Path, parts: dict[str, AvatarPart]) -> None:
     """Two eyes of one mesh, of which one turns: the other keeps the file's."""
     some = {name: parts[name] for name in ("Head", "EyeLeft")}
