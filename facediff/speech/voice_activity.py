@@ -7,6 +7,7 @@ in streams alike; and what is wrong with a recording (:func:`speech_problems`).
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
 from collections import deque
@@ -72,6 +73,15 @@ CLEARLY = 10.0
 
 MEMORY = 500
 """Steps for which the level of noise is remembered."""
+
+NEAR = 14
+"""Steps on either side of one, within which something must be nearly as loud as the loudest for it to be speech."""
+
+NEARLY = 9.0
+"""Decibels below the loudest that are nearly as loud."""
+
+BACKGROUND = 34.0
+"""Decibels below the loudest: what is never softer for :data:`MEMORY` steps has something besides speech in it."""
 
 HYSTERESIS = 3.0
 """Decibels by which speech must fall below the limit that it has risen above."""
@@ -197,6 +207,8 @@ class _EnergyListener(Listener):
         self._waiting: deque[float] = deque()  # levels that are not decided yet
         self._short: deque[tuple[int, float]] = deque()  # steady stretches (last step, level), softer ones later
         self._long: deque[tuple[int, float]] = deque()
+        self._softest: deque[tuple[int, float]] = deque()  # smoothed levels, steady or not; softer ones later
+        self._past: deque[float] = deque(maxlen=NEAR + 1)  # levels of the latest steps that were decided on
         self._loudest = QUIETEST
         self._step = -1  # the latest one that was heard
         self._speaking = False
@@ -227,6 +239,8 @@ class _EnergyListener(Listener):
         self._waiting.append(max(level, 10 * math.log10(power) if power > 1e-12 else SILENT))
         self._levels.append(level)
         self._loudest = max(level, self._loudest - FADING / 100, QUIETEST)
+        _add_softer(self._softest, self._step, level)
+        _forget(self._softest, self._step)
         latest = list(self._levels)
         for length, flat, stretches in (
             (SHORT, FLAT, self._short),
@@ -235,15 +249,13 @@ class _EnergyListener(Listener):
             some = [max(each, QUIETEST - 20) for each in latest[-length:]]
             if len(some) == length and max(some) - min(some) < flat:
                 steady = sum(some) / length
-                while stretches and stretches[-1][1] >= steady:
-                    stretches.pop()
-                stretches.append((self._step, steady))
-            while stretches and stretches[0][0] < self._step - MEMORY:
-                stretches.popleft()
+                _add_softer(stretches, self._step, steady)
+            _forget(stretches, self._step)
 
     def _decide(self) -> bool:
         """Whether the first step that waits is speech."""
         level = self._waiting.popleft()
+        self._past.append(level)
         limit = max(QUIETEST, self._loudest - LOUDEST_ABOVE)
         noise = [self._long[0][1]] if self._long else []
         if self._short and self._short[0][1] < self._loudest - CLEARLY:
@@ -251,7 +263,28 @@ class _EnergyListener(Listener):
         if noise:
             limit = max(limit, min(noise) + self.gate.margin)
         self._speaking = level > (limit - HYSTERESIS if self._speaking else limit)
-        return self._speaking
+        return self._speaking and not self._behind_speech()
+
+    def _behind_speech(self) -> bool:
+        """Whether something sounds all the time, and nothing around the step is nearly as loud as the speech was."""
+        # Without what comes next, the first sounds of a word are as soft as music. Where nothing else sounds, speech
+        # itself is silent for a moment at every p, t and k.
+        if self.gate.look_ahead < NEAR or self._softest[0][1] < self._loudest - BACKGROUND:
+            return False
+        return max(*self._past, *itertools.islice(self._waiting, NEAR)) < self._loudest - NEARLY
+
+
+def _add_softer(stretches: deque[tuple[int, float]], step: int, value: float) -> None:
+    """Add the latest stretch to those that may become the softest one."""
+    while stretches and stretches[-1][1] >= value:
+        stretches.pop()
+    stretches.append((step, value))
+
+
+def _forget(stretches: deque[tuple[int, float]], step: int) -> None:
+    """Drop the stretches that are too long ago."""
+    while stretches and stretches[0][0] < step - MEMORY:
+        stretches.popleft()
 
 
 @voice_gate.register("webrtc")

@@ -49,6 +49,26 @@ def test_mouth_rests_in_pauses_and_no_onset_is_cut(decibels: float) -> None:
     assert found[[*range(18), *range(84, 94), *range(159, 175)]].max() < 0.01
 
 
+def with_plucked_notes(speech: np.ndarray, decibels: float) -> np.ndarray:
+    """Speech with three notes a second that decay, every other one louder by 9 dB."""
+    time = np.arange(len(speech)) / RATE
+    notes = sum(np.sin(2 * np.pi * (330 + 55 * order) * time) for order in range(4)) * np.exp(-3 * (time % 0.35))
+    notes *= np.where(time // 0.35 % 2, 2.8, 1.0)
+    return speech + notes / np.sqrt((notes**2).mean()) * 10 ** (-decibels / 20) * 0.1
+
+
+def test_music_far_behind_the_speech_is_a_pause() -> None:
+    found = openness(with_plucked_notes(sentence_with_pauses(200), 18), 175, FRAMES, EnergyGate())
+    assert found[[*range(27, 73), *range(102, 148)]].min() > 0.99
+    assert found[86:93].max() < 0.01
+
+
+def test_soft_words_in_quiet_are_speech() -> None:
+    """Without anything behind the speech, it may be as soft as it likes."""
+    speech = np.concatenate([np.zeros(RATE), 0.1 * talk(2, 1), np.zeros(RATE), 0.02 * talk(2, 2), np.zeros(RATE)])
+    assert openness(speech, 175, FRAMES, EnergyGate())[102:148].min() > 0.99
+
+
 def test_gate_opens_before_speech_by_lead_and_closes_after_hold_within_release() -> None:
     speech = np.concatenate([np.zeros(RATE), talk(1), np.zeros(RATE)])
     times = (np.arange(300) + 0.5) / 100
@@ -102,7 +122,7 @@ def gates() -> list[VoiceGate]:
 @settings(max_examples=15, deadline=None)
 def test_openness_does_not_depend_on_how_speech_is_cut(cuts: list[int], which: int) -> None:
     gate = gates()[which]
-    speech = sentence_with_pauses(25)[: 5 * RATE]
+    speech = with_plucked_notes(sentence_with_pauses(25), 15)[: 5 * RATE]
     whole = openness(speech, 125, FRAMES, gate)
     stream, parts, start = Openness(gate, FRAMES), [], 0
     for cut in [*cuts, len(speech)]:

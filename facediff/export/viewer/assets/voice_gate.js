@@ -3,6 +3,7 @@
 const GATE_HOP = 160; // samples of a step of 10 ms
 const QUIETEST_LEVEL = -65, SILENT_LEVEL = -120, LOUDEST_ABOVE = 40, FADING = 3;
 const SMOOTH_STEPS = 5, LONG_STEPS = 100, CLEARLY = 10, NOISE_MEMORY = 500, HYSTERESIS = 3;
+const NEAR_STEPS = 14, NEARLY_AS_LOUD = 9, BACKGROUND = 34;
 /** Steps, decibels and which list: noise far below the speech, and noise as loud as it. */
 const STEADY = [[25, 7, 0], [60, 3, 1], [LONG_STEPS, 5, 1]];
 /** 150 Hz to 5 kHz at 16 kHz, in second-order sections: b0, b1, b2, a1, a2. */
@@ -40,7 +41,9 @@ class EnergyListener {
     this.recent = []; // powers of the latest steps
     this.levels = []; // smoothed levels of the latest steps
     this.waiting = []; // levels that are not decided yet
-    this.stretches = [[], []]; // steady stretches [last step, level], softer ones later; short ones, and long ones
+    this.past = []; // levels of the latest steps that were decided on
+    // Stretches [last step, level], softer ones later: short steady ones, long steady ones, and single steps.
+    this.stretches = [[], [], []];
     this.loudest = QUIETEST_LEVEL;
     this.step = -1;
     this.speaking = false;
@@ -65,26 +68,40 @@ class EnergyListener {
     this.waiting.push(Math.max(level, decibels(power))); // a step that is loud by itself is loud
     this.levels = [...this.levels.slice(1 - LONG_STEPS), level];
     this.loudest = Math.max(level, this.loudest - FADING / 100, QUIETEST_LEVEL);
+    this.keep(2, level);
     for (const [length, flat, which] of STEADY) {
-      const stretches = this.stretches[which];
       const some = this.levels.slice(-length).map((each) => Math.max(each, QUIETEST_LEVEL - 20));
       if (some.length === length && Math.max(...some) - Math.min(...some) < flat) {
-        const steady = some.reduce((sum, each) => sum + each, 0) / length;
-        while (stretches.length && stretches.at(-1)[1] >= steady) stretches.pop();
-        stretches.push([this.step, steady]);
+        this.keep(which, some.reduce((sum, each) => sum + each, 0) / length);
       }
+    }
+    for (const stretches of this.stretches) {
       while (stretches.length && stretches[0][0] < this.step - NOISE_MEMORY) stretches.shift();
     }
   }
 
+  /** Add the latest stretch to those that may become the softest one. */
+  keep(which, value) {
+    const stretches = this.stretches[which];
+    while (stretches.length && stretches.at(-1)[1] >= value) stretches.pop();
+    stretches.push([this.step, value]);
+  }
+
   decide() {
     const level = this.waiting.shift(), [short, long] = this.stretches;
+    this.past = [...this.past.slice(-NEAR_STEPS), level];
     let limit = Math.max(QUIETEST_LEVEL, this.loudest - LOUDEST_ABOVE);
     const noise = long.length ? [long[0][1]] : [];
     if (short.length && short[0][1] < this.loudest - CLEARLY) noise.push(short[0][1]);
     if (noise.length) limit = Math.max(limit, Math.min(...noise) + this.gate.margin);
     this.speaking = level > (this.speaking ? limit - HYSTERESIS : limit);
-    return this.speaking;
+    return this.speaking && !this.behindSpeech();
+  }
+
+  /** Whether something sounds all the time, and nothing around the step is nearly as loud as the speech was. */
+  behindSpeech() {
+    if (this.gate.ahead < NEAR_STEPS || this.stretches[2][0][1] < this.loudest - BACKGROUND) return false;
+    return Math.max(...this.past, ...this.waiting.slice(0, NEAR_STEPS)) < this.loudest - NEARLY_AS_LOUD;
   }
 }
 
