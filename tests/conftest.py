@@ -4,6 +4,7 @@ import os
 import signal
 
 import pytest
+from jaxtyping import install_import_hook
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
@@ -14,15 +15,16 @@ os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what 
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports, also
+# those of the conftest.py of folders that are named on the command line, which are read before pytest_configure.
+SHAPED = "audio_encoders speaker_encoders mesh_encoders fusions decoders layers losses samplers folding losses_fused"
+SHAPED += " motion_space deepspeech"
+install_import_hook([f"facediff.models.{module}" for module in SHAPED.split()], "beartype.beartype")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """What takes seconds to import is for the processes that run tests, not for the one that hands them out."""
     handed_out = config.getoption("numprocesses", None) and not config.option.collectonly
     if handed_out and not hasattr(config, "workerinput"):
         return
-    # The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports.
-    from jaxtyping import install_import_hook
-
-    shaped = "audio_encoders speaker_encoders mesh_encoders fusions decoders layers losses samplers folding"
-    shaped += " losses_fused motion_space deepspeech"
-    install_import_hook([f"facediff.models.{module}" for module in shaped.split()], "beartype.beartype")
     config.pluginmanager.import_plugin("tests.fakes.fixtures")
