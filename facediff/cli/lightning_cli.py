@@ -372,7 +372,11 @@ class FaceDiffCLI(LightningCLI):
     before_test = before_predict = before_validate
 
     def _set_seed(self) -> None:
-        """Set the seed."""
+        """Set the seed.
+
+        Raises:
+            ArgumentError: if it is no seed.
+        """
         seed = self._get(self.config, "seed_everything")
         expected = mismatch(bool | Annotated[int, Range(0, 2**32 - 1)] | None, seed)
         if expected is not None:

@@ -41,7 +41,11 @@ PROCESSES = 4
 
 
 def check_trainer(options: Mapping[str, Any]) -> None:
-    """Refuse numbers that no training can have."""
+    """Refuse numbers that no training can have.
+
+    Raises:
+        ArgumentError: naming the option.
+    """
     for name, hint in RANGES.items():
         expected = mismatch(hint, options[name]) if name in options else None
         if expected is not None:
@@ -61,7 +65,11 @@ SHARDED = ("fsdp", "deepspeed", "modelparallel")
 
 
 def check_machine(options: Mapping[str, Any]) -> None:
-    """Refuse GPUs that are not there, and strategies that need them."""
+    """Refuse GPUs that are not there, and strategies that need them.
+
+    Raises:
+        ArgumentError: naming the option.
+    """
     import torch
 
     accelerator, strategy = options.get("accelerator"), options.get("strategy")

@@ -24,6 +24,9 @@ def conversation_file(root: Path, folder: str, clip: str) -> npt.NDArray[Any]:
         root: the corpus's folder.
         folder: ``partner`` or ``speaking``.
         clip: the clip's name.
+
+    Raises:
+        FaceDiffError: if the file is missing, or of another shape.
     """
     path = root / folder / f"{clip}.npy"
     array = open_array(path, kinds=CONVERSATION[folder])

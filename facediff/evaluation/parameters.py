@@ -60,7 +60,11 @@ class ParameterFiles:
         rig: Path | None,
         stride: int,
     ) -> ParameterFiles:
-        """As the first truth's file says."""
+        """As the first truth's file says.
+
+        Raises:
+            FaceDiffError: if it cannot be read, or the rig has none of its channels.
+        """
         first = _read(files[0], layouts[1])
         opened: AnyRig | None = None
         if rig is not None:
@@ -96,7 +100,11 @@ class ParameterFiles:
         return rig.template if person is None else rig.shaped(person)
 
     def read(self, path: Path, stride: int) -> Motion:
-        """Channels of a file in the order of the space, and the vertices of a face that does not turn its head."""
+        """Channels of a file in the order of the space, and the vertices of a face that does not turn its head.
+
+        Raises:
+            FaceDiffError: if the file has other channels, or another frame rate.
+        """
         is_truth = path.is_relative_to(self.truth)
         clip = even(_read(path, self.layouts[1 if is_truth else 0]))
         if abs(clip.frame_rate / stride - self.frame_rate) > 0.01 * self.frame_rate:

@@ -50,6 +50,9 @@ def write_fbx(
         animation: for its frame rate.
         sound: name of the file of its sound; None if there is none.
         write_glb: writes the .glb of that name, and returns its files.
+
+    Raises:
+        FaceDiffError: if Blender fails.
     """
     refuse_without_blender(path)
     with scratch_folder(path) as hidden:

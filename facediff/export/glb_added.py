@@ -58,7 +58,11 @@ def open_to_add(target: Path) -> tuple[Glb, GlbWriter]:
 
 
 def parts_of(glb: Glb, animation: Animation) -> list[Placed]:
-    """The placed parts of a .glb that an animation was carried to."""
+    """The placed parts of a .glb that an animation was carried to.
+
+    Raises:
+        FaceDiffError: if the animation has another number of vertices.
+    """
     parts = list(placed_parts(glb))
     total = sum(len(part.local) for part in parts)
     if total != len(animation.template):

@@ -97,7 +97,11 @@ def needs_shapes(name: str) -> FaceDiffError:
 
 
 def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:
-    """Names of a set of blendshapes, and the solver of their weights for a frame."""
+    """Names of a set of blendshapes, and the solver of their weights for a frame.
+
+    Raises:
+        FaceDiffError: if the shapes do not fit the face.
+    """
     from facediff.editing.live_weights import FrameSolver
     from facediff.editing.shapes import read_shapes
 

@@ -175,6 +175,9 @@ class Receiver(ABC):
 def read_address(text: str) -> Address:
     """An address: ``scheme://host:port?option=value``, ``scheme:port``, ``scheme:file``, or the scheme alone.
 
+    Raises:
+        FaceDiffError: if it is malformed.
+
     Example:
         >>> read_address("livelink://127.0.0.1:11111?subject=Ann").port
         11111
@@ -227,7 +230,11 @@ def open_receiver(text: str) -> Receiver:
 
 
 def open_receivers(texts: Sequence[str]) -> list[Receiver]:
-    """The receivers at several addresses, none of which is given twice."""
+    """The receivers at several addresses, none of which is given twice.
+
+    Raises:
+        FaceDiffError: as :func:`open_receiver`.
+    """
     for place, text in enumerate(texts):
         if text in texts[:place]:
             raise FaceDiffError(f"{OPTION} {text}: is given twice; give every receiver once")

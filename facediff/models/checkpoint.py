@@ -153,7 +153,11 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
 
 
 def read_assets(path: Path | str) -> Assets:
-    """The assets alone: templates, faces, frame rate …; no class that the checkpoint names is looked at."""
+    """The assets alone: templates, faces, frame rate …; no class that the checkpoint names is looked at.
+
+    Raises:
+        FaceDiffError: if the file is missing, or no checkpoint of this version of facediff.
+    """
     with open_content(path, weights=False) as (content, name):
         return assets_of(name, content)
 
@@ -217,6 +221,9 @@ def open_content(
         path: a checkpoint, which may be open; a model folder; a name of the Hugging Face hub; or one face of any of
             them, as :func:`facediff.utils.hub.split_face` reads it.
         weights: whether to read the weights of a model folder too.
+
+    Raises:
+        FaceDiffError: if there is none, or it is damaged.
     """
     face = None
     if isinstance(path, str | os.PathLike):
@@ -238,6 +245,9 @@ def face_content(checkpoint: dict[str, Any], face: str, path: object) -> dict[st
         checkpoint: of many faces.
         face: the name of one that is not the first.
         path: the file, for messages.
+
+    Raises:
+        FaceDiffError: if there is no such face, or it is damaged.
     """
     faces = checkpoint.get(FACES_KEY)
     if not isinstance(faces, dict) or face not in faces or not isinstance(faces[face], dict):
@@ -261,7 +271,11 @@ def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
 
 
 def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
-    """Refuse a content that has not the outer form of a checkpoint of facediff's."""
+    """Refuse a content that has not the outer form of a checkpoint of facediff's.
+
+    Raises:
+        FaceDiffError: naming the file and the part.
+    """
     if not isinstance(checkpoint, dict) or not {ASSETS_KEY, "hyper_parameters", "state_dict"} <= checkpoint.keys():
         raise FaceDiffError(
             f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
@@ -290,7 +304,11 @@ def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - what
 
 
 def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
-    """The assets of a checkpoint's content."""
+    """The assets of a checkpoint's content.
+
+    Raises:
+        FaceDiffError: naming the file and what is wrong with them.
+    """
     try:
         return Assets.from_state(checkpoint[ASSETS_KEY])
     except FaceDiffError as error:
@@ -395,7 +413,11 @@ def weight_budget(path: Path | str, weights: Iterable[torch.Tensor]) -> Iterator
 
 
 def check_weights(path: Path | str, weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> None:
-    """Refuse weights whose numbers are of another sort than the model's: copying would change them in silence."""
+    """Refuse weights whose numbers are of another sort than the model's: copying would change them in silence.
+
+    Raises:
+        FaceDiffError: naming the weights.
+    """
     for name, value in weights.items():
         mine = own.get(name)
         if isinstance(mine, torch.Tensor) and mine.is_floating_point() != value.is_floating_point():

@@ -115,7 +115,11 @@ class CheckpointContent(LightningModule, Inference):
         return OFF if IMPORTED in self.provenance else USUAL_GATE
 
     def adopt(self, assets: Assets) -> None:
-        """Take over a corpus's assets after checking that they fit the model's sizes."""
+        """Take over a corpus's assets after checking that they fit the model's sizes.
+
+        Raises:
+            FaceDiffError: naming what differs.
+        """
         sizes = {template.shape[0] for template in assets.templates.values()}
         for what, mine, theirs in (
             ("kinds of space", self.space.kind, assets.space.kind),
@@ -201,7 +205,11 @@ class CheckpointContent(LightningModule, Inference):
 
 
 def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
-    """What a checkpoint was made from; the epochs and steps of one that says nothing else."""
+    """What a checkpoint was made from; the epochs and steps of one that says nothing else.
+
+    Raises:
+        FaceDiffError: if it is anything but short texts by name.
+    """
     texts = checkpoint.get(PROVENANCE_KEY, {})
     if not isinstance(texts, dict) or not all(
         isinstance(text, str) and is_plain_text(text) for pair in texts.items() for text in pair

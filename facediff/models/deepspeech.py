@@ -173,6 +173,9 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
     Args:
         graph: a frozen graph's constants by name.
         source: the file, for messages.
+
+    Raises:
+        FaceDiffError: if it is another network's.
     """
     matched: dict[str, Tensor] = {}
     left = []
@@ -242,7 +245,11 @@ def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
 
 
 def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
-    """The network's sizes, checked."""
+    """The network's sizes, checked.
+
+    Raises:
+        ArgumentError: if they are others than expected.
+    """
     stated = {name: sizes.get(name) for name in SIZES}
     sizes = {name: size for name, size in sizes.items() if name != "_name_or_path"}
     fits = all(isinstance(size, int) and not isinstance(size, bool) and 0 < size <= 1 << 16 for size in stated.values())
@@ -270,6 +277,9 @@ class DeepSpeechEncoder(AudioEncoder):
         source: the frozen graph ``output_graph.pb`` of the release 0.1.0, which TensorFlow is not needed for.
         config: the network's sizes; if given, the weights are not read from ``source`` but left for a checkpoint to
             fill in. Checkpoints use it, so that they need no access to ``source``.
+
+    Raises:
+        FaceDiffError: if ``source`` cannot be read, or is no such graph.
     """
 
     checkpoint_options = ("config",)  # without it, a file could have another one read

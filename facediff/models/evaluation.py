@@ -157,6 +157,9 @@ class Evaluation:
     """Metrics of one protocol, and ``metrics`` chosen by name with their options, for every split and method.
 
     No part of the model's module tree: weight averaging copies that tree before the regions are known.
+
+    Raises:
+        FaceDiffError: if there is no such metric or option.
     """
 
     def __init__(

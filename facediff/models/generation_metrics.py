@@ -484,7 +484,11 @@ FORMAT = "facediff generation metrics 1"
 
 
 def means_of(content: object, source: object) -> dict[str, dict[str, float | None]]:
-    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave."""
+    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave.
+
+    Raises:
+        FaceDiffError: if it is anything else.
+    """
     means: dict[str, dict[str, float | None]] = {}
     try:
         if not isinstance(content, dict) or content["format"] != FORMAT:

@@ -257,6 +257,9 @@ class SpiralMeshEncoder(MeshEncoder):
 
         Args:
             topology: a mesh hierarchy of :attr:`mesh_options`.
+
+        Raises:
+            FaceDiffError: if it is of another mesh or other options.
         """
         sizes = [level.n_vertices for level in topology.levels]
         expected = [self.n_vertices, *(step.sizes[1] for step in self.steps)]
@@ -283,7 +286,11 @@ class SpiralMeshEncoder(MeshEncoder):
         self._attached = True
 
     def forward(self, motion: Motion) -> Frames:
-        """The feature of each frame."""
+        """The feature of each frame.
+
+        Raises:
+            FaceDiffError: if the encoder has not been given a mesh.
+        """
         check_points(motion, self.n_vertices, 3)
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")

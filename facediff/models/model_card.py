@@ -86,7 +86,11 @@ def is_score(column: str) -> bool:
 
 
 def check_languages(languages: Iterable[str]) -> None:
-    """Refuse what is no code of a language."""
+    """Refuse what is no code of a language.
+
+    Raises:
+        FaceDiffError: naming it.
+    """
     for code in languages:
         if not re.fullmatch(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})*", code):
             raise FaceDiffError(f"--languages {quoted(code)}: expected codes such as en or zh-CN, separated by commas")

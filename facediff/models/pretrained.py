@@ -208,6 +208,9 @@ def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
     Args:
         folder: the folder.
         weights: whether the weights are read too.
+
+    Raises:
+        FaceDiffError: if a file is missing, damaged, or of a later format.
     """
     path = folder / CONFIG
     config = load_json(path, remedy=REMEDY)
@@ -238,7 +241,11 @@ def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
 
 
 def as_plain(value: Any, tensors: dict[str, Tensor], name: str) -> Any:  # noqa: ANN401 - plain data of any form
-    """Plain data for JSON; a tensor goes to ``tensors``, and its place holds a mark with its name and its type."""
+    """Plain data for JSON; a tensor goes to ``tensors``, and its place holds a mark with its name and its type.
+
+    Raises:
+        FaceDiffError: if it holds anything else.
+    """
     if isinstance(value, Tensor):
         key, number = name, 2
         while key in tensors or "/" in key or "\\" in key:

@@ -70,6 +70,9 @@ class NoiseProcess:
         variances: the noise variance α_n of each step, float32.
         signal: ᾱ_n = Π_{k≤n} (1 − α_k), the share of the clean motion's variance that is left after step n.
 
+    Raises:
+        FaceDiffError: if there is no such schedule.
+
     Example:
         >>> process = NoiseProcess(steps=4)
         >>> [round(float(kept), 3) for kept in process.signal]
@@ -301,6 +304,9 @@ class Sampler(ABC):
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
         signal: ᾱ at each of them, and 1 for the clean end.
 
+    Raises:
+        FaceDiffError: if the number of steps is impossible.
+
     Example:
         >>> sampler = DdimSampler(process=NoiseProcess(), steps=4)
         >>> sampler.timesteps
@@ -386,6 +392,9 @@ class DdimSampler(Sampler):
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
         first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
+
+    Raises:
+        FaceDiffError: if the number of steps or eta is impossible.
     """
 
     linear: ClassVar[bool] = True
@@ -459,6 +468,9 @@ class DpmSolverSampler(Sampler):
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
         first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
+
+    Raises:
+        FaceDiffError: if the number of steps or the order is impossible.
     """
 
     linear: ClassVar[bool] = True

@@ -230,7 +230,11 @@ def read_style(
 def style_of(
     opened: StyleFile, identity: str, model: AnimationModel, *, template: str | Path | None = None
 ) -> Reference | Style:
-    """The style in a motion or a vector, however it was obtained; the arguments are those of :func:`read_style`."""
+    """The style in a motion or a vector, however it was obtained; the arguments are those of :func:`read_style`.
+
+    Raises:
+        FaceDiffError: if it is no style for this checkpoint.
+    """
     import torch
 
     from facediff.animation import metres_per_unit
@@ -266,6 +270,9 @@ def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
     Args:
         words: a file, with ``@`` and its layout if it does not say that itself.
         frame_rate: frames a second of an array whose layout has no rate of its own.
+
+    Raises:
+        FaceDiffError: if there is no such file, or it is not of that layout.
     """
     import numpy as np
 

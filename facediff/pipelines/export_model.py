@@ -123,7 +123,11 @@ def export_model(
 
 
 def require_onnx() -> None:
-    """Refuse to begin without the packages."""
+    """Refuse to begin without the packages.
+
+    Raises:
+        MissingExtraError: naming the extra.
+    """
     import importlib.util
 
     for package in ("onnx", "onnxscript", "onnxruntime"):

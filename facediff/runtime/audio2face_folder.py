@@ -197,7 +197,11 @@ class Audio2FaceFolder:
 
 
 def read_audio2face(folder: Path) -> Audio2FaceFolder:
-    """Read a folder."""
+    """Read a folder.
+
+    Raises:
+        FaceDiffError: naming the file and what is wrong in it.
+    """
     about = folder / "model.json"
     content = _object(load_json(about, remedy=REMEDY), about)
     facts = read_facts(_named(folder, about, content, "networkInfoPath"))

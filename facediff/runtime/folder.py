@@ -431,6 +431,9 @@ def copy_exported(source: Path, folder: Path) -> int:
 
     Returns:
         the bytes of its files.
+
+    Raises:
+        FaceDiffError: if the source is damaged or the folder cannot be written.
     """
     description, _ = read_folder(source)
     with atomic_folder(folder) as staged:

@@ -212,6 +212,9 @@ class RuntimeStream(SpeechWindows[Array]):
         face: place of the face among the templates.
         conditions: what motion is conditioned on.
         plan: the windows.
+
+    Raises:
+        FaceDiffError: if the plan does not fit the frame rate.
     """
 
     def __init__(self, model: RuntimeModel, face: int, conditions: RuntimeConditions, plan: WindowPlan) -> None:

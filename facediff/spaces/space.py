@@ -188,7 +188,11 @@ class Space:
 
     @classmethod
     def from_state(cls, state: object) -> Space:
-        """The inverse of :meth:`state`; what it is given may come from anybody."""
+        """The inverse of :meth:`state`; what it is given may come from anybody.
+
+        Raises:
+            FaceDiffError: naming the field that is missing or not valid.
+        """
         names = {attribute.name for attribute in fields(cls)}
         if not isinstance(state, dict) or state.keys() != names:
             odd = sorted(map(str, names ^ state.keys())) if isinstance(state, dict) else state
@@ -253,6 +257,9 @@ def metres_per_unit(unit: str) -> float:
     Args:
         unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", such as that of a
             corpus whose faces were normalised.
+
+    Raises:
+        FaceDiffError: if it is none of these.
 
     Example:
         >>> metres_per_unit("mm"), metres_per_unit("normalised (about 185 mm)")

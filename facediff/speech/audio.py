@@ -233,6 +233,9 @@ def read_stretch(
 
     Of a 16 kHz mono file only these samples are read. Any other file is decoded as a whole once and kept in ``store``.
     Files that were looked at to the end are kept in ``whole``, so that a training does so once.
+
+    Raises:
+        FaceDiffError: as :func:`read_speech`.
     """
     if not path.is_file() or not path.stat().st_size:
         return fit_length(read_speech(path), length)  # which reports what is wrong

@@ -72,6 +72,9 @@ def align_features(first: npt.NDArray[np.float64], second: npt.NDArray[np.float6
 
     Returns:
         indices (T,) into ``second``, never falling; where several frames go with one, the middle one.
+
+    Raises:
+        MissingExtraError: if dtaidistance is not installed.
     """
     try:
         from dtaidistance import dtw_ndim

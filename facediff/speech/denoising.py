@@ -11,7 +11,11 @@ from facediff.utils import SAMPLE_RATE
 
 
 def denoised(speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Speech (S,) at 16 kHz without its steady noise, by spectral gating; silence stays silence."""
+    """Speech (S,) at 16 kHz without its steady noise, by spectral gating; silence stays silence.
+
+    Raises:
+        MissingExtraError: if noisereduce is not installed.
+    """
     try:
         import noisereduce
     except ImportError as error:

@@ -69,7 +69,11 @@ def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
 
 
 def read_phonemes(path: Path) -> list[TimedPhoneme]:
-    """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``."""
+    """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``.
+
+    Raises:
+        FaceDiffError: if the file is not that.
+    """
     expected = "expected a table with the columns start, end (seconds), ipa"
     try:
         phonemes = [
@@ -125,7 +129,11 @@ def closures(phonemes: Iterable[TimedPhoneme], frame_rate: float) -> list[tuple[
 
 
 def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPhoneme]]:
-    """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses."""
+    """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses.
+
+    Raises:
+        MissingExtraError: if espeak-ng is not installed.
+    """
     from facediff.speech.espeak import EspeakVoice, speak
 
     utterance = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
@@ -138,6 +146,9 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
     """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
 
     Labels may be IPA, also with marks, or ARPAbet with or without digits of stress.
+
+    Raises:
+        FaceDiffError: if the file is neither, or holds no phonemes.
     """
     if path.suffix.lower() == ".textgrid":
         phonemes = [TimedPhoneme(start, end, label) for start, end, label in phones_in(path)]

@@ -123,6 +123,9 @@ class WindowPlan:
             in one pass.
         past: motion before the window that it sees and continues.
 
+    Raises:
+        FaceDiffError: if a length is impossible.
+
     Example:
         >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
         >>> plan.in_frames(25.0)
@@ -154,7 +157,11 @@ class WindowPlan:
             raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
 
     def in_frames(self, frame_rate: float) -> FramePlan:
-        """The same in whole frames."""
+        """The same in whole frames.
+
+        Raises:
+            FaceDiffError: if windows are too short for frames.
+        """
         frames, overlap, before, after, past = (
             round(length * frame_rate) for length in (self.seconds, self.overlap, self.before, self.after, self.past)
         )
@@ -171,7 +178,11 @@ class WindowPlan:
         return FramePlan(frames, overlap, before, after, past)
 
     def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
-        """The plan with other lengths; None keeps a length."""
+        """The plan with other lengths; None keeps a length.
+
+        Raises:
+            FaceDiffError: if a length is impossible.
+        """
         length = self.seconds if seconds is None else seconds
         shared = min(self.overlap, length / 2) if overlap is None else overlap
         # A chosen window is used also with a model that otherwise takes speech of any length in one pass.

@@ -77,7 +77,11 @@ class Synthesiser(ABC):
 
     @abstractmethod
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
-        """Speak a sentence; the same arguments give the same samples."""
+        """Speak a sentence; the same arguments give the same samples.
+
+        Raises:
+            FaceDiffError: if the program fails.
+        """
 
 
 def open_voice(name: str) -> Synthesiser:

@@ -376,6 +376,9 @@ def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # no
             given is read from Dask's own configuration (``~/.config/dask/jobqueue.yaml``).
         workers: how many; those of one job if None.
         tasks: no more are started than there are tasks.
+
+    Raises:
+        FaceDiffError: if SLURM is not here, or an option is wrong or missing.
     """
     cluster = _clusters.get(scheduler)
     if cluster is None:

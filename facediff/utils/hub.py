@@ -165,13 +165,21 @@ def model_path(source: str | os.PathLike[str]) -> Path:
 
 
 def local_model(source: str | os.PathLike[str]) -> Path:
-    """As :func:`model_path`, with the face after it where one is named."""
+    """As :func:`model_path`, with the face after it where one is named.
+
+    Raises:
+        FaceDiffError: as :func:`model_path`.
+    """
     path, face = model_path(source), split_face(source)[1]
     return path if face is None else path.with_name(f"{path.name}:{face}")
 
 
 def model_files(source: str | os.PathLike[str]) -> list[Path]:
-    """The files that decide what a model makes: the checkpoint, or those of the folder that hold numbers."""
+    """The files that decide what a model makes: the checkpoint, or those of the folder that hold numbers.
+
+    Raises:
+        FaceDiffError: as :func:`model_path`.
+    """
     path = model_path(source)
     return [path / name for name in (CONFIG, WEIGHTS, ASSETS)] if path.is_dir() else [path]
 

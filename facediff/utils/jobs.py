@@ -64,7 +64,11 @@ def check_scheduler(scheduler: str | None) -> str:
 
 
 def is_cluster(scheduler: str | None) -> bool:
-    """Whether tasks run on a cluster rather than on this machine."""
+    """Whether tasks run on a cluster rather than on this machine.
+
+    Raises:
+        FaceDiffError: as :func:`check_scheduler`.
+    """
     return scheduler != "" and check_scheduler(scheduler) not in ("", *LOCAL)
 
 

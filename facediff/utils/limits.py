@@ -46,7 +46,11 @@ class Limits:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Limits:
-        """The limits, with those replaced that an environment variable states."""
+        """The limits, with those replaced that an environment variable states.
+
+        Raises:
+            FaceDiffError: if a variable is not a positive number.
+        """
         limits: dict[str, float] = {}
         for field in fields(cls):
             variable = f"FACEDIFF_MAX_{field.name.upper()}"

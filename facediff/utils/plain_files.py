@@ -34,6 +34,9 @@ def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a J
         text: the text; of bytes, UTF-8, UTF-16 or UTF-32 with or without a mark.
         source: what messages call it.
         remedy: how messages end.
+
+    Raises:
+        FaceDiffError: if it is anything else.
     """
     LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(text), source)
     try:
@@ -119,7 +122,11 @@ def json_text(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write an object as JSON, whole or not at all; equal objects give equal bytes."""
+    """Write an object as JSON, whole or not at all; equal objects give equal bytes.
+
+    Raises:
+        FaceDiffError: if a number is NaN or infinite.
+    """
     text = json_text(path, content) + "\n"
     with atomic(path) as temporary:
         # Bytes of a file name that are no UTF-8 become the escapes by which JSON names them; they come back on reading.

@@ -102,7 +102,11 @@ def read_provenance(folder: Path) -> Provenance | None:
 
 
 def provenance_of(content: object, name: object) -> Provenance:
-    """Provenance from plain data, which errors call ``name``."""
+    """Provenance from plain data, which errors call ``name``.
+
+    Raises:
+        FaceDiffError: if a field is not of its type.
+    """
     if not isinstance(content, dict):
         raise FaceDiffError(f"{name}: holds no JSON object; {REMEDY}")
     check_format(name, content.get("format", FORMAT), FORMAT)

@@ -87,7 +87,11 @@ class Range:
         return f"{noun} {self}".strip()
 
     def read(self, name: str, text: str, *, whole: bool = False) -> float:
-        """The number that a text spells, in ASCII digits and without underscores or blanks."""
+        """The number that a text spells, in ASCII digits and without underscores or blanks.
+
+        Raises:
+            FaceDiffError: if it spells none, or one outside the range.
+        """
         if not (_WHOLE if whole else _DECIMAL).fullmatch(text):
             raise FaceDiffError(f"{name} {shown(text)}: not valid; expected {self.numbers(whole=whole)}")
         number = int(text) if whole else float(text)
@@ -167,7 +171,11 @@ def check_fields(instance: Any) -> None:  # noqa: ANN401 - an instance of a data
 
 
 def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a dataclass
-    """Refuse options, the fields of a dataclass, that do not fit their type hints. None is allowed."""
+    """Refuse options, the fields of a dataclass, that do not fit their type hints. None is allowed.
+
+    Raises:
+        OptionError: naming the option and the range.
+    """
     owner: Any = type(options)
     for name, hint in _all_hints(owner).items():
         value = getattr(options, name)

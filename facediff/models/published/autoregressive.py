@@ -489,7 +489,11 @@ def decoder_sizes(weights: AuthorsWeights, prefix: str, dim: int) -> dict[str, A
 
 
 def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts, *, any_rate: bool = False) -> int:
-    """The period of a table of positions, which must follow the formula and, unless ``any_rate``, fit the data."""
+    """The period of a table of positions, which must be what the formula gives and, unless ``any_rate``, fit the data.
+
+    Raises:
+        FaceDiffError: if it is another table, or that of another frame rate.
+    """
     weights.shape(name, 3)
     table = weights.get(name)[0].float()
     # The published table repeats its rows, so the first row that equals row 0 is one period away.

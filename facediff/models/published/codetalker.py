@@ -481,7 +481,11 @@ class Predictor(SpokenDecoder):
 
 
 def check_sizes(dim: int, heads: int, kernel: int, tokens: int, token_dim: int | None, token_maps: bool) -> None:  # noqa: FBT001
-    """Refuse sizes of a prior that do not go together."""
+    """Refuse sizes of a prior that do not go together.
+
+    Raises:
+        ArgumentError: naming them.
+    """
     if dim % heads or dim % 2:
         raise ArgumentError({"prior_dim": dim, "prior_heads": heads}, "prior_dim must be even, and a multiple of heads")
     if kernel % 2 == 0:

@@ -79,7 +79,11 @@ def convert_prior(weights: AuthorsWeights, prefix: str = "") -> dict[str, Any]:
 
 
 def check_positions(weights: AuthorsWeights, name: str) -> None:
-    """Leave out a table of positions, of which the published code uses the first row, once it is seen to be one."""
+    """Leave out a table of positions, of which the published code uses the first row, once it is seen to be one.
+
+    Raises:
+        FaceDiffError: if it is anything else.
+    """
     if name not in weights:
         return
     *_, width = weights.shape(name, 3)

@@ -94,7 +94,11 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
 
 
 def faces_of(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
-    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised."""
+    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised.
+
+    Raises:
+        FaceDiffError: if a file cannot be read, or does not fit.
+    """
     _, person_dim = weights.shape("denoising_net.person_proj.weight")
     count = person_dim - weights.shape("null_style_feat", 3)[2]
     statistics, given = options.statistics, options.templates

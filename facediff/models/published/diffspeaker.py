@@ -156,6 +156,9 @@ class DiffSpeaker(DiffusionModel):
         Args:
             name: ``ddim`` for DDIM as its paper has it; the present scheduler if None.
             steps: denoising steps; the present number if None.
+
+        Raises:
+            FaceDiffError: if there is no such sampler, or so many steps are impossible.
         """
         if name is not None and name not in self.samplers:
             raise OptionError.naming(

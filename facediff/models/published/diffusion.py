@@ -44,7 +44,11 @@ class DiffusionModel(PublishedModel):
         return name in self.samplers
 
     def choose_expressivity(self, expressivity: object) -> None:
-        """Samples as they are (1); the method knows no mean around which they lie."""
+        """Samples as they are (1); the method knows no mean around which they lie.
+
+        Raises:
+            FaceDiffError: if it is anything else.
+        """
         if isinstance(expressivity, Tensor) or expressivity != 1:
             raise FaceDiffError(f"expressivity: {type(self).__name__} predicts no mean of its samples; omit the option")
 

@@ -77,7 +77,11 @@ class ImportOptions:
         return cls(**chosen, model_options={name: value for name, value in options.items() if name not in own})
 
     def with_hparams(self) -> tuple[ImportOptions, list[str]]:
-        """These options, with those of the file where they are not given, and the names that are no option here."""
+        """These options, with those of the file where they are not given, and the names that are no option here.
+
+        Raises:
+            FaceDiffError: if the file cannot be read, or holds no options by name.
+        """
         if self.hparams is None:
             return self, []
         content: Any = self.hparams
@@ -98,7 +102,11 @@ class ImportOptions:
         return replace(self, **chosen, model_options={**flags, **self.model_options}), left
 
     def all_model_options(self) -> dict[str, Any]:
-        """Options of the model and its audio encoder by name; ``ignore`` is a list where it is repeated."""
+        """Options of the model and its audio encoder by name; ``ignore`` is a list where it is repeated.
+
+        Raises:
+            FaceDiffError: if an option has no name or no value.
+        """
         options = dict(self.model_options)
         for text in self.option or []:
             name, equals, value = text.partition("=")

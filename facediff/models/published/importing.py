@@ -173,7 +173,11 @@ def bundles(files: Sequence[Path]) -> dict[Path, list[Path]]:
 
 
 def read_weights(files: Sequence[Path]) -> AuthorsWeights:
-    """The tensors of all files together."""
+    """The tensors of all files together.
+
+    Raises:
+        FaceDiffError: if a file cannot be read, or two of them hold the same tensor.
+    """
     if not files:
         raise FaceDiffError("import-checkpoint: no checkpoint was given; expected that of a published method")
     together: dict[str, Tensor] = {}
@@ -194,7 +198,11 @@ def read_weights(files: Sequence[Path]) -> AuthorsWeights:
 
 
 def recognise(weights: AuthorsWeights) -> Recogniser:
-    """The method that tensors belong to."""
+    """The method that tensors belong to.
+
+    Raises:
+        FaceDiffError: if it is none that is known.
+    """
     registry.model.load()
     fitting = [entry for entry in RECOGNISERS if entry.knows(weights)]
     if len(fitting) == 1:
@@ -210,7 +218,11 @@ def recognise(weights: AuthorsWeights) -> Recogniser:
 def facts_of(
     weights: AuthorsWeights, method: Recogniser, options: ImportOptions, graphs: Sequence[Path]
 ) -> CheckpointFacts:
-    """Data set, frame rate and identities: by the shapes, or as the user says."""
+    """Data set, frame rate and identities: by the shapes, or as the user says.
+
+    Raises:
+        FaceDiffError: if they contradict each other, or do not follow.
+    """
     if method.layout:
         return parametric_facts(weights, method, options)
     datasets, count, vertices = dataset_facts(), method.count(weights), method.vertices(weights)
@@ -308,7 +320,11 @@ def own_facts(faces: FaceFacts, method: Recogniser, options: ImportOptions) -> C
 
 
 def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[str]]:
-    """Assets of such a method, and notes on them."""
+    """Assets of such a method, and notes on them.
+
+    Raises:
+        FaceDiffError: if a mesh does not fit its vertices.
+    """
     everything = torch.arange(faces.n_points)
     named = {name: torch.tensor(faces.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
     regions = {name: indices if len(indices) else everything for name, indices in named.items()}
@@ -328,7 +344,11 @@ def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[s
 
 
 def with_flame(assets: Assets, mesh: Path | None) -> Assets:
-    """Assets in FLAME's parameters with the user's FLAME model as rig, so that they can be drawn."""
+    """Assets in FLAME's parameters with the user's FLAME model as rig, so that they can be drawn.
+
+    Raises:
+        FaceDiffError: if the file is no FLAME model.
+    """
     if mesh is None or assets.space.kind != "flame":
         return assets
     from facediff.data.batch import Rig
@@ -339,7 +359,11 @@ def with_flame(assets: Assets, mesh: Path | None) -> Assets:
 
 
 def read_triangles(mesh: Path | None, count: int) -> Tensor | None:
-    """The triangles of a mesh, if there is one."""
+    """The triangles of a mesh, if there is one.
+
+    Raises:
+        FaceDiffError: if it has another number of vertices.
+    """
     from facediff.mesh import read_mesh
 
     if mesh is None:
@@ -351,7 +375,11 @@ def read_triangles(mesh: Path | None, count: int) -> Tensor | None:
 
 
 def rate_of(dataset: DatasetFacts, method: Recogniser, option: object) -> float:
-    """Frames a second: those of the data set or of the method, or as the user says where the method lets choose."""
+    """Frames a second: those of the data set or of the method, or as the user says where the method lets choose.
+
+    Raises:
+        FaceDiffError: if they are no positive number.
+    """
     rate = read_value(option) if method.frame_rate is not None else None
     if rate is None:
         return method.frame_rate or dataset.frame_rate
@@ -363,7 +391,11 @@ def rate_of(dataset: DatasetFacts, method: Recogniser, option: object) -> float:
 
 
 def read_config(config: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """The configuration of an audio encoder."""
+    """The configuration of an audio encoder.
+
+    Raises:
+        FaceDiffError: if the file cannot be read, or holds no options by name.
+    """
     if config is None or isinstance(config, Mapping):
         return config
     path, remedy = Path(config), "expected the config.json of the audio encoder"
@@ -374,7 +406,11 @@ def read_config(config: str | Path | Mapping[str, Any] | None) -> Mapping[str, A
 
 
 def with_options(method: str, converted: dict[str, Any], chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """A model's options with those that the user gives, which may be its audio encoder's as well."""
+    """A model's options with those that the user gives, which may be its audio encoder's as well.
+
+    Raises:
+        FaceDiffError: if there is no such option, or a value does not fit it.
+    """
     own = parameters(registry.model.get(method))
     encoders = parameters(component_class(converted["audio_encoder"])) if "audio_encoder" in converted else {}
     for name in ("n_vertices", "identities", "frame_rate", "space", "audio_encoder"):
@@ -503,7 +539,11 @@ def parametric_assets(facts: CheckpointFacts) -> Assets:
 
 
 def read_region(path: Path, n_vertices: int) -> Tensor:
-    """Indices of a region's vertices."""
+    """Indices of a region's vertices.
+
+    Raises:
+        FaceDiffError: if the file cannot be read, or names vertices that do not exist.
+    """
     try:
         region = Region.from_file(path, n_vertices=n_vertices)
     except ValueError as error:
@@ -514,7 +554,11 @@ def read_region(path: Path, n_vertices: int) -> Tensor:
 def build(
     weights: AuthorsWeights, method: Recogniser, facts: CheckpointFacts, options: dict[str, Any]
 ) -> AnimationModel:
-    """The model with the authors' weights."""
+    """The model with the authors' weights.
+
+    Raises:
+        FaceDiffError: if a tensor is missing or of another shape.
+    """
     model: AnimationModel = registry.model.get(method.method)(
         **facts.sizes(),
         **options,
@@ -570,7 +614,11 @@ def listed(names: Sequence[str]) -> str:
 
 
 def save_model(model: AnimationModel, path: Path) -> None:
-    """Write a model as a checkpoint, in the form in which training writes one."""
+    """Write a model as a checkpoint, in the form in which training writes one.
+
+    Raises:
+        FaceDiffError: if the file cannot be written.
+    """
     from lightning.pytorch import Trainer
 
     from facediff.utils.files import atomic

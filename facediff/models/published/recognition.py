@@ -115,7 +115,11 @@ class AuthorsWeights:
         return [name for name in self.tensors if name.startswith(prefix)]
 
     def get(self, name: str) -> Tensor:
-        """A tensor, which counts as used."""
+        """A tensor, which counts as used.
+
+        Raises:
+            FaceDiffError: if it is missing.
+        """
         if name not in self.tensors:
             raise FaceDiffError(
                 f"{self.source}: lacks the tensor {name}; give the checkpoint of the whole model, as its authors "
@@ -125,14 +129,22 @@ class AuthorsWeights:
         return self.tensors[name]
 
     def shape(self, name: str, dims: int = 2) -> tuple[int, ...]:
-        """The shape of a tensor."""
+        """The shape of a tensor.
+
+        Raises:
+            FaceDiffError: if it is missing, or has another number of dimensions.
+        """
         shape = tuple(self.get(name).shape)
         if len(shape) != dims or not all(shape):
             raise FaceDiffError(f"{self.source}: its tensor {name} has the shape {shape}; expected {dims} dimensions")
         return shape
 
     def move(self, old: str, new: str) -> None:
-        """Use a tensor under another name."""
+        """Use a tensor under another name.
+
+        Raises:
+            FaceDiffError: if it is missing, or another one has that name.
+        """
         if new in self.renamed:
             raise FaceDiffError(
                 f"{self.source}: holds {self._origins[new]} and {old}, which are the same tensor; expected one of them"

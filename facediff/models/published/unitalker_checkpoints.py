@@ -63,22 +63,21 @@ class ReleasedData:
         return 25.0 if self.head.startswith("BIWI") else 30.0
 
 
+def _non_commercial(of: str, source: str) -> Licence:
+    return Licence(f"corpus {of}", "CC-BY-NC-4.0", "forbidden", source)
+
+
 RELEASE = "github.com/X-niper/UniTalker"
-
-
-def _non_commercial(of: str) -> Licence:
-    return Licence(f"corpus {of}", "CC-BY-NC-4.0", "forbidden", RELEASE)
-
 
 DATA: dict[str, ReleasedData] = {
     "D0": ReleasedData(
-        *("D0_BIWI", "BIWI_23370_vertices", 70110, 6, 0.2, 3, "", _non_commercial("BIWI")),
+        *("D0_BIWI", "BIWI_23370_vertices", 70110, 6, 0.2, 3, "", _non_commercial("BIWI", RELEASE)),
     ),
     "D1": ReleasedData(
-        *("D1_vocaset", "FLAME_5023_vertices", 15069, 12, 1.0, 3, "", _non_commercial("VOCASET")),
+        *("D1_vocaset", "FLAME_5023_vertices", 15069, 12, 1.0, 3, "", _non_commercial("VOCASET", RELEASE)),
     ),
     "D2": ReleasedData(
-        *("D2_meshtalk", "meshtalk_6172_vertices", 18516, 13, 0.001, 0, "", _non_commercial("MeshTalk")),
+        *("D2_meshtalk", "meshtalk_6172_vertices", 18516, 13, 0.001, 0, "", _non_commercial("MeshTalk", RELEASE)),
     ),
     "D3": ReleasedData("D3D4_3DETF/D3_HDTF", "3DETF_blendshape_weight", 52, 141, layout="arkit"),
     "D4": ReleasedData("D3D4_3DETF/D4_RAVDESS", "3DETF_blendshape_weight", 52, 24, layout="arkit"),
@@ -168,7 +167,11 @@ def faces(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
 
 
 def released_array(root: Path, folder: str, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An array of the data release."""
+    """An array of the data release.
+
+    Raises:
+        FaceDiffError: if it cannot be read or has another shape.
+    """
     path = root / folder / name
     if not path.is_file():
         raise OptionError.naming(f"{{data_root}} {root}: has no {folder}/{name}; expected UniTalker's data release")

@@ -358,7 +358,11 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> d
 
 
 def convert_convolutions(weights: AuthorsWeights, encoder: str, heard: int, count: int) -> list[int]:
-    """The convolutions, of which the first sees the speaker too, and their channels."""
+    """The convolutions, of which the first sees the speaker too, and their channels.
+
+    Raises:
+        FaceDiffError: if their shapes are others than expected.
+    """
     channels: list[int] = []
     into = heard + count
     while (name := f"{encoder}conv{len(channels) + 1}/weights") in weights or not channels:

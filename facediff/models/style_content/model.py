@@ -227,7 +227,11 @@ class StyleContentDisentanglement(AnimationModel):
                 )
 
     def adopt(self, assets: Assets) -> None:
-        """Take over a corpus's assets, and which vertices are the face."""
+        """Take over a corpus's assets, and which vertices are the face.
+
+        Raises:
+            FaceDiffError: if they do not fit, or no region says what the face is.
+        """
         super().adopt(assets)
         visible = self.network.visible
         if visible is not None:

@@ -72,7 +72,11 @@ def even(clip: ParameterClip) -> ParameterClip:
 
 
 def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> Values:
-    """Values of a file (T, C) as float32, within the budget and finite."""
+    """Values of a file (T, C) as float32, within the budget and finite.
+
+    Raises:
+        FaceDiffError: naming the file, if they are not.
+    """
     check_number(path, "frame rate", frame_rate, *FRAME_RATES)
     LIMITS.check("frames", len(values), path)
     if not len(values):
@@ -84,7 +88,11 @@ def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> 
 
 
 def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
-    """Where each channel of a space stands in a header, whatever its case."""
+    """Where each channel of a space stands in a header, whatever its case.
+
+    Raises:
+        FaceDiffError: naming a channel that is missing.
+    """
     folded = [name.strip().casefold() for name in header]
     lacking = [name for name in space.channels if name.casefold() not in folded]
     if lacking:
