@@ -291,7 +291,7 @@ def finished(
 def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """The tensors under the names of this file, and the model's options."""
     content, emotion = "audio_encoder_cont.", "audio_encoder_emo.wav2vec2."
-    for prefix in (content, emotion):
+    for prefix in (content, emotion, "audio_encoder_emo."):
         weights.ignore(f"{prefix}lm_head.", "the speech recogniser's letters")
     weights.ignore("audio_encoder_emo.classifier.", "the names of emotions, which only training needs")
     own = EmoTalk.encoder_settings()
