@@ -19,19 +19,17 @@ LONGEST = 200
 names."""
 
 
-def load_manifest(path: Path, *, name: str = "", remedy: str = REMEDY) -> dict[str, Any]:
+def load_manifest(path: Path, *, remedy: str = REMEDY) -> dict[str, Any]:
     """The object in a manifest, or in the state of a preparation that is running.
 
     Args:
         path: the file.
-        name: what messages call it; its path if empty.
         remedy: what messages advise.
     """
-    name = name or str(path)
-    manifest = load_json(path, name=name, remedy=remedy)
+    manifest = load_json(path, remedy=remedy)
     if not isinstance(manifest, dict):
-        raise FaceDiffError(f"{name}: holds no JSON object; {remedy}")
-    check_format(name, manifest.get("format", FORMAT), FORMAT)
+        raise FaceDiffError(f"{path}: holds no JSON object; {remedy}")
+    check_format(path, manifest.get("format", FORMAT), FORMAT)
     return manifest
 
 

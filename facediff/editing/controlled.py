@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 HEAD = ("head.pitch", "head.yaw", "head.roll")
 ACTED = ("brows", "lids", *HEAD)
 """What acting moves, in the order of its columns."""
-POSES = ("shape", "brows", "lids", "head")
-"""Channels that are no options, but set a pose by themselves."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,12 +73,12 @@ def parametric(kind: Kind, parts: Iterable[Part], *, version: str = "", identity
     return Space(kind, tuple(channels), version, rotations=tuple(rotations), identity=identity)
 
 
-def _arkit(names: tuple[str, ...], source: str, frame_rate: float | None = None) -> Layout:
+def _arkit(names: tuple[str, ...], source: str) -> Layout:
     turns: dict[str, Joint] = {"HeadYaw": "head", "LeftEyeYaw": "left_eye", "RightEyeYaw": "right_eye"}
     rotations = tuple(Rotation(joint, names.index(name), "euler") for name, joint in turns.items() if name in names)
     absent = tuple(name for name in ARKIT if name not in names)
     space = Space("arkit", names, "arkit", rotations=rotations, valid_range=(0.0, 1.0), absent=absent)
-    return Layout(space, frame_rate, source=source)
+    return Layout(space, None, source=source)
 
 
 def _flame(*parts: Part, source: str, shape: int = 0, leading: int = 0, **more: object) -> Layout:

@@ -130,11 +130,11 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
+def scratch_folder(path: Path) -> Iterator[Path]:
     """A hidden folder next to ``path`` (after its links), on the same disk, which is removed at the end.
 
     What killed processes have left there is removed first. An :class:`OSError` in the block is raised as a
-    :class:`FaceDiffError` that names ``path``. Nobody else may look into a ``private`` folder.
+    :class:`FaceDiffError` that names ``path``.
     """
     with _writing(path):
         place = destination(path)
@@ -143,7 +143,7 @@ def scratch_folder(path: Path, *, private: bool = False) -> Iterator[Path]:
             folder = _partial(place)
             # The folder is locked before it gets its name, so that no other process removes it as abandoned.
             unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
-            unnamed.mkdir(mode=0o700 if private else 0o777)
+            unnamed.mkdir()
             with _locked_folder(unnamed):
                 try:
                     unnamed.rename(folder)
