@@ -158,17 +158,18 @@ class SpiralDown(nn.Module):
         nn.init.xavier_uniform_(self.map.weight)
         nn.init.zeros_(self.map.bias)
 
-    def forward(self, x: Float[Tensor, "frames vertices in_channels"]) -> Float[Tensor, "frames coarse out_channels"]:
+    def forward(self, x: Float[Tensor, "vertices in_channels frames"]) -> Float[Tensor, "coarse out_channels frames"]:
         """Features of the next level's vertices."""
-        # The features along each vertex's spiral, one after the other: one gather for all, then one linear map.
-        around = x.index_select(1, self.table.flatten()).view(x.shape[0], len(self.table), -1)
-        out = self.map(around)
+        # Vertices come first, so that a gather and its gradient move whole rows, and the features along each vertex's
+        # spiral are one after the other without a copy. A plain matmul would make one, to fold the vertices.
+        around = x.index_select(0, self.table.flatten()).view(len(self.table), self.map.in_features, x.shape[-1])
+        out = torch.bmm(self.map.weight.expand(len(around), -1, -1), around) + self.map.bias[:, None]
         if self.rows is None or self.weights is None:
             return out
         # A sparse matrix product by scattering: each vertex adds its share to the one coarse vertex of its group.
         # By index_add and not by a sparse matrix, which the format of exported graphs does not have.
-        shares = out * self.weights[:, None]
-        return shares.new_zeros(x.shape[0], self.sizes[1], out.shape[-1]).index_add(1, self.rows, shares)
+        shares = out * self.weights[:, None, None]
+        return shares.new_zeros(self.sizes[1], *out.shape[1:]).index_add(0, self.rows, shares)
 
 
 @mesh_encoder.register("spiral")
@@ -304,9 +305,10 @@ class SpiralMeshEncoder(MeshEncoder):
 
     def encode(self, x: Float[Tensor, "frames points dims"]) -> Float[Tensor, "frames dim"]:
         """The feature of each frame of one sequence."""
+        x = x.permute(1, 2, 0).contiguous()
         for step in self.steps:
             x = F.leaky_relu(step(x), self.negative_slope)
-        return self.map(x.flatten(1))
+        return self.map(x.flatten(0, 1).T)
 
     def _part(self, x: Tensor) -> Tensor:
         # Nothing here is random, so the state of the random generator need not be kept.

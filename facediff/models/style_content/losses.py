@@ -71,9 +71,10 @@ class MotionDistance:
         gap = motion.new_zeros(())
         if self.lip_gap and pairs is not None and rest is not None:
             gap = frame_mean((_gaps(motion, rest, pairs) - _gaps(truth, rest, pairs)).square().mean(-1), mask)
-        if vertices is not None:
-            motion, truth = motion[:, :, vertices], truth[:, :, vertices]
+        # The difference first: a choice of vertices then copies one array, and leaves one gradient to be scattered.
         error = motion - truth
+        if vertices is not None:
+            error = error.index_select(2, vertices)
         # A velocity needs two valid frames: the step from the last frame into the padding is no movement.
         both = mask[:, 1:] & mask[:, :-1]
         moved = frame_mean(error.square().mean((2, 3)), mask)
@@ -84,9 +85,9 @@ class MotionDistance:
 
 def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch frames pairs"]:
     """Distances between the paired vertices; its gradient is finite where they touch."""
-    upper, lower = (motion[:, :, pairs[:, side]] + rest[:, None, pairs[:, side]] for side in (0, 1))
+    ends = (motion.index_select(2, pairs.T.flatten()) + rest.index_select(1, pairs.T.flatten())[:, None]).chunk(2, 2)
     # The root's slope is infinite at 0, which closed lips reach in every p, b and m.
-    return ((upper - lower).square().sum(-1) + EPSILON).sqrt()
+    return ((ends[0] - ends[1]).square().sum(-1) + EPSILON).sqrt()
 
 
 def frame_mean(values: Float[Tensor, "batch frames"], mask: Mask) -> Float[Tensor, ""]:
@@ -163,7 +164,7 @@ def dynamics_distance(
     if not chosen.any():
         return motion.new_zeros(())
     # FDD's own quantity is the spread of the squared displacement, so the loss compares the same one.
-    squared = [clips[chosen][:, :, vertices].square().sum(-1) for clips in (motion, truths)]
+    squared = [clips.index_select(2, vertices)[chosen].square().sum(-1) for clips in (motion, truths)]
     spread, true_spread = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
     return (spread - true_spread).square().mean() / (true_spread.mean().square() + EPSILON)
 
