@@ -32,7 +32,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facediff.errors import ArgumentError, FaceDiffError, choices
-from facediff.utils.plain_options import is_path
 from facediff.utils.ranges import mismatch
 
 T = TypeVar("T", bound=type)
@@ -382,6 +381,8 @@ def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a
         path: the import path.
         base: what the class must be a subclass of.
     """
+    from facediff.utils.plain_options import is_path  # the metrics alone need the registry, and no more of utils
+
     if not isinstance(path, str) or not is_path(path):
         return None
     module, _, name = path.rpartition(".")

@@ -60,8 +60,8 @@ def split_face(source: str | os.PathLike[str]) -> tuple[str, str | None]:
     """A model of many faces and the face that is named after a colon; None for the whole model.
 
     Example:
-        >>> split_face("runs/best.ckpt:mask"), split_face("demo/puppet.ckpt")
-        (('runs/best.ckpt', 'mask'), ('demo/puppet.ckpt', None))
+        >>> split_face("user/name:mask"), split_face("demo/puppet.ckpt")
+        (('user/name', 'mask'), ('demo/puppet.ckpt', None))
     """
     text = os.fspath(source)
     model, colon, face = text.rpartition(":")

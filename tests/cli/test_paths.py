@@ -39,6 +39,7 @@ NO_PATHS = {
         "device",
         "expressiveness",
         "expressivity",
+        "face",
         "font",
         "transcript",
         "voice_gate",
