@@ -1,10 +1,11 @@
-"""Numbers: NumPy's files of vertices or of a whole animation, and a table of blendshape weights."""
+"""Numbers: NumPy's files of vertices or of a whole animation, and files of blendshape weights."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,13 @@ from facediff.animation.files import MotionWriter
 from facediff.animation.options import ExportOptions
 from facediff.export.format import FileSpace, Format
 from facediff.registry import export_format
+from facediff.spaces.arkit import ARKIT
+from facediff.spaces.files.beat import write_beat
+from facediff.spaces.files.clips import ParameterClip
+from facediff.spaces.layouts import layout
+
+if TYPE_CHECKING:
+    from facediff.editing.blendshapes import Weights
 
 
 @export_format.register("npy")
@@ -78,17 +86,8 @@ class BlendshapeWeights(Format):
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Solve for the weights and write them, with a .json file that says how well they fit."""
-        from facediff.editing.blendshapes import SolveOptions, own_weights, solve
-        from facediff.editing.shapes import read_shapes
-        from facediff.spaces.arkit import ARKIT
-
         (animation,) = animations
-        if options.shapes is None:  # checked by check_export
-            weights = own_weights(animation)
-        else:
-            # Only those with a column: others would take motion that the table then lacks
-            shapes = read_shapes(Path(options.shapes), animation.template, animation.unit).only(ARKIT)
-            weights = solve(animation, shapes, SolveOptions())
+        weights = _arkit_weights(animation, options)
         if options.tracks != "arkit":
             weights = weights.tracks(options.tracks)
         weights.save(path, plain=options.tracks != "arkit", key_tolerance=options.key_tolerance)
@@ -96,3 +95,38 @@ class BlendshapeWeights(Format):
     def companions(self, path: Path, animation: Animation) -> list[Path]:
         """The .json file."""
         return [path.with_suffix(".json")]
+
+
+@export_format.register("json")
+class BeatWeights(Format):
+    """Weights of blendshapes (ARKit) as BEAT writes them; needs --shapes, but for motion in such weights."""
+
+    next_step = "programs that play BEAT's faces read it; head and eyes' rotations are not in it"
+    speech = "next to it"
+    needs_mesh = False
+    needs_shapes = True
+    uses = ("shapes",)
+    units = "none"
+    up_axes = ()
+
+    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
+        """Write the weights that there are; those that are absent are not written as 0."""
+        (animation,) = animations
+        weights = _arkit_weights(animation, options)
+        absent = {*weights.absent, *(animation.space.absent if options.shapes is None else ())}
+        kept = [index for index, name in enumerate(weights.names) if name not in absent]
+        names = tuple(weights.names[index] for index in kept)
+        space = replace(layout("arkit"), channels=names, absent=tuple(name for name in ARKIT if name in absent))
+        write_beat(path, ParameterClip(path.stem, weights.values[:, kept].astype("f4"), space, weights.frame_rate))
+
+
+def _arkit_weights(animation: Animation, options: ExportOptions) -> Weights:
+    """The animation's own weights, or those of the shapes that the options name."""
+    from facediff.editing.blendshapes import SolveOptions, own_weights, solve
+    from facediff.editing.shapes import read_shapes
+
+    if options.shapes is None:  # checked by check_export
+        return own_weights(animation)
+    # Only ARKit's: others would take motion that the file then lacks
+    shapes = read_shapes(Path(options.shapes), animation.template, animation.unit).only(ARKIT)
+    return solve(animation, shapes, SolveOptions())

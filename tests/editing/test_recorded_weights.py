@@ -31,6 +31,18 @@ def test_a_recording_is_played_and_written_again(tmp_path: Path, suffix: str) ->
     np.testing.assert_allclose(again.values[:40, columns], values[:, columns], atol=1e-6)
 
 
+@pytest.mark.parametrize("order", ["live_link", "arkit_51"])
+def test_weights_exported_as_beat_are_the_same_and_absent_ones_are_left_out(tmp_path: Path, order: str) -> None:
+    space = layout(order)
+    values = np.random.default_rng(1).random((9, len(space.channels))).astype(np.float32)
+    write_parameters(tmp_path / "take.json", ParameterClip("take", values, space, 30.0))
+    facediff.read(tmp_path / "take.json").save(tmp_path / "again.json")
+    again, first = (read_parameters(tmp_path / name) for name in ("again.json", "take.json"))
+    assert (again.space, again.frame_rate, again.times) == (first.space, 30.0, None)
+    assert ("tongueOut" in again.space.channels) == (order == "live_link")
+    np.testing.assert_array_equal(again.values, first.values)
+
+
 def test_other_parameters_are_refused(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("a,b\n1,2\n")
     with pytest.raises(FaceDiffError, match=r"take\.csv"):

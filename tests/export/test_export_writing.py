@@ -24,13 +24,14 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_formats_are_as_promised() -> None:
-    assert {*OWN, ".html", ".csv"} == set(FORMATS)
+    assert {*OWN, ".html", ".csv", ".json"} == set(FORMATS)
     assert {suffix for suffix, made in FORMATS.items() if made.holds_several} == {".mp4", ".html"}
     assert {suffix for suffix, made in FORMATS.items() if made.speech == "in the file"} == {".mp4", ".html", ".npz"}
     assert {suffix for suffix, made in FORMATS.items() if not made.needs_mesh} == {
         ".pc2",
         ".mdd",
         ".csv",
+        ".json",
         ".npz",
         ".npy",
     }
@@ -50,6 +51,7 @@ def test_formats_are_as_promised() -> None:
         ("a.mp4", {"up": "y"}, [".mp4", "no axes"]),
         ("a.obj", {"output_unit": "parsec"}, ['unit "parsec"']),
         ("a.csv", {}, ["a.csv", "shapes"]),
+        ("a.json", {}, ["a.json", "shapes"]),
         ("a.csv", {"shapes": Path("nowhere")}, ["nowhere: no such folder or file"]),
         ("file/a.glb", {}, ["cannot be written"]),
         ("folder.glb", {}, ["is a folder"]),

@@ -104,7 +104,11 @@ def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> No
     if clip.space.kind != "arkit":
         raise FaceDiffError(f"{path}: the clip is in a space of {clip.space.kind}; expected ARKit's weights")
     turning = {*clip.space.head, *clip.space.eyes}
-    shapes = [index for index, name in enumerate(clip.space.channels) if index not in turning]
+    shapes = [
+        index
+        for index, name in enumerate(clip.space.channels)
+        if index not in turning and name not in clip.space.absent
+    ]
     times = np.arange(len(clip.values)) / clip.frame_rate if clip.times is None else clip.times
     frames = [
         # Text and back keeps the shortest decimal of each float32 instead of the digits of its float64.

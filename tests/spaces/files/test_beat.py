@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from facediff.errors import FaceDiffError
 from facediff.spaces import layout
-from facediff.spaces.files import read_parameters, write_parameters
+from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
 from facediff.spaces.files.beat import write_beat
 
 WEIGHTS = np.random.default_rng(0).random((6, 51)).astype(np.float32)
@@ -46,6 +47,14 @@ def test_beat_written_and_read_again_is_the_same(tmp_path: Path, metadata: bool)
     assert (again.space, again.start, again.frame_rate) == (clip.space, clip.start, clip.frame_rate)
     write_parameters(tmp_path / "c.json", again)
     assert metadata or (tmp_path / "c.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
+def test_absent_weights_are_not_written_as_zero(tmp_path: Path) -> None:
+    space = replace(layout("arkit"), absent=("tongueOut",))
+    write_beat(tmp_path / "a.json", ParameterClip("a", np.ones((3, 52), np.float32), space, 30.0))
+    again = read_parameters(tmp_path / "a.json")
+    assert "tongueOut" not in again.space.channels
+    assert again.space.absent == ("tongueOut",)
 
 
 def test_read_beat_of_lam_takes_the_rate_of_its_metadata(tmp_path: Path) -> None:
