@@ -42,6 +42,7 @@ def export(
     from facediff.animation import Animation
     from facediff.animation.files import has_values
     from facediff.editing.controls import check_controls
+    from facediff.editing.recorded_weights import SUFFIXES
     from facediff.export import FORMATS, check_export, check_used, write_animations
     from facediff.pipelines.motion import SourceReader
 
@@ -53,7 +54,8 @@ def export(
         footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
     check_used(output.suffix, files.changed())
     options = replace(files, footer=footer, quiet=quiet)
-    check_export(output, options, len(animations), weights=all(map(has_values, animations)))
+    weights = all(path.suffix.lower() in SUFFIXES or has_values(path) for path in animations)
+    check_export(output, options, len(animations), weights=weights)
     check_controls(controls)
     read = SourceReader(source).read
     finished: list[Animation] = [read(path) for path in animations]
