@@ -178,7 +178,13 @@ def test_microphone_hands_over_blocks_with_the_time_at_which_they_were_spoken(mo
 
 def test_microphone_that_is_unplugged_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     sound = library(monkeypatch, *CARDS)
-    threading.Timer(0.05, lambda: sound.opened[0].stop()).start()
+
+    def pull() -> None:
+        while not sound.opened:
+            time.sleep(0.005)
+        sound.opened[0].stop()
+
+    threading.Thread(target=pull, daemon=True).start()
     with pytest.raises(FaceDiffError, match="Webcam"):
         Microphone("Webcam").run(lambda *_: None, threading.Event())
 
