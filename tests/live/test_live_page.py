@@ -85,8 +85,10 @@ def test_the_page_shows_frames_plays_speech_and_comes_back(browser: Chromium, pu
         acting.stop()
         last = acting.index - 1
         page.wait_for(f"facediff.stats.index === {last}")
-        at = page.evaluate("Array.from(facediff.positions)")
         wanted = 1000 * (puppet.neutral + moved(puppet, last).vertices)
+        # A frame is counted when it arrives, and drawn with the picture after that.
+        page.wait_for(f"Math.abs(facediff.positions[1] - {wanted[0, 1]:.4f}) < 0.5")
+        at = page.evaluate("Array.from(facediff.positions)")
         np.testing.assert_allclose(np.reshape(at, (-1, 3)), wanted, atol=0.5 * STEP + 1e-3)
         assert page.evaluate("document.querySelector('h1').textContent") == "<b>Ann</b>"
         assert page.evaluate("document.getElementById('sound').getAttribute('aria-pressed')") == "true"
