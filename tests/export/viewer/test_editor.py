@@ -63,8 +63,11 @@ def keys_in(page: Page) -> Direction:
 def lane(page: Page, name: str) -> tuple[float, float, float, float]:
     """Left, top, width and height of the part of a channel's lane in which keys lie."""
     found = page.evaluate(
-        f"(() => {{ const canvas = [...document.querySelectorAll('.lane')].find((each) => each.textContent.startsWith("
-        f"'{name}')).querySelector('canvas'); canvas.scrollIntoView({{ block: 'nearest' }}); canvas.focus();"
+        f"(async () => {{ const canvas = [...document.querySelectorAll('.lane')].find((each) => each.textContent"
+        f".startsWith('{name}')).querySelector('canvas');"
+        f" canvas.scrollIntoView({{ block: 'nearest' }}); canvas.focus();"
+        # The browser gives a click to what its last picture has there: scrolling must have been drawn.
+        f" for (let i = 0; i < 2; i++) await new Promise(requestAnimationFrame);"
         f" const box = canvas.getBoundingClientRect(); return [box.left, box.top, box.width, box.height]; }})()"
     )
     left, top, width, height = found
