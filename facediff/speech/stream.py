@@ -135,6 +135,7 @@ class AnimationStream:
             vertices = self._rest.apply(vertices, opened)
         if self._finish is not None:
             vertices, heads = self._finish(vertices, self._finished, None if self._performer is None else acted)
-            self.heads = heads if self.heads is None or heads is None else np.concatenate([self.heads, heads])
+            if heads is not None:  # a piece without a frame has none
+                self.heads = heads if self.heads is None else np.concatenate([self.heads, heads])
         self._finished += count
         return vertices
