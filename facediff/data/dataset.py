@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,9 @@ from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import samples_for
 from facediff.utils.arrays import ArrayStore
+
+B = TypeVar("B", covariant=True)
+"""What an order of batches gives for each of them."""
 
 # Features of an audio encoder's frozen part, kept on disk, one array for each clip.
 
@@ -106,7 +109,23 @@ class Pick:
     repeated: bool = False  # whether another process has the same clip, so that it must not be scored here
 
 
-class ClipBatches(DistributedSampler[list[Pick]]):
+class ResumableBatches(DistributedSampler[B]):
+    """An order of batches that can be continued in the middle of an epoch: see :attr:`done`."""
+
+    resume_epoch = resume_batch = 0
+
+    def resume(self, epoch: int, batch: int) -> None:
+        """Continue in an epoch after some of its batches; later epochs are complete."""
+        self.set_epoch(epoch)  # worker processes begin to read before Lightning sets the epoch
+        self.resume_epoch, self.resume_batch = epoch, batch
+
+    @property
+    def done(self) -> int:
+        """Batches of the present epoch that were taken before it was continued."""
+        return self.resume_batch if self.epoch == self.resume_epoch else 0
+
+
+class ClipBatches(ResumableBatches[list[Pick]]):
     """Batches of clips, which depend on seed and epoch but not on the number of loader processes.
 
     A batch has ``batch_size`` clips or, with ``max_frames``, as many clips of similar length as fit into that many
@@ -159,7 +178,6 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         self.training = training
         self.groups = list(groups) if groups is not None and training else None
         self.copies = list(copies) if copies is not None and training else [1] * len(lengths)
-        self.resume_epoch, self.resume_batch = 0, 0
         self.announce: Callable[[list[Pick]], None] | None = None
 
     def __len__(self) -> int:
@@ -170,8 +188,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         """This process's batches of the current epoch."""
         # Every process computes the batches of all and takes its share: the seed alone keeps them in agreement.
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
-        done = self.resume_batch if self.epoch == self.resume_epoch else 0
-        places = range(self.rank + done * self.num_replicas, len(batches), self.num_replicas)
+        places = range(self.rank + self.done * self.num_replicas, len(batches), self.num_replicas)
         for number, place in enumerate(places):
             if self.announce is not None:
                 self.announce([pick for near in places[number : number + 2] for pick in self._picks(batches, near)])
@@ -181,11 +198,6 @@ class ClipBatches(DistributedSampler[list[Pick]]):
         # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
         repeated = not self.training and place >= len(self.lengths)
         return [Pick(*self._pick(unit), repeated) for unit in batches[place]]
-
-    def resume(self, epoch: int, batch: int) -> None:
-        """Continue in an epoch after some of its batches; later epochs are complete."""
-        self.set_epoch(epoch)  # worker processes begin to read before Lightning sets the epoch
-        self.resume_epoch, self.resume_batch = epoch, batch
 
     def _hash(self, what: object) -> int:
         return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
@@ -247,7 +259,7 @@ class ClipBatches(DistributedSampler[list[Pick]]):
 
 
 class ResumableLoader(DataLoader[list[Sample]]):
-    """A loader over :class:`ClipBatches` that continues in the middle of an epoch.
+    """A loader over :class:`ResumableBatches` that continues in the middle of an epoch.
 
     Attributes:
         progress: gives the epoch and the number of its batches that are completed.
@@ -262,10 +274,9 @@ class ResumableLoader(DataLoader[list[Sample]]):
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Continue there."""
-        sampler: Any = self.sampler
-        if hasattr(sampler, "resume"):
-            sampler.seed = state["seed"]  # a config may leave the seed to chance
-            sampler.resume(state["epoch"], state["batches"])
+        if isinstance(self.sampler, ResumableBatches):
+            self.sampler.seed = state["seed"]  # a config may leave the seed to chance
+            self.sampler.resume(state["epoch"], state["batches"])
 
 
 def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generator) -> list[list[int]]:

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, cast
 
-from torch.utils.data import DataLoader, Dataset, DistributedSampler
+from torch.utils.data import DataLoader, Dataset
 
 from facediff.data.batch import Batch, Sample, collate
-from facediff.data.dataset import BatchDataset, ClipBatches, Pick, ResumableLoader
+from facediff.data.dataset import BatchDataset, ClipBatches, Pick, ResumableBatches, ResumableLoader
 
 
-class MixedBatches(DistributedSampler[tuple[str, list[Pick]]]):
+class MixedBatches(ResumableBatches[tuple[str, list[Pick]]]):
     """The batches of several corpora in one order, each batch of one of them.
 
     An epoch has all batches of all corpora; each corpus is spread evenly over it. All processes therefore train on the
@@ -27,7 +27,6 @@ class MixedBatches(DistributedSampler[tuple[str, list[Pick]]]):
         everything: Any = range(sum(map(len, parts.values())))  # only its length is used
         super().__init__(everything, num_replicas=first.num_replicas, rank=first.rank, seed=first.seed)
         self.parts = dict(parts)
-        self.resume_epoch, self.resume_batch = 0, 0
 
     def __len__(self) -> int:
         """Number of batches of this process; the same in every epoch."""
@@ -39,18 +38,13 @@ class MixedBatches(DistributedSampler[tuple[str, list[Pick]]]):
         # The k-th of a corpus's n batches stands at (k + ½) / n of the epoch, whatever the others have.
         places = [((k + 0.5) / count, name) for name, count in counts.items() for k in range(count)]
         order = [name for _, name in sorted(places)]
-        done = order[: self.resume_batch] if self.epoch == self.resume_epoch else []
+        done = order[: self.done]
         for name, part in self.parts.items():
             part.seed = self.seed
             part.resume(self.epoch, done.count(name))
         remaining = {name: iter(part) for name, part in self.parts.items()}
         for name in order[len(done) :]:
             yield name, next(remaining[name])
-
-    def resume(self, epoch: int, batch: int) -> None:
-        """Continue in an epoch after some of its batches; later epochs are complete."""
-        self.set_epoch(epoch)
-        self.resume_epoch, self.resume_batch = epoch, batch
 
 
 class MixedDataset(Dataset[tuple[str, list[Sample]]]):
