@@ -356,7 +356,8 @@ class AnimationModel(PersonStyles, ABC):
         losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
-        self.evaluation.score(self, "val", self.with_person_styles(batch))
+        model = self.model_of(batch)
+        model.evaluation.score(model, "val", model.with_person_styles(batch))
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics as ``val/mve`` …."""
@@ -451,6 +452,10 @@ class AnimationModel(PersonStyles, ABC):
                 self.trainer.strategy.root_device,
                 data,
             )
+
+    def model_of(self, batch: Batch) -> AnimationModel:  # noqa: ARG002 - a model of one face
+        """The model of the face that a batch is of."""
+        return self
 
     def own_modules(self) -> Iterator[nn.Module]:
         """The modules that belong to the model's own corpus: all, by itself."""

@@ -68,9 +68,13 @@ class ManyFaces(DualPathDiffusion):
         """Those of the first face."""
         return (module for part in self.children() if part is not self.further_faces for module in part.modules())
 
-    def face_of(self, batch: Batch) -> DualPathDiffusion | None:
-        """The further face that a batch is of; None for the first."""
-        return cast(DualPathDiffusion, self.further_faces[batch.face]) if batch.face else None
+    def model_of(self, batch: Batch) -> DualPathDiffusion:
+        """The model of the face that a batch is of; itself for the first."""
+        return self.face(batch.face)
+
+    def face(self, name: str) -> DualPathDiffusion:
+        """The model of a face by its name, which is empty for the first."""
+        return cast(DualPathDiffusion, self.further_faces[name]) if name else self
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
         """Let every face take its own corpus.
@@ -106,27 +110,19 @@ class ManyFaces(DualPathDiffusion):
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The losses of the batch's own face."""
-        face = self.face_of(batch)
-        return super().losses(batch, generator) if face is None else face.losses(batch, generator)
+        face = self.model_of(batch)
+        return super().losses(batch, generator) if face is self else face.losses(batch, generator)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss and metrics of the batch's own face."""
-        face = self.face_of(batch)
         self._validated.add(batch.face)
-        if face is None:
-            super().validation_step(batch, batch_idx)
-            return
-        losses = face.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
-        logged = {f"val/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
-        face.evaluation.score(face, "val", face.with_person_styles(batch))
+        super().validation_step(batch, batch_idx)
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of each further face as ``val/NAME/mve`` …, and the mean over all faces as ``val/mve`` …."""
         scores = []
         for name in sorted(self._validated):  # a rehearsal of two batches sees two faces at most
-            face = cast(DualPathDiffusion, self.further_faces[name]) if name else self
-            scores.append(face.evaluation.scalars("val"))
+            scores.append(self.face(name).evaluation.scalars("val"))
             own = {f"val/{name}/{key.removeprefix('val/')}": value for key, value in scores[-1].items() if name}
             self.log_dict(own, sync_dist=True)
         self._validated.clear()
