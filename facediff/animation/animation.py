@@ -204,12 +204,7 @@ class Animation:
         """
         if self.head is None:
             return self
-        matrices = rotations(self.head[:, :3])
-        vertices = np.empty(self.vertices.shape, np.float32)
-        for index, frame in enumerate(self.vertices):
-            moving = self.head[index].any()
-            vertices[index] = (frame - self.head[index, 3:]) @ matrices[index] if moving else frame
-        still = replace(self, vertices=vertices, head=None)
+        still = replace(self, vertices=without_head(self.vertices, self.head), head=None)
         return still if self.values is None else still.made_of(self.space, self.values)
 
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
@@ -379,3 +374,12 @@ class Animation:
         facts += [f"style of {metadata['style']}"] if "style" in metadata else []
         facts += ["with speech" if self.speech is not None else "silent"]
         return f'Animation("{self.name}": {", ".join(facts)})'
+
+
+def without_head(vertices: npt.NDArray[np.float32], head: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """Vertices (T, V, 3), moved by ``head`` (T, 6) as :attr:`Animation.head` has it, as they were before."""
+    still = np.empty(vertices.shape, np.float32)
+    turns = rotations(head[:, :3])
+    for index, frame in enumerate(vertices):
+        still[index] = (frame - head[index, 3:]) @ turns[index] if head[index].any() else frame
+    return still

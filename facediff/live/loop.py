@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from facediff.animation.animation import without_head
 from facediff.live.frames import LiveFrame, Receiver
 from facediff.live.model import LiveModel
 from facediff.live.sources import Speech, SpeechSource
 from facediff.live.timing import Lags, Pacer, SpokenClock, Thinning
-from facediff.mesh.flame import rotations
 from facediff.speech.audio import samples_for
 from facediff.utils import SAMPLE_RATE
 
@@ -426,10 +426,10 @@ class Loop:
     def _still(self, frame: _Ready) -> Array:
         """Offsets of a frame's vertices whose head does not move as a whole, which shapes of a face cannot say."""
         if frame.head is None or not frame.head.any():
-            return frame.vertices
+            return frame.vertices  # to the last bit
         neutral = self.model.neutral
-        (turn,) = rotations(frame.head[None, :3])
-        return np.asarray((neutral + frame.vertices - frame.head[3:]) @ turn - neutral, np.float32)
+        (vertices,) = without_head((neutral + frame.vertices)[None], frame.head[None])
+        return np.asarray(vertices - neutral, np.float32)
 
     def _send(self, frame: _Ready, weights: Array | None, solving: float) -> None:
         began = time.monotonic()

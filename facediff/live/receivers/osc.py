@@ -144,11 +144,7 @@ class Osc(_Osc):
 
     def messages(self, frame: LiveFrame) -> list[bytes]:
         """The messages of a frame, in their order."""
-        weights = self._weights.of(frame).tolist()
-        head = message(self._frame, frame.index, float(frame.time), float(frame.lag), frame.dropped)
+        weights = zip(self._parts, self._weights.of(frame).tolist(), strict=True)
+        about = message(self._frame, frame.index, float(frame.time), float(frame.lag), frame.dropped)
         turned = message(self._turned, *frame.turned.tolist())
-        return [
-            head,
-            turned,
-            *(part + struct.pack(">f", weight) for part, weight in zip(self._parts, weights, strict=True)),
-        ]
+        return [about, turned, *(part + struct.pack(">f", weight) for part, weight in weights)]
