@@ -72,17 +72,22 @@ class Archive(Format):
         write_archive(path, animation if not options.no_speech else replace(animation, speech=None))
 
 
-@export_format.register("csv")
-class BlendshapeWeights(Format):
-    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for motion in such weights."""
+class _Weights(Format):
+    """Shared by the files of weights of blendshapes."""
 
-    next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
     speech = "next to it"
     needs_mesh = False
     needs_shapes = True
-    uses = ("shapes", "tracks", "key_tolerance")
     units = "none"
     up_axes = ()
+
+
+@export_format.register("csv")
+class BlendshapeWeights(_Weights):
+    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for motion in such weights."""
+
+    next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
+    uses = ("shapes", "tracks", "key_tolerance")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Solve for the weights and write them, with a .json file that says how well they fit."""
@@ -98,16 +103,11 @@ class BlendshapeWeights(Format):
 
 
 @export_format.register("json")
-class BeatWeights(Format):
+class BeatWeights(_Weights):
     """Weights of blendshapes (ARKit) as BEAT writes them; needs --shapes, but for motion in such weights."""
 
     next_step = "programs that play BEAT's faces read it; head and eyes' rotations are not in it"
-    speech = "next to it"
-    needs_mesh = False
-    needs_shapes = True
     uses = ("shapes",)
-    units = "none"
-    up_axes = ()
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write the weights that there are; those that are absent are not written as 0."""
