@@ -307,10 +307,7 @@ def parse(
     """The values of a command's parameters; those of a group as an instance of its dataclass."""
     flags = {flag for parameter in flat(parameters) for flag in parameter.flags}
     end = arguments.index("--") if "--" in arguments else len(arguments)
-    arguments = [
-        *(current_option(word, flags) if word[:2] == "--" and word not in flags else word for word in arguments[:end]),
-        *arguments[end:],
-    ]
+    arguments = [*(current_option(word, flags) for word in arguments[:end]), *arguments[end:]]
     refuse_repeated(flat(parameters), arguments)
     values = vars(make_parser(parameters, program, summary, details).parse_args(arguments))
     for parameter in flat(parameters):

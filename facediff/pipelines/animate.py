@@ -17,14 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from facediff.animation.options import (
-    AnimationControls,
-    AnimationOptions,
-    DirectionLike,
-    ExportOptions,
-    Scales,
-    scales_text,
-)
+from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import SAMPLE_RATE, ranges
@@ -62,13 +55,12 @@ def check_options(options: AnimationOptions) -> None:
     expressivity_of(options)
     read_scales(options.guidance)
     read_gate(options.voice_gate or OFF)
-    if options.controls != AnimationControls():
-        check_controls(options)
+    check_controls(options)
     if options.acting is not None:
         from facediff.editing.acting import read_acting
 
         read_acting(options.acting)
-    if options.direction is not None and (keys := keys_of(options.direction)) is not None:
+    if (keys := keys_of(options.direction)) is not None:
         for name in ("style", "condition", "expressivity", "guidance"):
             if getattr(options, name) is not None:
                 keys.refuse_both(name)
@@ -149,7 +141,7 @@ class AnimationPipeline(ABC):
         one_animation = f"{model} makes one animation, whatever the seed; omit the option"
         if options.samples > 1 and not samples:
             raise OptionError("samples", one_animation, options.samples)
-        drawn = not options.is_off and is_procedural(options) and options.controls_seed is None
+        drawn = is_procedural(options) and options.controls_seed is None
         if options.seed and not samples and not drawn:
             raise OptionError("seed", one_animation, options.seed)
         self.seed = options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or drawn else 0
@@ -171,7 +163,7 @@ class AnimationPipeline(ABC):
         self._correspondence: Correspondence | None = None
         self._phonemes: list[TimedPhoneme] | None = None  # of the recording, once they are known
         self.face: ControlledFace | None = None
-        self.direct(None if options.direction is None else keys_of(options.direction, self.frame_rate))
+        self.direct(keys_of(options.direction, self.frame_rate))
 
     @abstractmethod
     def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:

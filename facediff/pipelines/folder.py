@@ -85,13 +85,13 @@ def animate_folder(
         fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
         raise OptionError("suffix", f"a batch writes one file for each recording; choose {fit}", suffix)
     found = recordings(speech)
+    if (directions := directions_folder(options)) is not None:
+        check_directions(options, found, directions)
     correspondence = None if options.correspondence is None else Path(options.correspondence)
     if options.target_mesh is not None and correspondence is not None and not correspondence.exists():
         # Otherwise every process would fit the mesh, and a second run would see a file that decides the outputs and
         # that the records of the first one do not know.
         write_correspondence(replace(options, quiet=True, samples=1), found)
-    if (directions := directions_folder(options)) is not None:
-        check_directions(options, found, directions)
     quiet, export = replace(options, quiet=True), replace(export, quiet=True)
     decides = {**asdict(quiet), "export": asdict(export)}
     del decides["commercial_only"]  # refuses a model, and changes no animation
@@ -188,10 +188,7 @@ def write_correspondence(options: AnimationOptions, files: Sequence[Path]) -> No
         except FaceDiffError as error:  # the batch will say so of this recording, and goes on with others
             problems.append(error)
             continue
-        pipeline = open_pipeline(options)
-        if directions_folder(options) is not None:
-            pipeline.direct(None)
-        with pipeline.animations(speech[: FITTED_SECONDS * SAMPLE_RATE], file.stem):
+        with open_pipeline(options).animations(speech[: FITTED_SECONDS * SAMPLE_RATE], file.stem):
             return
     raise problems[0]
 
