@@ -36,6 +36,9 @@ VARIANT_KEYS = ("label", "options", "published")
 REFERENCES = ("still", "mean_face", "shuffled")
 """Rows that a test scores next to the model: see :data:`facediff.models.evaluation.METHODS`."""
 
+COSTS = ("weights", "rtf", "training", "memory")
+"""What a table can say of a method besides its scores."""
+
 MEAN_SUFFIX = ".mean"
 """What follows a method's name in that of its further row, the mean of ``model.test_samples`` samples."""
 
@@ -337,6 +340,29 @@ def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> Benchmark
         variants=variants,
         published=top.texts("published"),
     )
+
+
+def check_scores(plan: BenchmarkPlan) -> None:
+    """Refuse a protocol, a metric, a column or a published table of a plan that there is none of.
+
+    Apart from :func:`read_plan`, since it imports PyTorch.
+    """
+    from facediff.benchmark.published import find_published
+    from facediff.evaluation.evaluator import find_protocols
+    from facediff.metrics.by_name import parse_all
+    from facediff.metrics.generation import SMOOTHNESS
+
+    try:
+        (protocol,) = find_protocols([plan.protocol])
+        parse_all(plan.metrics)
+        find_published(plan.published)
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{plan.file}: {error}") from error
+    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *plan.metrics, *SMOOTHNESS, *COSTS]
+    for column in plan.columns:
+        # A metric of several scores gives each its own name behind.
+        if column not in scores and not column.startswith(tuple(f"{name}_" for name in plan.metrics)):
+            raise FaceDiffError(f"{plan.file}: columns: there is no score {column!r}: {choices(column, scores)}")
 
 
 def _corpus(name: str, section: Section, roots: Mapping[str, Path], path: Path) -> CorpusEntry:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from facediff.benchmark.plan import MEAN_SUFFIX
+from facediff.benchmark.plan import COSTS, MEAN_SUFFIX
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
 from facediff.benchmark.statistics import Difference, RowScores, compared, hears, marked
@@ -20,9 +20,6 @@ REFERENCE_LABELS = {
     "mean_face": "speaker's mean face",
     "shuffled": "{row}, shuffled speech",
 }
-COSTS = ("weights", "rtf", "training", "memory")
-"""What a table can say of a method besides its scores."""
-
 SPLIT_LABELS = {
     "test_a": "test A, seen speakers",
     "test_b": "test B, unseen speakers",
@@ -39,7 +36,8 @@ class ReportOutline:
         title: of the tables.
         description: what they are of.
         protocol: by which all was scored.
-        columns: scores and :data:`COSTS` that are shown; all scores if none is named, and all costs.
+        columns: scores and :data:`~facediff.benchmark.plan.COSTS` that are shown; all scores if none is named, and all
+            costs.
         baseline: the row that others are compared with; the first if empty.
         references: rows that were not trained.
         rows: label, and name in papers' tables, by row.

@@ -53,7 +53,7 @@ def benchmark(
         retry_failed: try cells again that failed
         dry_run: say what would run, and for how long by the last timings
     """
-    from facediff.benchmark.plan import find_plan, read_plan
+    from facediff.benchmark.plan import check_scores, find_plan, read_plan
     from facediff.utils.jobs import check_scheduler, is_cluster
     from facediff.utils.workers import processors
 
@@ -61,25 +61,10 @@ def benchmark(
     definition = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline
-    from facediff.benchmark.published import find_published
     from facediff.benchmark.running import estimate, pending, remember, run_cells
-    from facediff.benchmark.tables import COSTS
-    from facediff.evaluation.evaluator import find_protocols
-    from facediff.metrics.by_name import parse_all
     from facediff.utils.files import locked
 
-    try:
-        (protocol,) = find_protocols([definition.protocol])
-        parse_all(definition.metrics)
-        find_published(definition.published)
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{definition.file}: {error}") from error
-    scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *definition.metrics]
-    for column in definition.columns:
-        # A metric of several scores gives each its own name behind, as difference_ratio does for lips and upper face.
-        if not (column in (*scores, *COSTS) or column.startswith(tuple(f"{name}_" for name in definition.metrics))):
-            known = [*scores, *COSTS]
-            raise FaceDiffError(f"{definition.file}: columns: there is no score {column!r}: {choices(column, known)}")
+    check_scores(definition)
     cells = cells_of(definition)
     folder = output / definition.name
     left = pending(cells, folder, retry_failed=retry_failed)

@@ -7,6 +7,7 @@ calibration compare several samples of each sequence with the one recorded truth
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from itertools import combinations
 from typing import Any, ClassVar, Literal, Unpack
 
@@ -398,3 +399,10 @@ energy_score = functional(EnergyScore)
 spectrum_distance = functional(SpectrumDistance)
 frame_step = functional(FrameStep)
 difference_ratio = functional(DifferenceRatio)
+
+SMOOTHNESS: Mapping[str, tuple[Callable[[RegionLike], RatioMetric], str]] = {
+    f"{name}_{region}": (implementation, region)
+    for name, implementation in (("difference_ratio", DifferenceRatio), ("frame_step", FrameStep))
+    for region in ("lips", "upper_face")
+}
+"""What every test scores besides its protocol: metric and region by the score's name, such as ``frame_step_lips``."""

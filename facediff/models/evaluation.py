@@ -20,10 +20,8 @@ from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.metrics import (
     Context,
-    DifferenceRatio,
     EnergyScore,
     EyelidPairs,
-    FrameStep,
     LipPairs,
     ProtocolMetrics,
     Region,
@@ -34,6 +32,7 @@ from facediff.metrics import (
     protocol,
 )
 from facediff.metrics.by_name import parse_all
+from facediff.metrics.generation import SMOOTHNESS
 from facediff.models.inference import Inference, Style
 from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE
@@ -120,7 +119,7 @@ asked for them; the model with the style that ``animate`` takes where none is gi
 template, or from the mean of its speaker's training clips; the model given another sentence's speech."""
 
 ENERGY_REGIONS = ("lips", "upper_face")
-"""Regions by whose energy scores the best checkpoint is chosen, and whose smoothness is scored."""
+"""Regions by whose energy scores the best checkpoint is chosen."""
 
 PARAMETERS = "param_"
 """How the names of scores begin that are taken of the channels of a parametric space."""
@@ -286,11 +285,7 @@ class Evaluation:
         """Difference ratio and frame step by region, of tests."""
         if self.splits == ["val"]:
             return {}
-        return {
-            f"{name}_{region}": metric(regions[region]).to(device)
-            for name, metric in (("difference_ratio", DifferenceRatio), ("frame_step", FrameStep))
-            for region in ENERGY_REGIONS
-        }
+        return {name: metric(regions[region]).to(device) for name, (metric, region) in SMOOTHNESS.items()}
 
     def _prepare_energies(self, model: Inference, regions: Mapping[str, Region], device: torch.device) -> None:
         """Make the energy scores of validation, of the model and of a still face, by region."""

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from facediff.benchmark import cells_of, read_plan
+from facediff.benchmark.plan import check_scores
 from facediff.cli.benchmark import corpus_folders
 from facediff.errors import FaceDiffError
+from facediff.utils.files import config_dir
 
 PLAN = """\
 seeds: [0, 1]
@@ -77,3 +79,27 @@ def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path)
             corpus_folders(words)
     with pytest.raises(FaceDiffError, match="huge"):
         read_plan(folder / "plan.yaml", {"huge": folder})
+
+
+@pytest.mark.parametrize("path", sorted((config_dir() / "benchmark").glob("*.yaml")), ids=lambda path: path.stem)
+def test_plans_that_come_with_facediff_can_be_run(path: Path) -> None:
+    plan = read_plan(path)
+    check_scores(plan)
+    assert cells_of(plan)
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("columns: [lve, difference_ratio_mouth]", "difference_ratio_mouth"),
+        ("columns: [lip_closure_error]", "lip_closure_error"),  # a metric that the plan does not ask for
+        ("metrics: [lip_closing]", "lip_closing"),
+        ("protocol: papers", "papers"),
+        ("published: [nowhere]", "nowhere"),
+    ],
+)
+def test_a_score_or_table_that_there_is_not_is_named(folder: Path, line: str, named: str) -> None:
+    (folder / "plan.yaml").write_text(f"{PLAN}{line}\n")
+    plan = read_plan(folder / "plan.yaml")
+    with pytest.raises(FaceDiffError, match=rf"plan\.yaml.*{named}"):
+        check_scores(plan)
