@@ -62,10 +62,11 @@ def test_the_loss_of_a_clip_does_not_depend_on_its_padding(model: DualPathDiffus
         {"identity_encoder": registry.identity_encoder.none},
         {"fusion": registry.fusion.add},
         {"style_tokens": "single"},
+        {"template_token": True},
         {"decoder": registry.decoder.gru},
         {"style_encoder": registry.style_encoder.none, "identity_encoder": registry.identity_encoder.none},
     ],
-    ids=["full", "no_style", "no_identity", "add", "single_token", "gru", "no_condition"],
+    ids=["full", "no_style", "no_identity", "add", "single_token", "template_token", "gru", "no_condition"],
 )
 def test_every_trainable_parameter_gets_a_gradient(make_model: Make, tiny: Tiny, override: dict[str, object]) -> None:
     model = make_model(**override)
@@ -84,6 +85,26 @@ def test_ablations_leave_their_part_out(make_model: Make) -> None:
     assert len(bare.network.style_tokens.projections) == 3
     assert bare.network.mesh_encoder is None
     assert len(make_model(style_tokens="single").network.style_tokens.projections) == 1
+
+
+def test_the_neutral_face_is_a_token_of_what_it_has_of_its_own(make_model: Make, tiny: Tiny) -> None:
+    model = make_model(template_token=True)
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    model.measure(tiny)
+    own, token = collate([tiny.dataset("val")[0]]), model.network.template_token
+    assert token is not None
+    faces = torch.stack([model.assets.template(name) for name in model.identities])
+    expected = (faces - faces.mean(0)) / (faces - faces.mean(0)).square().mean().sqrt()
+    for face, whole in zip(faces, expected, strict=True):
+        last = model.conditions(replace(own, template=face[None])).style[:, -1]
+        torch.testing.assert_close(last[0], token.project(whole.flatten()), atol=1e-5, rtol=1e-4)
+    other = replace(own, template=own.template + 0.1 * torch.rand_like(own.template))
+    assert not torch.allclose(model.eval().generate_clips(own), model.generate_clips(other))
+    plain = make_model()
+    plain.adopt(tiny.assets().with_motion_scale(1.0))
+    torch.testing.assert_close(plain.eval().generate_clips(own), plain.generate_clips(other))
+    with pytest.raises(FaceDiffError, match="template_token"):
+        model.graphs()
 
 
 def test_conditions_are_computed_once_and_not_per_step(

@@ -122,8 +122,10 @@ def graphs_of(model: DualPathModel) -> Graphs:
     """A dual-path model with its present sampler as graphs and numbers.
 
     Raises:
-        FaceDiffError: if its sampler is not linear, or conditions are guided.
+        FaceDiffError: if its sampler is not linear, conditions are guided, or the network sees the neutral face.
     """
+    if model.network.template_token is not None:
+        raise FaceDiffError("template_token: a model that sees the neutral face cannot be exported; train one without")
     if [*model.views()] != [()]:
         raise FaceDiffError("guidance: a guided model cannot be exported; set all scales to 1")
     network, sampler = model.network, model.sampler

@@ -22,7 +22,14 @@ from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.decoders import DecoderFactory, StyleTransformer
 from facediff.models.dual_path.graphs import graphs_of
-from facediff.models.dual_path.network import Conditions, DualPathNetwork, Hidden, SpeechStyle, TokenForm
+from facediff.models.dual_path.network import (
+    Conditions,
+    DualPathNetwork,
+    Hidden,
+    SpeechStyle,
+    TemplateToken,
+    TokenForm,
+)
 from facediff.models.folding import (
     Blend,
     ConditionalDenoiser,
@@ -102,6 +109,8 @@ class DualPathDiffusion(AnimationModel):
         noise_scale: what motion is multiplied by before it is noised; ``auto`` measures on the training split at which
             scale half of its variance shows in the schedule's middle.
         style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
+        template_token: let the network see the neutral face f, as in algorithms 1 and 2 of the paper, which say not
+            where; here as a further token. Such a model cannot be exported.
         identity_dropout: share of training clips whose identity is hidden, so that unseen speakers can be animated.
         invented_speakers: share of training clips whose motion and style reference are multiplied by the same random
             gains under a hidden identity, so that the style path learns more speakers than the corpus has.
@@ -155,6 +164,7 @@ class DualPathDiffusion(AnimationModel):
         timestep_sampling: TimestepSampling = "uniform",
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
+        template_token: bool = False,
         identity_dropout: Share = 0.1,
         invented_speakers: Share = 0.0,
         invented_gain: Annotated[float, Range(0, 1)] = 0.1,
@@ -223,6 +233,7 @@ class DualPathDiffusion(AnimationModel):
             fusion=fusion(dim=dim),
             decoder=decoder(dim=dim, style_dim=dim),
             token_form=style_tokens,
+            template_token=TemplateToken(self.n_vertices, self.dims, dim) if template_token else None,
             speech_may_hide=speech_dropout > 0,
             style_may_hide=style_dropout > 0,
             speech_style=SpeechStyle(dim, sum(style.token_dims), len(self.identities)) if style_from_speech else None,
@@ -261,6 +272,9 @@ class DualPathDiffusion(AnimationModel):
                 noised, variances = space.modes(covariance)
             self.rescale_noise(half_hidden(noised, variances))
         space.fit(self.process.signal, covariance)
+        if (token := self.network.template_token) is not None:
+            faces = self.assets.templates
+            token.measure(torch.stack([faces[identity] for identity in self.identities if identity in faces]))
         return shapes
 
     def scale_like(self, other: DualPathDiffusion, data: SpeechMotionDataModule) -> None:
@@ -329,11 +343,11 @@ class DualPathDiffusion(AnimationModel):
             self.rescale_noise(float(scale))
 
     def personal_modules(self) -> list[nn.Module]:
-        """The identity's and the dynamic style's encoders, and how both are presented to the decoder."""
+        """The identity's and the dynamic style's encoders, and how these and the face are presented to the decoder."""
         network = self.network
         parts = (
             *(network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens),
-            self.style_identity,
+            *(network.template_token, self.style_identity),
         )
         return [part for part in parts if part is not None]
 

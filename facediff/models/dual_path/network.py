@@ -123,6 +123,7 @@ class DualPathNetwork(nn.Module):
         speech_may_hide: learn what stands for speech that is not given.
         style_may_hide: the same for the dynamic style.
         speech_style: what speech says of the style; None if that is not asked.
+        template_token: the neutral face to a further token; None if the network does not see it.
     """
 
     def __init__(
@@ -141,6 +142,7 @@ class DualPathNetwork(nn.Module):
         speech_may_hide: bool = False,
         style_may_hide: bool = False,
         speech_style: SpeechStyle | None = None,
+        template_token: TemplateToken | None = None,
     ) -> None:
         super().__init__()
         self.coordinates = coordinates
@@ -161,6 +163,7 @@ class DualPathNetwork(nn.Module):
         self.no_speech = nn.Parameter(torch.zeros(dim)) if speech_may_hide else None
         self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None
         self.speech_style = speech_style
+        self.template_token = template_token
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
 
     def share_trunk(self, other: DualPathNetwork) -> None:
@@ -238,6 +241,8 @@ class DualPathNetwork(nn.Module):
         if hidden.style is not None and self.no_style is not None:
             dynamic_style = torch.where(hidden.style[:, None], self.no_style.to(dynamic_style), dynamic_style)
         tokens = self.style_tokens(torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1))  # eq. 14
+        if self.template_token is not None:
+            tokens = torch.cat([tokens, self.template_token(batch.template).repeat(times, 1, 1)], dim=1)
         return Conditions(audio, tokens, mask, dynamic=encoded)
 
     def dynamic_style(
@@ -360,6 +365,35 @@ class StyleTokens(nn.Module):
             return self.null.expand(len(style), -1, -1)
         parts = torch.split(style, list(self.token_dims), dim=-1)
         return torch.stack([p(part) for p, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+class TemplateToken(nn.Module):
+    """The neutral face f as a token beside those of the style, for how a face moves follows from its shape too.
+
+    Args:
+        points: vertices.
+        dims: numbers of a vertex.
+        dim: channels of the token.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, points: int, dims: int, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(points, dims))
+        self.register_buffer("deviation", torch.ones(()))
+        self.project = nn.Linear(points * dims, dim)
+
+    def measure(self, templates: Float[Tensor, "identities points dims"]) -> None:
+        """Take the mean and the size of faces from those of the training; a single face counts as it is."""
+        self.mean.copy_(templates.mean(0))
+        deviation = (templates - self.mean).square().mean().sqrt()
+        self.deviation.copy_(deviation if deviation > 0 else torch.ones(()))
+
+    def forward(self, template: Float[Tensor, "batch points dims"]) -> Float[Tensor, "batch 1 dim"]:
+        """What neutral faces have of their own."""
+        return self.project(((template - self.mean) / self.deviation).flatten(1))[:, None]
 
 
 class StepEmbedding(nn.Module):
