@@ -65,10 +65,9 @@ class Glb:
         packed = [str(name) for name in needed if "compression" in str(name)] if isinstance(needed, list) else []
         if packed:
             # https://gltf-transform.dev/cli
-            remedy = "write it with `npx @gltf-transform/cli dequantize IN.glb OUT.glb`, or "
             raise ValueError(
-                f"is compressed ({', '.join(packed)}): {remedy if 'EXT_meshopt_compression' in packed else ''}"
-                f"import it into Blender and export it without compression"
+                f"is compressed ({', '.join(packed)}): write it with `npx @gltf-transform/cli dequantize IN.glb OUT.glb`, "
+                f"or import it into Blender and export it without compression"
             )
         self._expanded = 0  # bytes of all accessors that were read: many may share the same data
 

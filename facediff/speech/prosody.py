@@ -75,7 +75,7 @@ def pitch_of(piece: Wave) -> float | None:
     products = np.fft.irfft(np.fft.rfft(wave, size) * head, size)[SUMMED - 1 : SUMMED - 1 + lags]
     squares = np.concatenate([[0.0], np.cumsum(wave**2)])
     powers = squares[SUMMED : SUMMED + lags] - squares[:lags]
-    if powers[0] < 1e-7:
+    if SUMMED * wave[:SUMMED].var() < 1e-7:  # silence, also where an onset after it moves the mean of the piece
         return None
     difference = np.maximum(powers[0] + powers - 2 * products, 0.0)
     sums = np.cumsum(difference[1:])
@@ -91,7 +91,9 @@ def pitch_of(piece: Wave) -> float | None:
     lag = best + SHORTEST_LAG
     left, middle, right = difference[lag - 1 : lag + 2]
     bend = left - 2 * middle + right
-    return float(SAMPLE_RATE / (lag + (0.5 * (left - right) / bend if bend > 0 else 0.0)))
+    # The dip is one of the normalised difference: the bottom of the plain one may lie elsewhere.
+    shift = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    return float(SAMPLE_RATE / (lag + min(max(shift, -1.0), 1.0)))
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,14 @@ def test_noise_and_silence_have_no_pitch() -> None:
     assert pitch_of(np.zeros(SPAN)) is None
 
 
+def test_silence_before_an_onset_has_no_pitch() -> None:
+    """A resampler's noise far below hearing, and then a plosive's puff of air, which moves the mean of the piece."""
+    for seed in range(20):
+        piece = 1e-9 * np.random.default_rng(seed).standard_normal(SPAN)
+        piece[501:] += 0.02
+        assert pitch_of(piece) is None
+
+
 @pytest.mark.parametrize("peak", [1.2, 1.9])
 def test_accent_is_where_the_pitch_rises(peak: float) -> None:
     pitch = 120 * 2 ** (6 / 12 * np.exp(-(((SECONDS - peak) / 0.1) ** 2)))
