@@ -518,6 +518,12 @@ class _Canvas:
         lens = (FIELD_OF_VIEW, self.camera.near, self.camera.far)
         pose = np.eye(4, dtype=np.float32)
         positions, values = np.ascontiguousarray(positions), np.ascontiguousarray(values)
+        # The rasteriser does not cut triangles: one that reaches behind the camera would be drawn all over the picture.
+        ahead = positions[:, 2] < -self.camera.near
+        if not ahead.all():
+            faces = np.ascontiguousarray(faces[ahead[faces].all(axis=1)])
+            if len(faces) == 0:
+                return
         cv2.triangleRasterize(positions, faces, values, self.values, self.depth, pose, *lens, settings)
 
     def coverage(self, window: _Window) -> Float32:

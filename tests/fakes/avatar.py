@@ -253,7 +253,8 @@ def write_avatar(
             slots[:, :2] = part.joint, 0
             weights = np.zeros((len(points), 4), np.float32)
             height = part.vertices[:, 1] - part.vertices[:, 1].min()
-            weights[:, 0] = 0.5 + 0.5 * height / height.max() if posed else 1
+            # A vertex has a joint once, as the validator of glTF asks: the body has the spine alone.
+            weights[:, 0] = 0.5 + 0.5 * height / height.max() if posed and part.joint else 1
             weights[:, 1] = 1 - weights[:, 0]
             attributes |= {
                 "JOINTS_0": file.add(slots, "VEC4", target=34962),

@@ -140,6 +140,17 @@ def test_vertices_outside_or_behind_the_camera_give_background(sphere: MakeSpher
     assert (renderer.render(vertices) != empty).any()
 
 
+def test_a_body_that_reaches_behind_the_camera_does_not_cover_the_face(sphere: MakeSphere) -> None:
+    vertices, faces = sphere()
+    camera = Camera.framing(vertices)
+    body = 3 * vertices + [0, -4, camera.distance]
+    both = np.concatenate([vertices, body])
+    renderer = Renderer(np.concatenate([faces, faces + len(vertices)]), template=both, size=48, camera=camera, look=PLAIN)
+    alone = Renderer(faces, template=vertices, size=48, camera=camera, look=PLAIN).render(vertices)
+    top = slice(0, 20)
+    assert np.mean(_drawn(renderer.render(both))[top] != _drawn(alone)[top]) < 0.01
+
+
 def test_one_camera_for_two_topologies_keeps_their_sizes(sphere: MakeSphere) -> None:
     big, small = sphere(), sphere(12, 24)
     camera = Camera.framing([big[0], small[0] * 0.5])
