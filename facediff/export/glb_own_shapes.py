@@ -285,7 +285,8 @@ def _animate(
     for node, turns in _turns(own, weights):
         add(node, "rotation", _local(glb, node, turns))
     if motion["channels"]:
-        glb.content["animations"] = [*glb.entries("animations"), motion]
+        # The first one is what Blender and viewers play of themselves.
+        glb.content["animations"] = [motion, *glb.entries("animations")]
 
 
 def _turns(own: OwnShapes, weights: Weights) -> list[tuple[int, Array]]:

@@ -12,6 +12,7 @@ The sound next to the .glb is a strip of the scene, which ``--blend hello.blend`
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -49,13 +50,17 @@ def curves_of(action: bpy.types.Action) -> list[bpy.types.FCurve]:
 
 
 def facts_of(glb: str) -> tuple[float, int]:
-    """Frame rate and number of frames, as a .glb of facediff has them; avatars do not."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.import_scene.gltf(filepath=glb)
-    facts = next((dict(made.items()) for made in bpy.context.scene.objects if "frame_rate" in made), None)
-    if facts is None:
-        sys.exit(f"{glb}: does not say its frame rate; give --frame-rate and --frames")
-    return float(facts["frame_rate"]), int(facts["frames"])
+    """Frame rate and number of frames, as a .glb of facediff has them, or by the times of its first animation."""
+    with open(glb, "rb") as file:
+        content = json.loads(file.read(int.from_bytes(file.read(20)[12:16], "little")))
+    facts = next((node["extras"] for node in content["nodes"] if "frame_rate" in node.get("extras", {})), None)
+    if facts is not None:
+        return float(facts["frame_rate"]), int(facts["frames"])
+    if not content.get("animations"):
+        sys.exit(f"{glb}: has no animation; write it with `facediff export` or `facediff retarget`")
+    times = content["accessors"][content["animations"][0]["samplers"][0]["input"]]
+    last = times["max"][0]
+    return round((times["count"] - 1) / last, 3) if last > 0 else 25.0, times["count"]
 
 
 def add_sound(scene: bpy.types.Scene, wav: Path) -> None:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import ast
 import json
+import runpy
 import sys
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
 
-from facediff.animation import write_archive
+from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.export import fbx, write_animations
 from facediff.mesh import read_mesh
+from facediff.spaces import layout
+from tests.fakes.avatar import avatar_parts, write_avatar
 from tests.fakes.clicks import clicks
 from tests.fakes.glb_reader import Reader
 
@@ -85,6 +90,22 @@ def test_without_blender_the_script_is_named(
     assert str(fbx.SCRIPT) in capsys.readouterr().err
     monkeypatch.setattr(fbx, "MODULE", "json")
     assert fbx.command() == [sys.executable, str(fbx.SCRIPT)]
+
+
+def test_frame_rate_and_length_are_read_from_a_face_and_from_an_avatar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "bpy", ModuleType("bpy"))
+    facts_of = runpy.run_path(str(fbx.SCRIPT))["facts_of"]
+    animation = clicks()
+    frames = len(animation.vertices)
+    write_animations(tmp_path / "face.glb", [animation])
+    assert facts_of(str(tmp_path / "face.glb")) == (25.0, frames)
+    write_avatar(tmp_path / "avatar.glb", avatar_parts(rounds=0))  # with an animation of its own, of one second
+    spoken = Animation("x", animation.vertices, animation.template, 30.0, faces=animation.faces)
+    spoken = spoken.made_of(layout("arkit"), np.zeros((frames, 52), np.float32))
+    write_animations(tmp_path / "out.glb", [spoken], into=tmp_path / "avatar.glb", own_shapes=True)
+    assert facts_of(str(tmp_path / "out.glb")) == (30.0, frames)
 
 
 def test_a_target_in_fbx_is_refused_with_the_conversion(tmp_path: Path) -> None:

@@ -53,9 +53,9 @@ def talk(path: Path, parts: dict[str, AvatarPart], *, posed: bool = False) -> An
 
 
 def evaluated(glb: Glb, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and normals of a part at a frame of the last animation, in the scene: targets first, then the skin."""
+    """Vertices and normals of a part at a frame of the animation that was added, in the scene: targets first, then the skin."""
     part = next(part for part in placed_parts(glb) if f"{name}Material" in part.names)
-    animation = glb.content["animations"][-1]
+    animation = glb.content["animations"][0]
     targets = part.primitive.get("targets", [])
     weights = np.zeros(len(targets))
     for channel in animation["channels"]:
@@ -80,8 +80,9 @@ def evaluated(glb: Glb, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
 def without_additions(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
     """The new description less what may be added to the old one."""
     made = copy.deepcopy(new)
-    for kind in ("accessors", "bufferViews", "animations"):
+    for kind in ("accessors", "bufferViews"):
         del made[kind][len(old.get(kind, [])) :]
+    del made["animations"][0]
     made["buffers"][0]["byteLength"] = old["buffers"][0]["byteLength"]
     for mesh, before in zip(made["meshes"], old["meshes"], strict=True):
         count = len(before.get("weights", []))
@@ -113,7 +114,7 @@ def test_an_avatar_keeps_all_it_has(tmp_path: Path, parts: dict[str, AvatarPart]
     add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.01)
     old, new = opened(tmp_path / "avatar.glb"), opened(tmp_path / "out.glb")
     assert new.binary.startswith(old.binary)
-    idle, kept = old.content["animations"][0], new.content["animations"][0]
+    idle, kept = old.content["animations"][0], new.content["animations"][1]
     changed = kept["samplers"][1]
     assert {**changed, "output": 0} == {**idle["samplers"][1], "output": 0}
     count = len(parts["Head"].targets)
@@ -132,7 +133,7 @@ def test_an_avatar_keeps_all_it_has(tmp_path: Path, parts: dict[str, AvatarPart]
         for content in (old.content, new.content):
             content["meshes"][i] |= {"weights": [], "extras": {"targetNames": []}}
     if not LAYOUTS[layout].get("joined"):
-        assert {c["target"]["node"] for c in new.content["animations"][1]["channels"]} == {
+        assert {c["target"]["node"] for c in new.content["animations"][0]["channels"]} == {
             i for i, node in enumerate(old.content["nodes"]) if node["name"] in MOVING
         }
     expected = copy.deepcopy(old.content)

@@ -125,7 +125,7 @@ def test_an_animation_is_added_and_everything_else_stays(tmp_path: Path) -> None
     assert two["extras"]["targetNames"][:2] == ["jawOpen", "smile"]
     assert two["weights"][:2] == [0.25, 0]
     assert len(two["weights"]) == len(after["targets"]) == len(two["extras"]["targetNames"])
-    smile, hello = new.content["animations"]
+    hello, smile = new.content["animations"]
     total = len(after["targets"])
     kept = new.numbers(smile["samplers"][smile["channels"][0]["sampler"]]["output"], "SCALAR", ("f4",)).reshape(
         2, total
