@@ -145,7 +145,8 @@ def test_a_body_that_reaches_behind_the_camera_does_not_cover_the_face(sphere: M
     camera = Camera.framing(vertices)
     body = 3 * vertices + [0, -4, camera.distance]
     both = np.concatenate([vertices, body])
-    renderer = Renderer(np.concatenate([faces, faces + len(vertices)]), template=both, size=48, camera=camera, look=PLAIN)
+    joined = np.concatenate([faces, faces + len(vertices)])
+    renderer = Renderer(joined, template=both, size=48, camera=camera, look=PLAIN)
     alone = Renderer(faces, template=vertices, size=48, camera=camera, look=PLAIN).render(vertices)
     top = slice(0, 20)
     assert np.mean(_drawn(renderer.render(both))[top] != _drawn(alone)[top]) < 0.01
