@@ -66,8 +66,8 @@ class Glb:
         if packed:
             # https://gltf-transform.dev/cli
             raise ValueError(
-                f"is compressed ({', '.join(packed)}): write it with `npx @gltf-transform/cli dequantize IN.glb OUT.glb`, "
-                f"or import it into Blender and export it without compression"
+                f"is compressed ({', '.join(packed)}): write it with `npx @gltf-transform/cli dequantize IN.glb OUT.glb`"
+                f", or import it into Blender and export it without compression"
             )
         self._expanded = 0  # bytes of all accessors that were read: many may share the same data
 

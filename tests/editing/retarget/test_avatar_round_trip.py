@@ -53,7 +53,7 @@ def talk(path: Path, parts: dict[str, AvatarPart], *, posed: bool = False) -> An
 
 
 def evaluated(glb: Glb, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and normals of a part at a frame of the animation that was added, in the scene: targets first, then the skin."""
+    """Vertices and normals of a part at a frame of the added animation, in the scene: targets first, then the skin."""
     part = next(part for part in placed_parts(glb) if f"{name}Material" in part.names)
     animation = glb.content["animations"][0]
     targets = part.primitive.get("targets", [])
