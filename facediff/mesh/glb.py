@@ -65,9 +65,10 @@ class Glb:
         packed = [str(name) for name in needed if "compression" in str(name)] if isinstance(needed, list) else []
         if packed:
             # https://gltf-transform.dev/cli
+            remedy = "`npx @gltf-transform/cli dequantize IN.glb OUT.glb`"
             raise ValueError(
-                f"is compressed ({', '.join(packed)}): write it with `npx @gltf-transform/cli dequantize IN.glb OUT.glb`"
-                f", or import it into Blender and export it without compression"
+                f"is compressed ({', '.join(packed)}): write it with {remedy}, or import it into Blender and export it "
+                f"without compression"
             )
         self._expanded = 0  # bytes of all accessors that were read: many may share the same data
 
