@@ -8,7 +8,6 @@ import importlib
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -250,11 +249,8 @@ HEAVY |= {"soundfile", "soxr", "cv2", "av", "PIL", "wandb", "rich", "beartype"}
     ],
 )
 def test_the_light_parts_load_nothing_heavy(program: str) -> None:
-    start = time.perf_counter()
     loaded = {name.split(".")[0] for name in modules_after(program)}
     assert not loaded & (HEAVY | {"torch", "numpy", "torchmetrics"})
-    # Under a second on an idle machine; a loaded one may be slow, but not as slow as importing torch and Lightning.
-    assert time.perf_counter() - start < 5
 
 
 def test_components_and_samplers_import_their_libraries_late() -> None:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from facediff.benchmark.results import cell_file
 from facediff.benchmark.running import Setting, estimate, fit_options, pending, remember, run_cells
 from facediff.benchmark.writing import document
 from facediff.reporting.documents import markdown
+from tests.fakes.waiting import wait_until
 
 LAUNCHER = (sys.executable, "-m", "facediff.utils.tethered", "tests.fakes.stand_in")
 PLAN = """\
@@ -176,13 +176,6 @@ def begin(folder: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(words, cwd=Path(__file__).parents[2], env=environment)
 
 
-def wait_for(condition: Any, seconds: float = 60) -> None:  # noqa: ANN401 - a function
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def is_running(process: int) -> bool:
     try:
         state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
@@ -196,11 +189,11 @@ def is_running(process: int) -> bool:
 def test_killed_and_started_again_the_table_is_that_of_another_benchmark_with_the_same_seeds(folder: Path) -> None:
     process = begin(folder)
     trained = folder / "out" / "runs"
-    wait_for(lambda: list(trained.rglob("last.ckpt")))
+    wait_until(lambda: list(trained.rglob("last.ckpt")))
     (call,) = calls(folder)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    wait_for(lambda: not is_running(call["pid"]))  # the training ends with whoever started it
+    wait_until(lambda: not is_running(call["pid"]))  # the training ends with whoever started it
     assert len(run(folder)) == 4
     again = calls(folder)[1]
     assert (again["command"], again["name"], again["continues"]) == ("fit", call["name"], True)

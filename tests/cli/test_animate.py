@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from facediff.mesh import read_mesh
 from facediff.models import DualPathDiffusion, load_model
 from facediff.speech.audio import read_speech
 from tests.fakes.processes import Forked, program
+from tests.fakes.waiting import wait_until, wait_until_read
 from tests.fakes.words import last_of_each
 
 
@@ -335,18 +335,15 @@ def test_half_precision_is_the_same_for_a_stream(checkpoint: Path, tmp_path: Pat
 def test_ctrl_c_ends_the_speech_and_what_was_said_is_kept(checkpoint: Path, tmp_path: Path) -> None:
     """A microphone has no other end."""
     process = Forked(program("facediff", *stream_words(checkpoint, tmp_path / "live.npy")[3:]))
-    deadline = time.monotonic() + 60
-    while "\n" not in process.printed(1) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: "\n" in process.printed(1), lambda: process.poll() is None)
     # docs/streaming.md promises this line to programs that wait for it.
     told = r"look-ahead 4.50 s .* 75 frames at a time, 25 a second, 24 vertices; reading 16000 Hz, 16 bit"
     assert re.fullmatch(f"facediff animate: ready; {told}\n", process.printed(1))
     process.stdin.write(pcm(2))
     process.stdin.flush()
-    time.sleep(1)
+    wait_until_read(process.stdin, process.pid)
     os.kill(process.pid, signal.SIGINT)
-    while process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: process.poll() is not None)
     assert process.wait(1) == 0
     assert "2.00 s of speech" in process.printed(1)
     assert np.load(tmp_path / "live.npy").shape == (50, 24, 3)

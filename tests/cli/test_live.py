@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import soundfile
 import facediff
 from facediff.cli.app import main
 from facediff.speech.audio import read_speech
+from tests.fakes.waiting import PATIENCE, wait_until_read
 
 WINDOWS = {"window": 0.6, "overlap": 0.2, "voice_gate": "off"}
 WORDS = ["--window", "0.6", "--overlap", "0.2", "--voice-gate", "off"]
@@ -79,10 +79,10 @@ def test_interrupt_ends_with_the_report_and_status_0(checkpoint: Path, tmp_path:
             assert process.poll() is None
         process.stdin.write(np.zeros(32_000, "<i2").tobytes())
         process.stdin.flush()
-        time.sleep(4)
+        wait_until_read(process.stdin, process.pid)
         process.send_signal(signal.SIGINT)
         said = process.stderr.read()
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE) == 0
     assert b" frames of 2.0 s" in said
     lines = out.read_text().splitlines()
     assert json.loads(lines[-1])["type"] == "end"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from facediff.cli.app import main
 from facediff.cli.trainer_options import check_trainer
 from facediff.errors import ArgumentError, MissingExtraError
 from tests.cli.conftest import SMALL
+from tests.fakes.waiting import free_port
 
 Fit = Callable[..., int]
 ROOT = Path(__file__).parents[2]
@@ -137,12 +137,6 @@ def test_a_run_of_the_sweep_trains(tiny_root: Path, tmp_path: Path, monkeypatch:
 
 
 # Several processes on this machine, which take one another for machines.
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
 
 
 def words_of(tiny_root: Path, runs: Path, *more: str) -> list[str]:

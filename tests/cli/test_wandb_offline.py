@@ -159,9 +159,7 @@ def test_a_server_that_says_nothing_does_not_answer() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
-        start = time.monotonic()
         assert not answers(f"http://127.0.0.1:{silent.getsockname()[1]}", patience=0.3)
-        assert time.monotonic() - start < 3
     assert not answers("http://host.invalid", patience=1.0)
 
 

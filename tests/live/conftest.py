@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -50,14 +49,3 @@ def opened(performance: Performance) -> Iterator[Opened]:
     yield open_one
     for receiver in receivers:
         receiver.close()
-
-
-@contextmanager
-def at_rate(rate: float) -> Iterator[Callable[[int], None]]:
-    """Waits until each frame of so many a second is due, counted from here."""
-    began = time.monotonic()
-
-    def wait(number: int) -> None:
-        time.sleep(max(0.0, began + number / rate - time.monotonic()))
-
-    yield wait

@@ -7,7 +7,6 @@ import json
 import socket
 import struct
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -23,8 +22,9 @@ from websockets.sync.client import ClientConnection, connect
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.live.frames import Performance, open_receiver
 from facediff.live.receivers.browser import ON_THE_WAY, STEP, Browser
+from tests.fakes.waiting import PATIENCE, free_port, wait_until
 from tests.live.conftest import FRAME_RATE, frame
-from tests.live.test_json_lines import free_port, wait_for
+from tests.live.test_json_lines import wait_for
 
 HEADER = 24
 
@@ -52,8 +52,8 @@ def visit(receiver: Browser, **options: object) -> ClientConnection:
 @pytest.fixture
 def visitor(served: Browser) -> Iterator[ClientConnection]:
     with visit(served) as connection:
-        assert json.loads(connection.recv(5))["format"] == "facediff live page 1"
-        connection.recv(5)
+        assert json.loads(connection.recv(PATIENCE))["format"] == "facediff live page 1"
+        connection.recv(PATIENCE)
         wait_for(served, "1 pages")
         yield connection
 
@@ -61,10 +61,10 @@ def visitor(served: Browser) -> Iterator[ClientConnection]:
 def test_the_description_the_mesh_and_frames(served: Browser, performance: Performance) -> None:
     count = len(performance.neutral)
     with visit(served) as connection:
-        about = json.loads(connection.recv(5))
+        about = json.loads(connection.recv(PATIENCE))
         assert (about["frameRate"], about["subject"], about["speech"]) == (FRAME_RATE, "Ann", True)
         assert about["metadata"] == {"licence": "CC0"}
-        mesh = connection.recv(5)
+        mesh = connection.recv(PATIENCE)
         assert isinstance(mesh, bytes)
         assert struct.unpack_from("<B3xIII", mesh) == (0, count, len(performance.faces), 0)
         rest = np.frombuffer(mesh, "<f4", 3 * count, HEADER).reshape(-1, 3)
@@ -74,11 +74,11 @@ def test_the_description_the_mesh_and_frames(served: Browser, performance: Perfo
         wait_for(served, "1 pages")
         for index in (4, 6):
             served.send(frame(index, dropped=3))
-            data = connection.recv(5)
+            data = connection.recv(PATIENCE)
             assert isinstance(data, bytes)
             kind, number, dropped, lag, seconds = struct.unpack_from("<B3xIIfd", data)
             assert (kind, number, dropped, seconds) == (1, index, 3, index / FRAME_RATE)
-            assert 0.1 <= lag < 5
+            assert 0.1 <= lag < PATIENCE
             steps = np.frombuffer(data, "<i2", offset=HEADER).reshape(-1, 3)
             apart = np.abs(STEP * steps - 1000 * frame(index).vertices)
             assert apart.max() <= 0.5 * STEP + 1e-4
@@ -87,7 +87,7 @@ def test_the_description_the_mesh_and_frames(served: Browser, performance: Perfo
 
 def test_speech_is_sent_as_samples_with_their_time(served: Browser, visitor: ClientConnection) -> None:
     served.hear(np.array([0.0, 0.5, -1.0, 2.0], np.float32), 1.25)
-    data = visitor.recv(5)
+    data = visitor.recv(PATIENCE)
     assert isinstance(data, bytes)
     assert struct.unpack_from("<B3xIIfd", data) == (2, 4, 0, 0.0, 1.25)
     assert np.frombuffer(data, "<i2", offset=HEADER).tolist() == [0, 16384, -32767, 32767]
@@ -101,26 +101,25 @@ def number(data: str | bytes) -> int:
 def test_a_page_that_falls_behind_gets_fewer_frames_and_blocks_nobody(
     served: Browser, visitor: ClientConnection
 ) -> None:
+    (page,) = served._viewers.values()
     served.send(frame(0))
-    visitor.send(str(number(visitor.recv(5))))
-    time.sleep(0.1)
-    began = time.monotonic()
+    visitor.send(str(number(visitor.recv(PATIENCE))))
+    wait_until(lambda: page._answers)
     for index in range(1, 41):
-        served.send(frame(index))
-        time.sleep(0.002)
-    assert time.monotonic() - began < 2
-    assert [number(visitor.recv(5)) for _ in range(ON_THE_WAY)] == list(range(1, ON_THE_WAY + 1))
+        served.send(frame(index))  # does not wait for the page, which neither reads nor answers
+        wait_until(lambda sent=index: page._on_the_way == min(sent, ON_THE_WAY))
+    assert [number(visitor.recv(PATIENCE)) for _ in range(ON_THE_WAY)] == list(range(1, ON_THE_WAY + 1))
     assert f"{40 - ON_THE_WAY} frames missed" in served.status()
     visitor.send("1")
-    time.sleep(0.1)
+    wait_until(lambda: page._on_the_way < ON_THE_WAY)
     served.send(frame(50))
-    assert number(visitor.recv(5)) == 50
+    assert number(visitor.recv(PATIENCE)) == 50
 
 
 def test_a_program_that_never_answers_gets_what_it_reads(served: Browser, visitor: ClientConnection) -> None:
     for index in range(40):
         served.send(frame(index))
-        assert number(visitor.recv(5)) == index
+        assert number(visitor.recv(PATIENCE)) == index
 
 
 @pytest.mark.parametrize("words", ["hello", "-1", "1", b"\0\1", "9" * 100, "١"])
@@ -129,16 +128,16 @@ def test_whoever_says_anything_else_is_shown_out(
 ) -> None:
     visitor.send(words)  # no frame is on the way: not even a number is right
     with pytest.raises(ConnectionClosed):
-        visitor.recv(5)
+        visitor.recv(PATIENCE)
     wait_for(served, "1 refused")
     wait_for(served, "0 pages")
     assert len([record for record in caplog.records if "refused" in record.message]) == 1
     with visit(served) as another:
-        another.recv(5)
-        another.recv(5)
+        another.recv(PATIENCE)
+        another.recv(PATIENCE)
         wait_for(served, "1 pages")
         served.send(frame(1))
-        another.recv(5)
+        another.recv(PATIENCE)
 
 
 @pytest.mark.parametrize(
@@ -161,13 +160,13 @@ def status_of(receiver: Browser, headers: dict[str, str]) -> int:
     given = {"Host": f"127.0.0.1:{receiver.port}", **headers}
     lines = ["GET /live HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
     lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *(f"{name}: {value}" for name, value in given.items())]
-    with socket.create_connection((receiver.host, receiver.port), 5) as client:
+    with socket.create_connection((receiver.host, receiver.port), PATIENCE) as client:
         client.sendall("\r\n".join([*lines, "", ""]).encode())
         return int(client.recv(64).split()[1])
 
 
 def test_the_page_loads_nothing_and_other_paths_are_not_there(served: Browser) -> None:
-    with urllib.request.urlopen(served.url, timeout=5) as response:  # noqa: S310 - our own server
+    with urllib.request.urlopen(served.url, timeout=PATIENCE) as response:  # noqa: S310 - our own server
         text, headers = response.read().decode(), response.headers
     assert headers["X-Frame-Options"] == "DENY"
     assert "connect-src 'self'" in text
@@ -175,7 +174,7 @@ def test_the_page_loads_nothing_and_other_paths_are_not_there(served: Browser) -
     assert "http://" not in text.replace("http://127", "")
     for path in ("../etc/passwd", "x", "live"):
         with pytest.raises(urllib.error.HTTPError) as failed:
-            urllib.request.urlopen(served.url + path, timeout=5)  # noqa: S310
+            urllib.request.urlopen(served.url + path, timeout=PATIENCE)  # noqa: S310
         failed.value.close()
         assert failed.value.code in (404, 426)
 
@@ -188,12 +187,12 @@ def test_noise_and_half_open_connections_stop_nothing(served: Browser, visitor: 
         b"POST / HTTP/1.1\r\nHost: a\r\n\r\n",
         b"\0" * 9000,
     ):
-        client = socket.create_connection((served.host, served.port), 5)
+        client = socket.create_connection((served.host, served.port), PATIENCE)
         client.sendall(noise)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.close()
     served.send(frame(0))
-    assert isinstance(visitor.recv(5), bytes)
+    assert isinstance(visitor.recv(PATIENCE), bytes)
 
 
 def test_a_taken_port_is_named(performance: Performance, served: Browser) -> None:
@@ -218,7 +217,7 @@ def test_the_package_that_is_missing_is_named(performance: Performance, monkeypa
 def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("facediff.live.receivers.browser.MOST_VIEWERS", 1)
     with visit(served) as first:
-        first.recv(5)
+        first.recv(PATIENCE)
         wait_for(served, "1 pages")
         with pytest.raises(InvalidStatus), visit(served):
             pass
@@ -226,7 +225,7 @@ def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: py
 
 def test_only_reading_is_answered(served: Browser) -> None:
     for method in ("GET", "HEAD", "PUT", "DELETE", "PATCH", "TRACE", "POST"):
-        connection = http.client.HTTPConnection(served.host, served.port, timeout=5)
+        connection = http.client.HTTPConnection(served.host, served.port, timeout=PATIENCE)
         with closing(connection):
             connection.request(method, "/")
             response = connection.getresponse()
@@ -240,8 +239,8 @@ def test_two_hundred_visitors_at_the_same_moment_get_the_page(served: Browser) -
     together = threading.Barrier(200)
 
     def read() -> int:
-        together.wait(30)
-        with urllib.request.urlopen(served.url, timeout=30) as response:  # noqa: S310 - our own server
+        together.wait(PATIENCE)
+        with urllib.request.urlopen(served.url, timeout=PATIENCE) as response:  # noqa: S310 - our own server
             return len(response.read())
 
     with ThreadPoolExecutor(200) as pool:

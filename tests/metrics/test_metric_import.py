@@ -1,4 +1,4 @@
-"""Importing the metrics brings torch and torchmetrics, nothing of the rest of the package, and takes no time."""
+"""Importing the metrics brings torch and torchmetrics, and nothing else that is heavy."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import subprocess
 import sys
 
 PROGRAM = """
-import sys, time
-start = time.perf_counter()
+import sys
 import torchmetrics
-middle = time.perf_counter()
 before = set(sys.modules)
 import facediff.metrics
-end = time.perf_counter()
-print((end - middle) / (middle - start), *sorted(set(sys.modules) - before))
+print(*sorted(set(sys.modules) - before))
 # torchmetrics itself takes transformers, matplotlib and others along where they are installed, but not these.
 assert not {name.split(".")[0] for name in before} & {"lightning", "jsonargparse", "diffusers", "jaxtyping"}
 """
@@ -23,8 +20,7 @@ def test_nothing_heavy_is_imported() -> None:
     run = subprocess.run(  # noqa: S603
         [sys.executable, "-W", "error", "-c", PROGRAM], capture_output=True, text=True, check=True, timeout=120
     )
-    ratio, *loaded = run.stdout.split()
-    assert float(ratio) < 0.1  # 0.02 on an idle machine
+    loaded = run.stdout.split()
     ours = {name for name in loaded if name.startswith("facediff")}
     others = {name.split(".")[0] for name in set(loaded) - ours}
     rest = {name for name in ours if not name.startswith("facediff.metrics")}

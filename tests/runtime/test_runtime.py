@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 
 import facediff
 from facediff import registry
@@ -110,15 +110,9 @@ def folder(model: AnimationModel, tmp_path_factory: pytest.TempPathFactory) -> P
     whole_run = tmp_path_factory.getbasetemp()
     shared = whole_run.parent if "PYTEST_XDIST_WORKER" in os.environ else whole_run
     path = shared / "tiny-onnx"
-    lock = shared / "tiny-onnx.lock"
-    try:
-        lock.touch(exist_ok=False)
-    except FileExistsError:
-        for _ in range(1200):
-            if path.exists():
-                return path
-            time.sleep(0.1)
-    export_model(model, path)
+    with FileLock(shared / "tiny-onnx.lock"):
+        if not path.exists():
+            export_model(model, path)
     return path
 
 

@@ -21,6 +21,7 @@ from facediff.utils.batch import run_batch
 from facediff.utils.jobs import PerWorker, SetupError, check_scheduler, run_tasks
 from facediff.utils.workers import WorkerDied
 from tests.fakes.tasks import counting, deadly, failing_oddly, failing_setup, place, raising, write_slowly
+from tests.fakes.waiting import wait_until
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Dask's own shutdown
@@ -92,8 +93,7 @@ def test_a_stop_ends_tasks_and_removes_what_is_half_written(
     work = partial(write_slowly, tmp_path)
     with closing(run_tasks(work, range(9), workers=2, scheduler=scheduler, writes=tmp_path)) as results:
         assert next(results) == (0, 0)
-        while not list(tmp_path.glob("begun*")):
-            time.sleep(0.02)
+        wait_until(lambda: list(tmp_path.glob("begun*")))
     left = {path.name for path in tmp_path.iterdir()}
     assert not {name for name in left if "partial" in name}
     assert "0.txt" in left
@@ -106,17 +106,18 @@ def test_a_stop_ends_threads_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     def work(task: int) -> int:
         if task:
-            (tmp_path / "begun").touch()
-            for _ in range(600):
-                time.sleep(0.05)
+            (tmp_path / f"begun{task}").touch()
+            try:
+                while True:
+                    time.sleep(0.05)
+            finally:
+                (tmp_path / f"ended{task}").touch()
         return task
 
-    started = time.monotonic()
     with closing(run_tasks(work, range(3), workers=2, scheduler=mode)) as results:
         next(results)
-        while not (tmp_path / "begun").exists():
-            time.sleep(0.02)
-    assert time.monotonic() - started < 20
+        wait_until(lambda: list(tmp_path.glob("begun*")))
+    wait_until(lambda: len(list(tmp_path.glob("ended*"))) == len(list(tmp_path.glob("begun*"))))
 
 
 def test_workers_that_see_other_files_are_refused(
@@ -226,10 +227,8 @@ def test_slurm_options_make_the_job_script(slurm: Path) -> None:
         assert f"#SBATCH {line}" in script
     assert "--nworkers 4" in script
     assert "--nthreads 1" in script
-    end = time.monotonic() + 20
-    while not (slurm / "jobs").exists() or len((slurm / "jobs").read_text().split()) < 2:
-        assert time.monotonic() < end, "six workers of four a job are two jobs"
-        time.sleep(0.05)
+    jobs = slurm / "jobs"
+    wait_until(lambda: jobs.exists() and len(jobs.read_text().split()) == 2)  # six workers of four a job
     assert re.sub(r"SLURMCluster-\d", "dummy-name", (slurm / "job.sh").read_text()) == script
 
 

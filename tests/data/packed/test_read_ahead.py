@@ -20,13 +20,7 @@ from facediff.data.packed.stores import RemoteStore
 from facediff.errors import FaceDiffError
 from tests.data.packed.test_stores import TINY, Ranges
 from tests.fakes.tiny import Tiny, write_tiny
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.002)
+from tests.fakes.waiting import wait_until
 
 
 def answers(number: int, made: list[int]) -> Callable[[], Answer]:
@@ -40,7 +34,7 @@ def answers(number: int, made: list[int]) -> Callable[[], Answer]:
 def test_answers_are_taken_once_and_are_bounded() -> None:
     ahead, made = ReadAhead(most_bytes=300), []
     ahead.expect({number: answers(number, made) for number in range(20)})
-    wait_for(lambda: ahead._bytes >= 300)
+    wait_until(lambda: ahead._bytes >= 300)
     time.sleep(0.05)
     assert len(made) < 3 + THREADS
     assert sorted(made) == list(range(len(made)))  # in order
@@ -49,7 +43,7 @@ def test_answers_are_taken_once_and_are_bounded() -> None:
         assert answer is None or bytes(answer[0]) == bytes([number]) * 100
         assert ahead.take(number) is None
         assert ahead._bytes < 300 + THREADS * 100
-    wait_for(lambda: not ahead._running)
+    wait_until(lambda: not ahead._running)
     assert ahead._bytes == 0
 
 
@@ -60,12 +54,12 @@ def test_what_is_no_longer_expected_is_given_up_and_what_failed_is_left_to_the_r
         raise FaceDiffError("the server is away")
 
     ahead.expect({"gone": answers(1, made), "stays": answers(2, made), "bad": failing})
-    wait_for(lambda: len(ahead._answers) == 2 and not ahead._running)
+    wait_until(lambda: len(ahead._answers) == 2 and not ahead._running)
     ahead.expect({"stays": answers(2, made), "new": answers(3, made)})
     assert ahead.take("gone") is None
     assert ahead.take("bad") is None
     assert ahead.take("stays") is not None
-    wait_for(lambda: "new" in ahead._answers)
+    wait_until(lambda: "new" in ahead._answers)
     assert sorted(made) == [1, 2, 3]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from facediff.synthetic.rig import CONTROLS
 from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
 from tests.fakes.glb_reader import Reader
+from tests.fakes.waiting import wait_until
 from tools.browser.chromium import Page
 
 Show = Callable[..., Page]
@@ -98,11 +98,12 @@ def downloaded(page: Page, folder: Path, action: Callable[[], object]) -> Path:
     folder.mkdir()
     page.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
     action()
-    end = time.monotonic() + 20
-    while not (found := [each for each in folder.iterdir() if each.suffix in (".json", ".npz", ".glb", ".wav")]):
-        assert time.monotonic() < end, list(folder.iterdir())
-        time.sleep(0.02)
-    return found[0]
+
+    def files() -> list[Path]:  # whole: while it comes, a file has another suffix
+        return [file for file in folder.iterdir() if file.suffix in (".json", ".npz", ".glb", ".wav")]
+
+    wait_until(files)
+    return files()[0]
 
 
 def test_keys_come_back_as_they_were_and_their_curves_are_those_of_python(show: Show) -> None:
