@@ -1,9 +1,8 @@
-"""The loop in real time, with a model and receivers that cost what a test says."""
+"""The loop by a simulated clock, with a model and receivers that cost what a test says."""
 
 from __future__ import annotations
 
 import threading
-import time
 from functools import partial
 
 import numpy as np
@@ -14,28 +13,39 @@ from facediff.errors import FaceDiffError
 from facediff.live.frames import LiveFrame
 from facediff.live.loop import Backlog, Loop
 from facediff.live.sources import Deliver
+from facediff.live.timing import MARGIN
 from facediff.speech.audio import samples_for
 from tests.fakes.live import AHEAD, FRAME_RATE, HOP, FakeStream, Kept, Spoken, fake_model
+from tests.fakes.simulated_time import SimulatedTime
 
 FRAME = 1 / FRAME_RATE
 
 
-def test_every_frame_leaves_at_its_time() -> None:
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
+    simulated = SimulatedTime()
+    for name in ("loop.time", "loop.threading"):
+        monkeypatch.setattr(f"facediff.live.{name}", simulated)
+    for name in ("timing", "frames"):
+        monkeypatch.setattr(f"facediff.live.{name}.monotonic", simulated.monotonic)
+    monkeypatch.setattr("tests.fakes.live.time", simulated)
+    return simulated
+
+
+def test_every_frame_leaves_at_its_time(clock: SimulatedTime) -> None:
     kept, reports = Kept(), list[str]()
     loop = Loop(fake_model(), Spoken(0.8), [kept], report=reports.append, every=0.3)
-    began = time.monotonic()
+    began = clock.monotonic()
     summary = loop.run()
     assert [frame.index for frame in kept.frames] == list(range(40))
     assert [frame.vertices[0, 0] for frame in kept.frames] == list(range(40))
     assert np.allclose([frame.time for frame in kept.frames], np.arange(40) * FRAME)
-    # Bursts of four frames come every 80 ms, but leave one by one; a busy machine may hold one up.
-    apart = np.diff(kept.times)
-    assert np.median(apart) == pytest.approx(FRAME, abs=0.004)
-    assert np.mean(apart > FRAME / 4) > 0.8
+    # Bursts of four frames come every 80 ms, but leave one by one, while the delay shrinks by 10 ms a second.
+    assert np.allclose(np.diff(kept.times), FRAME, atol=0.001)
     # The first frame of a burst waits for the others and the look-ahead.
     least = (HOP + AHEAD - 1) * FRAME
-    assert least - 0.005 < summary.lag.share(0.5) < least + 0.3
-    assert np.allclose([frame.heard for frame in kept.frames], began + (1 + np.arange(40)) * FRAME, atol=0.1)
+    assert summary.lag.share(0.5) == pytest.approx(least + 2 * MARGIN, abs=MARGIN)
+    assert np.allclose([frame.heard for frame in kept.frames], began + (1 + np.arange(40)) * FRAME)
     assert (summary.frames, summary.dropped, summary.lost) == (40, 0, 0)
     assert summary.receivers == {"kept:": "40 frames"}
     assert reports
@@ -69,10 +79,10 @@ def test_slow_model_drops_speech_says_so_once_and_keeps_its_lag(monkeypatch: pyt
 
 @pytest.mark.parametrize(("cost", "lost"), [(0.7, False), (4.0, True)])
 def test_frames_are_left_out_before_speech_is_dropped(
-    cost: float, *, lost: bool, monkeypatch: pytest.MonkeyPatch
+    cost: float, *, lost: bool, clock: SimulatedTime, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A model and a receiver that share one processor: fewer frames give a model of 0.7 s a second its time."""
-    processor, spared = threading.Lock(), list[bool]()
+    processor, spared = clock.Lock(), list[bool]()
 
     class Shared(FakeStream):
         def feed(self, samples: np.ndarray) -> np.ndarray:
@@ -82,7 +92,7 @@ def test_frames_are_left_out_before_speech_is_dropped(
     class Busy(Kept):
         def send(self, frame: LiveFrame) -> None:
             with processor:
-                time.sleep(0.8 * FRAME)
+                clock.sleep(0.8 * FRAME)
             super().send(frame)
 
     loop = Loop(fake_model(partial(Shared, cost)), Spoken(2.4), [Busy()], report=str)
@@ -99,13 +109,13 @@ def test_frames_are_left_out_before_speech_is_dropped(
     assert summary.dropped > 5
 
 
-def test_one_long_window_is_not_blamed_on_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_long_window_is_not_blamed_on_the_model(clock: SimulatedTime, monkeypatch: pytest.MonkeyPatch) -> None:
     """As when the process is stopped for a while: frames are left out then, and counted alike in both reports."""
 
     class Stopped(FakeStream):
         def feed(self, samples: np.ndarray) -> np.ndarray:
             if self.heard < 8_000 <= self.heard + len(samples):
-                time.sleep(1.2)
+                clock.sleep(1.2)
             return super().feed(samples)
 
     monkeypatch.setattr("facediff.live.loop.RECENT", 0.5)
@@ -118,19 +128,19 @@ def test_one_long_window_is_not_blamed_on_the_model(monkeypatch: pytest.MonkeyPa
     assert f"{summary.dropped} frames dropped" in reports[-1]
 
 
-def test_click_is_in_the_frame_in_which_it_was_spoken() -> None:
+def test_click_is_in_the_frame_in_which_it_was_spoken(clock: SimulatedTime) -> None:
     """Of a face that follows the level of the sound: the time at which its frame leaves is that of the click, late by
     what a frame lasts, and the margin.
     """
 
     class Clicks(Spoken):
         def run(self, deliver: Deliver, stopped: threading.Event) -> None:
-            began, places = time.monotonic(), (20, 41, 67)
+            places = (20, 41, 67)
             for piece in range(100):
-                time.sleep(max(0.0, began + 0.01 * (piece + 1) - time.monotonic()))
+                clock.sleep(0.01)
                 if piece in places:
-                    clicked.append(time.monotonic())
-                deliver(np.full(160, float(piece in places), np.float32), time.monotonic())
+                    clicked.append(clock.monotonic())
+                deliver(np.full(160, float(piece in places), np.float32), clock.monotonic())
 
     class Level(FakeStream):
         def feed(self, samples: np.ndarray) -> np.ndarray:
@@ -148,9 +158,9 @@ def test_click_is_in_the_frame_in_which_it_was_spoken() -> None:
     assert [kept.frames[place].index for place in loud] == [10, 20, 33]
     lags = np.array([kept.times[place] for place in loud]) - clicked
     assert (lags >= 0).all()
-    assert np.median(lags) < 0.1
+    assert lags.max() < FRAME + 2 * MARGIN + 0.001
     heard = np.array([kept.frames[place].heard for place in loud])
-    assert np.abs(heard - clicked).max() < FRAME + 0.02
+    assert np.abs(heard - clicked).max() < FRAME
 
 
 def test_speech_weights_and_the_end_reach_the_receivers() -> None:
@@ -205,11 +215,11 @@ def test_receiver_that_fails_does_not_stop_the_others() -> None:
     assert len([sentence for sentence in reports if "gone" in sentence]) == 1
 
 
-def test_interrupt_ends_with_a_summary() -> None:
+def test_interrupt_ends_with_a_summary(clock: SimulatedTime) -> None:
     kept = Kept(error=KeyboardInterrupt())
-    began = time.monotonic()
+    began = clock.monotonic()
     summary = Loop(fake_model(), Spoken(30.0), [kept], report=str).run()
-    assert time.monotonic() - began < 5
+    assert clock.monotonic() - began < 1
     assert summary.receivers == {"kept:": "3 frames"}
 
 
@@ -248,10 +258,9 @@ def test_backlog_drops_whole_frames_without_an_error_that_adds_up(frame_rate: fl
         pass
 
 
-@pytest.mark.slow
-def test_lag_stays_for_a_minute() -> None:
+def test_lag_stays_through_a_pause() -> None:
     kept = Kept()
-    loop = Loop(fake_model(), Spoken(60.0, pauses={3000: 1.0}), [kept], report=str)
+    loop = Loop(fake_model(), Spoken(40.0, pauses={1500: 1.0}), [kept], report=str)
     loop.run()
     lags = np.array(kept.times) - [frame.heard for frame in kept.frames]
-    assert abs(np.median(lags[-500:]) - np.median(lags[500:1000])) < 0.01
+    assert abs(np.median(lags[-250:]) - np.median(lags[250:750])) < 0.001

@@ -9,7 +9,6 @@ import io
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,19 +25,24 @@ from facediff.live.sound import SoundOut
 from facediff.live.sources import Microphone, Pcm, Played, SpeechSource
 from facediff.live.timing import Pacer, SpokenClock
 from tests.fakes.live import FakeSound, PortAudioError, device
+from tests.fakes.simulated_time import SimulatedTime
+from tests.fakes.waiting import PATIENCE, wait_until
 
 
 def heard(source: SpeechSource, stopped: threading.Event | None = None) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """All samples of a source, how many each piece has, and when each piece came, from the start."""
     pieces: list[np.ndarray] = []
     times: list[float] = []
-    began = time.monotonic()
+    clock = SimulatedTime()
+    began = clock.monotonic()
 
     def deliver(samples: np.ndarray, at: float) -> None:
         pieces.append(samples)
         times.append(at - began)
 
-    source.run(deliver, stopped or threading.Event())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("facediff.live.sources.time", clock)
+        source.run(deliver, stopped or clock.Event())  # type: ignore[arg-type]
     return np.concatenate(pieces), np.array([len(piece) for piece in pieces]), times
 
 
@@ -49,9 +53,7 @@ def test_recording_is_played_in_real_time(tmp_path: Path) -> None:
     samples, counts, times = heard(source)
     assert np.array_equal(samples, source.samples)
     assert len(samples) == 8000
-    late = np.array(times) - np.cumsum(counts) / 16_000
-    assert late.min() >= -0.001
-    assert np.median(late) < 0.01
+    assert np.allclose(times, np.cumsum(counts) / 16_000)
 
 
 @pytest.fixture
@@ -155,23 +157,22 @@ def test_microphone_hands_over_blocks_with_the_time_at_which_they_were_spoken(mo
     sound, stopped = library(monkeypatch, *CARDS), threading.Event()
     pieces: list[tuple[np.ndarray, float]] = []
     source = Microphone("Webcam")
+    monkeypatch.setattr("facediff.live.sources.time", SimpleNamespace(monotonic=lambda: 100.0))
     thread = threading.Thread(target=source.run, args=(lambda *piece: pieces.append(piece), stopped))
     thread.start()
-    while not sound.opened:
-        time.sleep(0.005)
+    wait_until(lambda: sound.opened)
     [stream] = sound.opened
     assert (stream.samplerate, stream.channels) == (32_000, 1)
     block = np.sin(np.arange(3200) / 20)[:, None].astype(np.float32)
     for _ in range(3):
-        now = time.monotonic()
         # PortAudio says that the first sample was recorded 0.15 s ago, so the last one 0.05 s ago.
         stream.callback(block, 3200, SimpleNamespace(currentTime=7.15, inputBufferAdcTime=7.0), None)
-        assert pieces[-1][1] == pytest.approx(now - 0.052, abs=0.03)  # 2 ms are held back
+        assert pieces[-1][1] == pytest.approx(100 - 0.05 - 1 / 480, abs=0.001)  # 2 ms are held back
     stream.callback(block, 3200, SimpleNamespace(currentTime=0.0, inputBufferAdcTime=0.0), "input overflow")
-    assert pieces[-1][1] == pytest.approx(time.monotonic(), abs=0.03)
+    assert pieces[-1][1] == pytest.approx(100, abs=0.003)
     assert source.lost == 1
     stopped.set()
-    thread.join(timeout=5)
+    thread.join(PATIENCE)
     assert stream.closed
     assert sum(len(samples) for samples, _ in pieces) == 4 * 1600 - 32
 
@@ -180,8 +181,7 @@ def test_microphone_that_is_unplugged_is_an_error(monkeypatch: pytest.MonkeyPatc
     sound = library(monkeypatch, *CARDS)
 
     def pull() -> None:
-        while not sound.opened:
-            time.sleep(0.005)
+        wait_until(lambda: sound.opened)
         sound.opened[0].stop()
 
     threading.Thread(target=pull, daemon=True).start()
@@ -194,7 +194,8 @@ def test_speech_is_heard_when_its_frames_are_due(monkeypatch: pytest.MonkeyPatch
     out, clock, pacer = SoundOut(), SpokenClock(), Pacer(0.1)
     still = np.zeros((1, 3), np.float32)
     out.open(Performance(25.0, still, np.zeros((0, 3), np.int32)))
-    start = time.monotonic()
+    start = 100.0
+    monkeypatch.setattr("facediff.live.sound.time", SimpleNamespace(monotonic=lambda: start))
     played = np.ones((160, 1), np.float32)
     out._play(played, 160, SimpleNamespace(currentTime=1.0, outputBufferDacTime=1.0), None)
     assert not played.any()  # nothing is known of the delay yet
@@ -205,7 +206,7 @@ def test_speech_is_heard_when_its_frames_are_due(monkeypatch: pytest.MonkeyPatch
     out.hear(ramp, 0.0)
     out._play(played, 160, SimpleNamespace(currentTime=1.0, outputBufferDacTime=1.1), None)
     # The block is heard in 0.1 s, 1.1 s after its speech began; less the delay, that is 0.38 s of it.
-    assert played[0, 0] == pytest.approx(1.1 - (pacer.delay or 0.0), abs=0.03)
+    assert played[0, 0] == pytest.approx(1.1 - (pacer.delay or 0.0), abs=1e-3)
     again = np.zeros((160, 1), np.float32)
     out._play(again, 160, SimpleNamespace(currentTime=1.01, outputBufferDacTime=1.11), None)
     assert again[0, 0] == pytest.approx(played[-1, 0] + 1 / 16_000, abs=1e-3)  # without a gap
