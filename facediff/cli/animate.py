@@ -166,4 +166,12 @@ def animate(
     for path in written:
         tell(f"{path}: {line}")
         line = "next to it"
+    if options.target_mesh is not None:
+        from facediff.cli.retarget import surface_notes
+        from facediff.export.glb_own_shapes import own_shapes, unused_shapes
+
+        mesh = Path(options.target_mesh)
+        tell(*pipeline.target_notes, *surface_notes(mesh, output, animation))
+        if output.suffix in (".glb", ".fbx"):
+            tell(*([own_shapes(mesh).summary] if options.own_shapes else unused_shapes(mesh)))
     return 0

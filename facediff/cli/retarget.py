@@ -95,11 +95,12 @@ def retarget(
     from facediff.editing.blendshapes import has_arkit_weights
     from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import retarget as transfer
-    from facediff.export import FORMATS, ExportOptions, check_export, write_animations
+    from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.glb_own_shapes import own_shapes as own_shapes_of
+    from facediff.export.glb_own_shapes import unused_shapes
     from facediff.export.pictures import draw_correspondence
     from facediff.mesh.glb import wears_more
-    from facediff.mesh.obj_surface import has_uvs, read_surface
+    from facediff.mesh.obj_surface import has_uvs
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
@@ -137,15 +138,9 @@ def retarget(
         notes.append(driven)
     elif dressed and not add_to_mesh:
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
-    textured = has_uvs(target_mesh)
-    if textured and (output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses):
-        notes += read_surface(target_mesh, len(made.triangles)).lost
-    elif textured:
-        notes.append(
-            f"{output.suffix} has no texture coordinates: those of {target_mesh.name} are left out; write .obj, .glb "
-            f"or .usdc, or give it to `facediff export` as --surface"
-        )
-    into = target_mesh if dressed or own_shapes or textured else None
+        notes += unused_shapes(target_mesh)
+    notes += surface_notes(target_mesh, output, made)
+    into = target_mesh if dressed or own_shapes or has_uvs(target_mesh) else None
     written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes)
     if show is not None:
         written.append(show)
@@ -216,6 +211,21 @@ def pick_on_page(
     if not saved:
         raise FaceDiffError("--pick: no landmarks were saved; save them on the page, or omit --pick")
     tell(picked)
+
+
+def surface_notes(target_mesh: Path, output: Path, made: Animation) -> list[str]:
+    """What of an .obj's texture coordinates and materials a file does not get, a sentence each."""
+    from facediff.export import FORMATS
+    from facediff.mesh.obj_surface import has_uvs, read_surface
+
+    if not has_uvs(target_mesh):
+        return []
+    if output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses:
+        return list(read_surface(target_mesh, len(made.triangles)).lost)
+    return [
+        f"{output.suffix} has no texture coordinates: those of {target_mesh.name} are left out; write .obj, .glb "
+        f"or .usdc, or give it to `facediff export` as --surface"
+    ]
 
 
 def remarks(animation: Animation, made: Animation, found: Correspondence, report: FitReport) -> list[str]:

@@ -103,6 +103,17 @@ def own_shapes(target: Path) -> OwnShapes:
         raise _unreadable(target, error) from error
 
 
+def unused_shapes(target: Path) -> list[str]:
+    """A sentence for users whose avatar has shapes that their option would drive; none if it has not."""
+    try:
+        own = own_shapes(target)
+    except FaceDiffError:
+        return []
+    return [
+        f"{target.name} has {len(own.binds)} shapes of its own ({own.kind}); --own-shapes drives them and adds none"
+    ]
+
+
 def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
     """Write a copy of an avatar whose own shapes and bones play an animation.
 

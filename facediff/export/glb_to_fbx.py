@@ -79,6 +79,9 @@ def convert(glb: str, fbx: str, tolerance: float, rate: float, frames: int, blen
     scene.render.fps_base = scene.render.fps / rate
     scene.frame_start, scene.frame_end = 0, frames - 1
     bpy.ops.import_scene.gltf(filepath=glb)
+    helpers = bpy.data.collections.get("glTF_not_exported")  # the ball by which the importer draws bones
+    for ball in [] if helpers is None else list(helpers.objects):
+        bpy.data.objects.remove(ball)
     if tolerance > 0:
         for action in bpy.data.actions:
             for curve in curves_of(action):
@@ -90,6 +93,9 @@ def convert(glb: str, fbx: str, tolerance: float, rate: float, frames: int, blen
         bpy.ops.wm.save_as_mainfile(filepath=str(Path(blend).resolve()))
     bpy.ops.export_scene.fbx(
         filepath=fbx,
+        # Pictures of a .glb have no files of their own, which Blender would refer to.
+        path_mode="COPY",
+        embed_textures=True,
         bake_anim_use_nla_strips=False,
         bake_anim_use_all_actions=False,
         # The exporter samples every frame; above 0 it leaves out what lies on a straight line: the thinned curves.

@@ -16,7 +16,7 @@ from facediff.mesh.obj_surface import ObjSurface
 from facediff.registry import export_format
 from facediff.utils.plain_files import json_text
 
-LIBRARY = "materials.mtl"  # In the folder of a sequence of .obj, for all frames
+LIBRARY = "materials"  # The .mtl in the folder of a sequence of .obj, for all frames
 RECORD = "sequence.json"  # The file that tells a folder of frames from any other folder
 
 
@@ -63,8 +63,13 @@ class ObjSequence(MeshSequence):
     def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> ObjSurface | None:
         """The texture coordinates; the materials and their pictures are written once for all frames."""
         surface = surface_of(animation, options)
-        if surface is None:
-            return None
+        if surface is not None:
+            self.write_materials(surface, folder, stem, LIBRARY)
+        return surface
+
+    @staticmethod
+    def write_materials(surface: ObjSurface, folder: Path, stem: str, library: str) -> None:
+        """The material file, and pictures whose names begin with the stem."""
         pictures, lines = pictures_of(surface, stem), [f"# {MARK.decode()}"]
         for number, material in enumerate(surface.materials):
             lines += [f"newmtl {material.name}", "Kd {:g} {:g} {:g}".format(*material.colour)]
@@ -72,11 +77,10 @@ class ObjSequence(MeshSequence):
                 name, data = pictures[number]
                 (folder / name).write_bytes(data)
                 lines.append(f"map_Kd {name}")
-        (folder / LIBRARY).write_text("\n".join(lines) + "\n", encoding="utf-8")
-        return surface
+        (folder / f"{library}.mtl").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def encoder(
-        self, animation: Animation, space: FileSpace, surface: ObjSurface | None = None
+        self, animation: Animation, space: FileSpace, surface: ObjSurface | None = None, library: str = LIBRARY
     ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """Vertices with nine digits, which give back every float32; colours follow them as sRGB from 0 to 1."""
         comment = f"# {_comment(animation, space)}\n"
@@ -85,7 +89,7 @@ class ObjSequence(MeshSequence):
         if surface is None:
             faces = "".join(f"f {a} {b} {c}\n" for a, b, c in triangles).encode()
         else:
-            comment += f"mtllib {LIBRARY}\n"
+            comment += f"mtllib {library}.mtl\n"
             lines, last = [f"vt {u:.9g} {v:.9g}\n" for u, v in surface.uvs.tolist()], -1
             corners = (surface.corners + 1).tolist()
             for (a, b, c), (p, q, r), number in zip(triangles, corners, surface.of_face.tolist(), strict=True):
@@ -149,6 +153,7 @@ class PointCache(Format):
     next_step = "Blender: import the .obj, add the modifier Mesh Cache and choose this file: docs/programs.md"
     speech = "next to it"
     needs_mesh = False
+    uses = ("surface",)
     dtype: str
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
@@ -160,7 +165,10 @@ class PointCache(Format):
             for points in space.frames(animation):
                 stream.write(points.astype(self.dtype).tobytes())
         for mesh in self.companions(path, animation):
-            mesh.write_bytes(ObjSequence().encoder(animation, space)(space.place(animation.template)))
+            form, surface = ObjSequence(), surface_of(animation, options)
+            if surface is not None:
+                form.write_materials(surface, path.parent, path.stem, path.stem)
+            mesh.write_bytes(form.encoder(animation, space, surface, path.stem)(space.place(animation.template)))
 
     def header(self, animation: Animation) -> bytes:
         """The bytes before the positions."""

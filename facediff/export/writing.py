@@ -121,8 +121,8 @@ def write_animations(
         for file in written:
             if (goal := path.with_name(file.name)).exists() and goal.is_dir() != file.is_dir():
                 raise FaceDiffError(f"{goal}: is in the way; move it, or choose another -o")
-            if file.suffix in PICTURE_SUFFIXES and file not in [hidden / target.name for target in targets]:
-                check_free(goal)  # a material's picture has not been named by the user
+            if file.suffix in (*PICTURE_SUFFIXES, ".mtl") and file not in [hidden / target.name for target in targets]:
+                check_free(goal)  # a material and its picture have not been named by the user
         for file in written:
             put_in_place(file, path.with_name(file.name))
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]

@@ -132,7 +132,7 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
             lost.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
             continue
         LIMITS.check("bytes", file.stat().st_size, file)
-        name = ""
+        name, left_out = "", set()
         for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
             word, _, rest = line.strip().partition(" ")
             if word == "newmtl":
@@ -148,6 +148,13 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
                     lost.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
                 else:
                     result[name] = Material(name, result[name].colour, picture)
+            elif word.lower().startswith(("map_", "bump", "norm")) or (
+                word == "d" and rest.strip() not in ("1", "1.0")
+            ):
+                left_out.add(word)
+        if left_out:
+            words = ", ".join(sorted(left_out))
+            lost.append(f"colours and their pictures are carried over, and {words} of {library} left out")
     return result
 
 

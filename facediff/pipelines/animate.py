@@ -110,6 +110,8 @@ class AnimationPipeline(ABC):
         gate: the voice gate's name with its options.
         progress: called while motion is generated; None for a bar on the terminal, if the options ask for one.
 
+        target_notes: what a user should know of the motion on the target mesh, where it was carried to it anew.
+
     Raises:
         FaceDiffError: if an option decides nothing or does not fit the face.
     """
@@ -161,6 +163,7 @@ class AnimationPipeline(ABC):
 
             self.acting = read_acting(options.acting)
         self._correspondence: Correspondence | None = None
+        self.target_notes: list[str] = []
         self._phonemes: list[TimedPhoneme] | None = None  # of the recording, once they are known
         self.face: ControlledFace | None = None
         self.direct(keys_of(options.direction, self.frame_rate))
@@ -462,6 +465,7 @@ class AnimationPipeline(ABC):
 
         def judge(retargeted: Animation, fit: Correspondence, report: FitReport) -> None:
             refuse_poor(target, report)
+            self.target_notes = [report.summary, *(f"note: {remark}" for remark in report.remarks)]
 
         # All samples have one face, so that one correspondence serves all.
         is_known = file is not None and file.exists()

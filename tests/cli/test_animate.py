@@ -457,7 +457,12 @@ def test_a_folder_of_recordings(checkpoint: Path, tmp_path: Path, capsys: pytest
 
 
 def test_samples_are_transferred_to_another_mesh_by_one_correspondence(
-    speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    speech: Path,
+    checkpoint: Path,
+    tiny_root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     from facediff.editing import retargeting
 
@@ -466,6 +471,7 @@ def test_samples_are_transferred_to_another_mesh_by_one_correspondence(
     monkeypatch.setattr(retargeting, "correspond", lambda *a, **k: found.append(1) or correspond(*a, **k))
     words = ["--samples", 2, "--target-mesh", tiny_root / "tiny.ply"]
     assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "t.npy", *words) == 0
+    assert "motion is carried" in capsys.readouterr().out
     assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "own.npy", "--samples", 2) == 0
     assert len(found) == 1
     template = load_model(checkpoint).assets.templates["A"].numpy()

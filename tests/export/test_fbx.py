@@ -108,6 +108,17 @@ def test_frame_rate_and_length_are_read_from_a_face_and_from_an_avatar(
     assert facts_of(str(tmp_path / "out.glb")) == (30.0, frames)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(fbx.command() is None, reason="needs Blender")
+def test_blender_embeds_an_avatars_pictures_and_leaves_out_its_helpers(tmp_path: Path) -> None:
+    write_avatar(tmp_path / "avatar.glb", avatar_parts(rounds=0))
+    animation = clicks()
+    animation = animation.made_of(layout("arkit"), np.zeros((len(animation.vertices), 52), np.float32))
+    (written, *_) = write_animations(tmp_path / "x.fbx", [animation], into=tmp_path / "avatar.glb", own_shapes=True)
+    assert b"\x89PNG" in written.read_bytes()
+    assert b"Icosphere" not in written.read_bytes()
+
+
 def test_a_target_in_fbx_is_refused_with_the_conversion(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"import_scene\.fbx\(filepath='me\.fbx'\).*me\.glb"):
         read_mesh(tmp_path / "me.fbx")

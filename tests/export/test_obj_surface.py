@@ -129,6 +129,21 @@ def test_usd_has_coordinates_materials_and_the_picture(
         write_animations(tmp_path / "a.usda", [animation], into=source)
 
 
+def test_the_mesh_of_a_point_cache_has_coordinates_materials_and_pictures(
+    tmp_path: Path, source: Path, animation: Animation
+) -> None:
+    for _ in range(2):
+        written = write_animations(tmp_path / "a.mdd", [animation], into=source)
+    assert [path.name for path in written] == ["a.mdd", "a.mtl", "a.obj", "a_0.png"]
+    again, before = (read_surface(path, 12) for path in (tmp_path / "a.obj", source))
+    assert np.array_equal(again.uvs[again.corners], before.uvs[before.corners])
+    assert [material.picture for material in again.materials] == [tmp_path / "a_0.png", None]
+    assert np.array_equal(read_mesh(tmp_path / "a.obj").vertices, animation.template)
+    (tmp_path / "a.mtl").write_text("newmtl mine")
+    with pytest.raises(FaceDiffError, match=r"a\.mtl"):
+        write_animations(tmp_path / "a.mdd", [animation], into=source)
+
+
 @pytest.mark.parametrize("form", ["PNG", "JPEG"])
 def test_a_picture_with_the_programs_mark_is_the_same_picture(tmp_path: Path, source: Path, form: str) -> None:
     from facediff.export.format import pictures_of
@@ -151,6 +166,9 @@ def test_what_is_missing_or_lies_elsewhere_is_left_out_and_said(tmp_path: Path, 
         assert any(name in sentence for sentence in surface.lost)
     (source.parent / "mine.mtl").unlink()
     assert "mine.mtl" in read_surface(source, 12).lost[0]
+    (source.parent / "mine.mtl").write_text("newmtl skin\nd 0.5\nmap_Bump skin.png\nnewmtl cloth\nd 1.0\n")
+    (sentence,) = read_surface(source, 12).lost
+    assert "d, map_Bump of mine.mtl" in sentence
     text = source.read_text()
     for broken in (
         text.replace("2/2", "2/99"),
