@@ -265,10 +265,11 @@ class Section:
 
 
 def find_plan(path: Path) -> Path:
-    """The file of a plan; those that begin with ``configs/`` are installed with the package."""
+    """The file of a plan; those of the package are found by ``configs/benchmark/NAME.yaml``, and by NAME alone."""
     if path.is_file():
         return path
-    bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / path
+    named = path if path.suffix == ".yaml" else Path(f"{path}.yaml")
+    bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / named
     if bundled.is_file():
         return bundled
     bundled_plans = [f"configs/benchmark/{file.name}" for file in sorted((config_dir() / "benchmark").glob("*.yaml"))]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from facediff.benchmark import cells_of, read_plan
-from facediff.benchmark.plan import check_scores
+from facediff.benchmark.plan import check_scores, find_plan
 from facediff.cli.benchmark import corpus_folders
 from facediff.errors import FaceDiffError
 from facediff.utils.files import config_dir
@@ -103,3 +103,11 @@ def test_a_score_or_table_that_there_is_not_is_named(folder: Path, line: str, na
     plan = read_plan(folder / "plan.yaml")
     with pytest.raises(FaceDiffError, match=rf"plan\.yaml.*{named}"):
         check_scores(plan)
+
+
+@pytest.mark.parametrize("name", ["quick", "quick.yaml", "configs/benchmark/quick.yaml"])
+def test_a_plan_of_the_package_is_found_from_any_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_plan(Path(name)).samefile(config_dir() / "benchmark" / "quick.yaml")
