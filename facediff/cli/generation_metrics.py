@@ -31,6 +31,7 @@ def generation_metrics(
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
     expressivity: Annotated[str | None, Option(metavar="E")] = None,
+    low_latency: bool = False,
     splits: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None,
     max_clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
     against: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
@@ -63,6 +64,7 @@ def generation_metrics(
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
         expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
+        low_latency: frame by frame, as `facediff live` does
         splits: val, test_a, test_b, test_c (default: all test splits)
         max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
         against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
@@ -96,7 +98,7 @@ def generation_metrics(
     from facediff.utils.progress import progress_bar
 
     factor = None if expressivity is None else ranges.EXPRESSIVITY.read("--expressivity", expressivity)
-    sampling = SamplingOptions(samples, references, sampler, steps, seed, factor)
+    sampling = SamplingOptions(samples, references, sampler, steps, seed, factor, low_latency)
     device = usable_device(device)
     reference = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)

@@ -35,7 +35,7 @@ ScaledMotion = Float[Tensor, "batch frames coordinates"]
 """Motion on the vertices, in the scale of the network."""
 
 WantedMotion = Float[Tensor, "batch wanted coordinates"]
-"""The same of the frames from a first one on."""
+"""The same of some frames."""
 
 Step = int | Int[Tensor, " batch"]
 """A step counted from 0: one for all clips, or one for each."""
@@ -225,14 +225,14 @@ class ConditionalDenoiser:
             self._last = features, prediction
         return prediction
 
-    def motion(self, sample: State, first: int = 0) -> WantedMotion:
-        """Scaled motion of the sampler's result, from a first frame on; where folded, the only map to the vertices.
+    def motion(self, sample: State, wanted: slice = slice(None)) -> WantedMotion:  # noqa: B008
+        """Scaled motion of the sampler's result in some frames; where folded, the only map to the vertices.
 
         Raises:
             FaceDiffError: if the sampler did not end at the last prediction.
         """
         if not isinstance(self.space, FoldedSpace):
-            return sample[:, first:]
+            return sample[:, wanted]
         # y alone does not say where the vertices are. But the last step of a linear sampler returns the last prediction
         # E M̂⁰, and M̂⁰ = U h + b of the features h that the network gave for it, which were kept.
         if self._last is None or not torch.allclose(sample, self._last[1], rtol=1e-3, atol=1e-4, equal_nan=True):
@@ -240,7 +240,7 @@ class ConditionalDenoiser:
                 "sampler: it is declared linear, but its last step does not return the last prediction; "
                 "choose --model.sampling_space=vertices"
             )
-        return self.network.clean_motion(self._last[0][:, first:])
+        return self.network.clean_motion(self._last[0][:, wanted])
 
 
 class PreconditionedDenoiser(ConditionalDenoiser):

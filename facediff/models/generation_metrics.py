@@ -124,6 +124,7 @@ class SamplingOptions:
         steps: of the sampler; the sampler's own if None.
         seed: of the first sample; the others follow.
         expressivity: 0 for the mean prediction, 1 for a sample; the checkpoint's if None.
+        low_latency: frame by frame, as speech arrives.
     """
 
     samples: ranges.Samples = 10
@@ -132,6 +133,7 @@ class SamplingOptions:
     steps: ranges.Steps | None = None
     seed: ranges.Seed = 0
     expressivity: ranges.Expressivity | None = None
+    low_latency: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -541,6 +543,8 @@ def measure(
                 f"{name}: is a model of {model.assets.corpus} with other speakers or vertices than those of "
                 f"{data.corpus_name} that are measured on; measure it by itself"
             )
+        if sampling.low_latency:
+            model.choose_low_latency()
         if sampling.sampler is not None or sampling.steps is not None:
             model.choose_sampler(sampling.sampler, sampling.steps)
         if sampling.expressivity is not None:

@@ -672,14 +672,14 @@ class WindowOverlap:
 
     Args:
         before: features of the window before in the shared frames, one tensor for each step; None for the first window.
-        kept: frames at the end that the next window will share.
+        kept: the frames that the next window will share.
         fixed: shared frames at the start that are given out already.
 
     Attributes:
         features: those of the kept frames, one tensor for each step; the next window's ``before``.
     """
 
-    def __init__(self, before: Sequence[Tensor] | None, kept: int, fixed: int = 0) -> None:
+    def __init__(self, before: Sequence[Tensor] | None, kept: slice, fixed: int = 0) -> None:
         self.before = before
         self.kept = kept
         self.fixed = fixed
@@ -693,7 +693,7 @@ class WindowOverlap:
         # and continues them. No jump is left at the boundary that would have to be smoothed afterwards.
         if self.before is not None:
             features = crossfaded(self.before[len(self.features)], features, self.fixed)
-        self.features.append(features[:, -self.kept :].clone())
+        self.features.append(features[:, self.kept].clone())
         return features
 
 

@@ -20,7 +20,7 @@ from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, WindowSpeech, clip_motion, window_motion
 from facediff.runtime.styles import RuntimeStyle, encode_style, read_style
 from facediff.speech.audio import samples_for
-from facediff.speech.windows import LOW_LATENCY, MotionWindow, SpeechWindows, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, MotionWindow, SpeechWindows, WindowPlan
 from facediff.utils.ranges import Expressivity, Seed, mismatch
 from facediff.version import __version__
 
@@ -52,7 +52,7 @@ class RuntimeModel(ExportedGraphs):
 
     def choose_low_latency(self) -> None:
         """Animate frame by frame from now on, and in few denoising steps where the model samples."""
-        self.windows = LOW_LATENCY
+        self.windows = LOW_LATENCY_AHEAD if self.description.blending == "steps" else LOW_LATENCY
         if quick := self.description.quick_steps:
             self.loop = list(zip(quick, self.description.quick_table, strict=True))
 

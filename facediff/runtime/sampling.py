@@ -110,19 +110,20 @@ def window_motion(
     Returns:
         the motion, and the tail that the next window blends with.
     """
-    own_frames = slice(window.context, window.context + window.frames)
+    own_frames = slice(window.context, window.context + window.frames + window.plan.ahead)
     if model.description.blending == "motion":
-        motion = clip_motion(model, speech, conditions)[:, own_frames][:, window.fixed :]
+        motion = clip_motion(model, speech, conditions)[:, own_frames][:, window.fixed : window.frames]
         if before is not None:
             shared = before[0].shape[1]
             blended = before[0] + crossfade(shared, 0)[:, None, None] * (motion[:, :shared] - before[0])
             motion = np.concatenate([blended, motion[:, shared:]], 1)
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
     features = np.ascontiguousarray(features_of(model, speech, speech.frames)[:, own_frames])
-    sampling = SamplerRun(model, conditions, before, window.shared, window.fixed)
+    new, last = slice(window.fixed, window.frames), slice(max(0, window.frames - window.kept), window.frames)
+    sampling = SamplerRun(model, conditions, before, window.shared, new)
     noise = NumpyWindowNoise(NAME, window, [conditions.choices.seed])
     motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
-    return motion, [kept[:, -window.kept :] for kept in sampling.kept]
+    return motion, [kept[:, last] for kept in sampling.kept]
 
 
 def own_frame_count(model: ExportedGraphs, speech: WindowSpeech) -> int:
@@ -176,7 +177,7 @@ class SamplerRun:
         conditions: what motion is conditioned on.
         before: what the window before kept, one array for each evaluation of the network; None for nothing.
         shared: frames that this window shares with it.
-        fixed: how many of these are given out already.
+        new: the frames that are wanted; those before them are given out already.
 
     Attributes:
         kept: what the next window is blended with, one array for each evaluation.
@@ -188,13 +189,13 @@ class SamplerRun:
         conditions: RuntimeConditions,
         before: Sequence[Array] | None,
         shared: int,
-        fixed: int = 0,
+        new: slice = slice(0, None),  # noqa: B008 - it cannot be changed
     ) -> None:
         self.model = model
         self.conditions = conditions
         self.before = before
         self.shared = shared
-        self.fixed = fixed
+        self.new = new
         self.kept: list[Array] = []
 
     def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
@@ -240,7 +241,7 @@ class SamplerRun:
         before, share = np.zeros((1, frames, about.kept), np.float32), np.ones((1, frames), np.float32)
         if self.before is not None:
             before[:, : self.shared] = self.before[len(self.kept)]
-            share[:, : self.shared] = crossfade(self.shared, self.fixed)
+            share[:, : self.shared] = crossfade(self.shared, self.new.start)
         prediction, kept = self.model.run(
             "step",
             {
@@ -258,7 +259,7 @@ class SamplerRun:
     def _decoded(self, result: tuple[Array, Array], unit: Array) -> Array:
         sample, kept = result
         last = kept if self.model.description.decoded == "kept" else sample
-        return self.model.run("motion", {"sample": last[:, self.fixed :], "noise": unit[:, self.fixed :]})[0]
+        return self.model.run("motion", {"sample": last[:, self.new], "noise": unit[:, self.new]})[0]
 
     def _start(self, unit: Array) -> Array:
         """The noisy motion that the loop starts from."""

@@ -25,7 +25,7 @@ from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, ch
 from facediff.runtime.onnxruntime_web import LICENCE
 from facediff.speech.audio import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
-from facediff.speech.windows import LOW_LATENCY
+from facediff.speech.windows import LOW_LATENCY_AHEAD
 from facediff.utils.files import atomic_folder
 from facediff.utils.server import HEADERS as SERVED
 from facediff.utils.server import names_of, own_page_only, require_server, run_server
@@ -45,8 +45,8 @@ SCRIPTS = (
 WORKER = ("archive", "npz", "noise", "windows", "voice_gate", "frame_clock", "exported", "generating", "talk_worker")
 """Parts of the worker's script."""
 DELAYS: tuple[dict[str, float | bool], ...] = (
-    {**vars(LOW_LATENCY), "quick": True},
-    {**vars(LOW_LATENCY), "quick": True, "seconds": 4 / 30},  # a third of the work
+    {**vars(LOW_LATENCY_AHEAD), "quick": True},
+    {**vars(LOW_LATENCY_AHEAD), "quick": True, "seconds": 4 / 30},  # a third of the work
     {"seconds": 1.0, "overlap": 0.4},
 )
 """Windows for a microphone that answer sooner than the model's own; quick ones take few denoising steps. A page begins

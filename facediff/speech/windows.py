@@ -122,6 +122,8 @@ class WindowPlan:
         above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
             in one pass.
         past: motion before the window that it sees and continues.
+        ahead: motion after the window that is generated with it and not given out. Its noise is known before its
+            speech, which is replaced by silence where it is not heard yet.
 
     Raises:
         FaceDiffError: if a length is impossible.
@@ -129,7 +131,7 @@ class WindowPlan:
     Example:
         >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
         >>> plan.in_frames(25.0)
-        FramePlan(frames=50, overlap=12, before=50, after=12, past=0)
+        FramePlan(frames=50, overlap=12, before=50, after=12, past=0, ahead=0)
         >>> plan.look_ahead
         2.5
     """
@@ -140,12 +142,14 @@ class WindowPlan:
     after: float = 0.5
     above: float = 10.0
     past: float = 0.0
+    ahead: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.seconds <= 600:
             raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
-        if not 0 <= self.past < math.inf:
-            raise FaceDiffError(f"past: {self.past:g} s is impossible; choose 0 s or more")
+        for name in ("past", "ahead"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise FaceDiffError(f"{name}: {getattr(self, name):g} s is impossible; choose 0 s or more")
         # A window that sees motion which does not change any more need not share frames that do.
         fits = 0 <= self.overlap < self.seconds if self.past else 0 < self.overlap <= self.seconds / 2
         if not fits:
@@ -162,12 +166,11 @@ class WindowPlan:
         Raises:
             FaceDiffError: if windows are too short for frames.
         """
-        frames, overlap, before, after, past = (
-            round(length * frame_rate) for length in (self.seconds, self.overlap, self.before, self.after, self.past)
-        )
+        lengths = (self.seconds, self.overlap, self.before, self.after, self.past, self.ahead)
+        frames, overlap, before, after, past, ahead = (round(length * frame_rate) for length in lengths)
         if past:
             frames = max(1, frames)
-            return FramePlan(frames, min(overlap, frames - 1), before, after, past)
+            return FramePlan(frames, min(overlap, frames - 1), before, after, past, ahead)
         # Half of a window may be rounded up where the window is rounded down.
         overlap = max(1, min(overlap, frames // 2))
         if frames < 4:
@@ -175,7 +178,7 @@ class WindowPlan:
                 f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s are too few frames at "
                 f"{frame_rate:g} a second; choose longer windows"
             )
-        return FramePlan(frames, overlap, before, after, past)
+        return FramePlan(frames, overlap, before, after, past, ahead)
 
     def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
         """The plan with other lengths; None keeps a length.
@@ -205,6 +208,9 @@ class WindowPlan:
 LOW_LATENCY = WindowPlan(seconds=1 / 30, overlap=0.0, before=0.4, after=0.12, above=0.0, past=1.0)
 """Windows of one frame that hear 0.12 s ahead and continue the last second of motion; see docs/streaming.md."""
 
+LOW_LATENCY_AHEAD = replace(LOW_LATENCY, past=0.48, ahead=0.48)
+"""The same for a model that draws noise for each frame, whose motion depends on the noise before and after a frame."""
+
 LOW_LATENCY_STEPS = 2
 """Denoising steps of such a window: what is random in its motion is mostly decided by the motion that it continues."""
 
@@ -219,6 +225,7 @@ class FramePlan:
         before: of speech before a window.
         after: of speech after it.
         past: of the motion before a window, which it sees.
+        ahead: of the motion after a window, which is generated with it.
     """
 
     frames: int
@@ -226,6 +233,7 @@ class FramePlan:
     before: int
     after: int
     past: int = 0
+    ahead: int = 0
 
     @property
     def hop(self) -> int:
@@ -283,15 +291,15 @@ class MotionWindow:
 
     @property
     def origins(self) -> list[tuple[int, slice]]:
-        """The windows in which its frames first appeared.
+        """The windows in which its frames, and those ahead of it, first appear.
 
         For each its index, and which of the frames that are new in it lie in this window. All frames of the first
         window are new in it, and the last ones of every other.
         """
-        origins, overlap, hop = [], self.plan.overlap, self.plan.hop
-        for index in range(max(0, (self.start - overlap) // hop), self.index + 1):
+        origins, overlap, hop, last = [], self.plan.overlap, self.plan.hop, self.end + self.plan.ahead
+        for index in range(max(0, (self.start - overlap) // hop), max(self.index, (last - 1 - overlap) // hop) + 1):
             first = index * hop + overlap if index else 0
-            begin, end = max(self.start, first), min(self.end, (index + 1) * hop + overlap)
+            begin, end = max(self.start, first), min(last, (index + 1) * hop + overlap)
             if begin < end:
                 origins.append((index, slice(begin - first, end - first)))
         return origins
@@ -466,6 +474,10 @@ class SpeechWindows(ABC, Generic[M]):
         speech = self._speech[first - self._dropped : last - self._dropped]
         # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
         deviation = max(self._level.deviation, QUIETEST)
+        if (seen := window.end + self.plan.ahead) > heard:
+            # At the mean, which is silence once it is standardised.
+            missing = self._sample(seen) - last
+            speech, heard = np.pad(speech, (0, missing), constant_values=self._level.mean), seen
         motion: Any = self.generate(window, speech, heard - start, self._level.mean, deviation)
         self._held = motion[:, motion.shape[1] - self.plan.overlap :]
         return motion

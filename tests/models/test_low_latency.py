@@ -15,7 +15,7 @@ from facediff.errors import FaceDiffError
 from facediff.models.dual_path.model import DualPathDiffusion
 from facediff.models.inference import SpeechStream, WindowNoise
 from facediff.speech.voice_activity import QUICK_GATE, Openness, read_gate
-from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_STEPS, FramePlan, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS, FramePlan, WindowPlan
 from tests.fakes.tiny import Tiny
 from tests.models.test_inference import CPU, Array, Echo, clip
 
@@ -67,12 +67,13 @@ def test_windows_with_a_past_are_the_loop_over_windows(plan: WindowPlan, frames:
     np.testing.assert_allclose(made, expected(speech, frames, plan.in_frames(25.0)), rtol=1e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("plan", [*PLANS, LOW_LATENCY])
+@pytest.mark.parametrize("plan", [*PLANS, LOW_LATENCY, LOW_LATENCY_AHEAD])
 def test_windows_with_a_past_share_its_noise(plan: WindowPlan) -> None:
     whole: dict[int, torch.Tensor] = {}
     for index in range(40):
         window = plan.in_frames(25.0).window(index)
         noise = WindowNoise("a", window, [5], CPU)(torch.empty(1, window.frames, 32))[0]
+        assert len(noise) == window.frames + window.plan.ahead
         for place, row in enumerate(noise, window.start):
             assert torch.equal(whole.setdefault(place, row), row)
     every = torch.stack([whole[place] for place in sorted(whole)]).double()
@@ -100,20 +101,20 @@ def test_frames_that_are_given_out_do_not_change(model: DualPathDiffusion) -> No
     model.choose_low_latency()
     decode, given, looked = model._motion, [], 0
 
-    def spied(space, sample, first):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    def spied(space, sample, wanted):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
         nonlocal looked
-        whole = decode(space, sample, 0)
+        whole, first = decode(space, sample, slice(None)), wanted.start
         for place in range(first):
             torch.testing.assert_close(whole[0, place], given[place - first], rtol=1e-4, atol=1e-5)
             looked += 1
         given.append(whole[0, first])
-        return whole[:, first:]
+        return whole[:, wanted]
 
     model._motion = spied  # type: ignore[method-assign]
     speech = torch.randn(2 * 16_000, generator=torch.Generator().manual_seed(0)) * 0.2
     made = model.animate(speech, identity=model.identities[0]).vertices
     assert len(given) == len(made) == 50
-    assert looked == sum(min(25, index) for index in range(50))
+    assert looked == sum(min(12, index) for index in range(50))
 
 
 def test_a_low_latency_stream_is_the_file_and_keeps_its_promise(model: DualPathDiffusion) -> None:
@@ -137,8 +138,12 @@ def test_low_latency_takes_few_steps_and_is_forgotten(model: DualPathDiffusion) 
     before = model.windows, model.sampler.steps
     with model.choosing():
         model.choose_low_latency()
-        assert (model.windows, model.sampler.steps) == (LOW_LATENCY, LOW_LATENCY_STEPS)
+        assert (model.windows, model.sampler.steps) == (LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS)
     assert (model.windows, model.sampler.steps) == before
+    with model.choosing():
+        model.choose_sampler(steps=1)  # as many as the model has learnt to need
+        model.choose_low_latency()
+        assert model.sampler.steps == 1
     model.low_latency_steps = 1
     sampling = model.graphs().sampling
     assert sampling is not None
@@ -160,7 +165,12 @@ def test_low_latency_waits_less_than_the_goal_at_every_rate(rate: float) -> None
 
 @pytest.mark.parametrize(
     ("change", "field"),
-    [({"past": -0.1}, "past"), ({"past": float("inf")}, "past"), ({"overlap": LOW_LATENCY.seconds}, "overlap")],
+    [
+        ({"past": -0.1}, "past"),
+        ({"ahead": -0.1}, "ahead"),
+        ({"past": float("inf")}, "past"),
+        ({"overlap": LOW_LATENCY.seconds}, "overlap"),
+    ],
 )
 def test_impossible_pasts_are_refused(change: dict[str, float], field: str) -> None:
     with pytest.raises(FaceDiffError, match=field):

@@ -44,7 +44,7 @@ from facediff.pipelines.export_model import export_model
 from facediff.reporting.documents import markdown_table
 from facediff.runtime import RuntimeModel
 from facediff.speech.audio import SAMPLE_RATE
-from facediff.speech.windows import LOW_LATENCY, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, WindowPlan
 
 Array = npt.NDArray[np.float32]
 PIECE = SAMPLE_RATE // 100
@@ -87,20 +87,20 @@ class Way:
 def ways(rate: float) -> list[Way]:
     """The rows of the table for a first checkpoint."""
     frame = 1 / rate
-    overlapping = replace(LOW_LATENCY, seconds=2 * frame, overlap=frame, after=LOW_LATENCY.after - frame)
+    overlapping = replace(LOW_LATENCY_AHEAD, seconds=2 * frame, overlap=frame, after=LOW_LATENCY_AHEAD.after - frame)
     return [
         Way("whole recording", None, None),
         Way("whole recording, 2 steps", None, 2),
         Way("windows of 4 s", WindowPlan(above=0), None),
         Way("windows of 1 s", WindowPlan(1.0, 0.4, above=0), None),
-        Way("low latency", LOW_LATENCY, 2),
-        Way("low latency, 1 step", LOW_LATENCY, 1),
-        Way("low latency, 10 steps", LOW_LATENCY, 10),
-        Way("… hears 0.08 s ahead", replace(LOW_LATENCY, after=0.08), 2),
-        Way("… hears 0.16 s ahead", replace(LOW_LATENCY, after=0.16), 2),
+        Way("low latency", LOW_LATENCY_AHEAD, 2),
+        Way("low latency, 1 step", LOW_LATENCY_AHEAD, 1),
+        Way("low latency, 10 steps", LOW_LATENCY_AHEAD, 10),
+        Way("… hears 0.08 s ahead", replace(LOW_LATENCY_AHEAD, after=0.08), 2),
+        Way("… hears 0.16 s ahead", replace(LOW_LATENCY_AHEAD, after=0.16), 2),
         Way("… hears 0.08 s ahead, shares 1 frame", overlapping, 2),
-        Way("… half a second of past", replace(LOW_LATENCY, past=0.5), 2),
-        Way("… two seconds of past", replace(LOW_LATENCY, past=2.0), 2),
+        Way("… a second of past", replace(LOW_LATENCY_AHEAD, past=1.0), 2),
+        Way("… no noise ahead", LOW_LATENCY, 2),
     ]
 
 

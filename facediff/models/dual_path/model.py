@@ -59,7 +59,7 @@ from facediff.models.speaker_encoders import (
     StyleEncoderFactory,
     TcnGruTransformer,
 )
-from facediff.speech.windows import LOW_LATENCY_STEPS, MotionWindow
+from facediff.speech.windows import LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
 from facediff.utils.ranges import Range, mismatch
 
@@ -142,7 +142,7 @@ class DualPathDiffusion(AnimationModel):
 
     samples: ClassVar[bool] = True
     low_latency_steps = LOW_LATENCY_STEPS
-    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
+    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "sampler_options", "guidance")
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class DualPathDiffusion(AnimationModel):
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
         # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
         # weight averaging would copy together with the model.
-        self._sampler_options: dict[str, Any] | None = None
+        self.sampler_options: dict[str, Any] | None = None
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
         self.motion_space = motion_space(n_vertices=self.n_vertices, dims=self.dims, steps=diffusion_steps)
@@ -324,7 +324,7 @@ class DualPathDiffusion(AnimationModel):
     def rescale_noise(self, scale: float) -> None:
         """Noise motion at another scale from now on."""
         self.process = NoiseProcess(self.process.steps, self.process.schedule, scale)
-        options = self._sampler_options
+        options = self.sampler_options
         options = self.hparams["sampler"]["init_args"] if options is None else options
         self.sampler = type(self.sampler)(process=self.process, **options)
 
@@ -371,12 +371,12 @@ class DualPathDiffusion(AnimationModel):
             # A thousand steps of ddpm go to the clean end: fewer of the process have the last noise of ten.
             options = {}
             self.sampler = chosen(process=self.process, **more)
-        self._sampler_options = options | more
+        self.sampler_options = options | more
 
     def choose_low_latency(self) -> None:
-        """Frame by frame, and in :attr:`low_latency_steps` denoising steps of the present sampler."""
-        super().choose_low_latency()
-        self.choose_sampler(steps=self.low_latency_steps)
+        """Frame by frame, and in :attr:`low_latency_steps` denoising steps of the present sampler at most."""
+        self.windows = LOW_LATENCY_AHEAD
+        self.choose_sampler(steps=min(self.low_latency_steps, self.sampler.steps))
 
     def choose_expressivity(self, expressivity: Expressivity) -> None:
         """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with.
@@ -521,12 +521,23 @@ class DualPathDiffusion(AnimationModel):
         scales: Preconditioning,
     ) -> dict[str, Tensor]:
         """The losses in a space of known variances."""
-        noisy = self.process.add_noise(clean, noise, step)
-        mean = scales.posterior_mean(noisy, step, mask)
-        embedded = self.network.embed(scales.inputs(noisy, mean, step, mask))
-        features = self.network.clean_motion(self.network.core(embedded, step, conditions))
-        predicted = scales.clean(mean, features, step, mask)
+        predicted = self.predict(conditions, self.process.add_noise(clean, noise, step), step, mask)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
+
+    def predict(
+        self,
+        conditions: Conditions,
+        noisy: Float[Tensor, "draws frames coordinates"],
+        step: Int[Tensor, " draws"],
+        mask: Bool[Tensor, "draws frames"],
+    ) -> Float[Tensor, "draws frames coordinates"]:
+        """Clean motion from noisy motion, in the motion space and with gradients."""
+        network, scales = self.network, self.motion_space.preconditioning
+        if scales is None:
+            return network(noisy, step, conditions)
+        mean = scales.posterior_mean(noisy, step, mask)
+        features = network.core(network.embed(scales.inputs(noisy, mean, step, mask)), step, conditions)
+        return scales.clean(mean, network.clean_motion(features), step, mask)
 
     def _with_style_losses(self, losses: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:
         """The terms of the dynamic style, where they are asked for, and the sum with them."""
@@ -671,12 +682,13 @@ class DualPathDiffusion(AnimationModel):
     ) -> tuple[Float[Tensor, "samples frames points dims"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
-        own = slice(window.context, window.context + window.frames)
+        own = slice(window.context, window.context + window.frames + window.plan.ahead)
         conditions = self.conditions(clip, guided=True, animated=own).frames(own.start, own.stop)
-        overlap_blend = WindowOverlap(before, window.kept, window.fixed)
+        kept, new = slice(max(0, window.frames - window.kept), window.frames), slice(window.fixed, window.frames)
+        overlap_blend = WindowOverlap(before, kept, window.fixed)
         noise = WindowNoise(clip.names[0], window, seeds, self.device)
         of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)
-        motion = self.sample(conditions, noise, of_mean, samples=len(seeds), blend=overlap_blend, first=window.fixed)
+        motion = self.sample(conditions, noise, of_mean, samples=len(seeds), blend=overlap_blend, wanted=new)
         return motion, overlap_blend.features
 
     def sample(
@@ -687,7 +699,7 @@ class DualPathDiffusion(AnimationModel):
         *,
         samples: int = 1,
         blend: Blend = unchanged,
-        first: int = 0,
+        wanted: slice = slice(None),  # noqa: B008 - it cannot be changed
         progress: Progress | None = None,
     ) -> Float[Tensor, "batch wanted points dims"]:
         """Run the sampler from noise to motion, in offsets from the template.
@@ -698,12 +710,12 @@ class DualPathDiffusion(AnimationModel):
             of_mean: gives the unit noise from which the mean is predicted, for every clip.
             samples: how many of one clip.
             blend: changes the features of every step.
-            first: the first frame whose motion is wanted.
+            wanted: the frames whose motion is wanted.
             progress: wraps the iteration over steps.
         """
         expressivity = self.expressivity
         whole = not isinstance(expressivity, Tensor)
-        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, first)
+        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, wanted)
         if mean is not None and whole and expressivity == 0:
             return mean.expand(samples * len(mean), -1, -1, -1)
         # Samples of one clip share its speech features and style: only the noisy motion differs.
@@ -716,7 +728,7 @@ class DualPathDiffusion(AnimationModel):
         sample = self.sampler.run(
             denoiser.denoise, noise(self._empty(denoiser, conditions)), noise=noise, progress=progress
         )
-        motion = self._motion(denoiser, sample, first)
+        motion = self._motion(denoiser, sample, wanted)
         if mean is None:
             return motion
         share = expressivity.to(motion)[:, None] if isinstance(expressivity, Tensor) else expressivity
@@ -724,7 +736,7 @@ class DualPathDiffusion(AnimationModel):
         # keeps the sample's timing.
         return mean + share * (motion - mean)
 
-    def _mean(self, conditions: Conditions, of_mean: NoiseSource, blend: Blend, first: int) -> Tensor:
+    def _mean(self, conditions: Conditions, of_mean: NoiseSource, blend: Blend, wanted: slice) -> Tensor:
         """The mean of motion under the conditions, one for each clip."""
         # At the last step nothing of the motion is left in the noise, so the prediction that errs least is the mean of
         # all motions that the conditions allow. A network lets some of the noise through all the same, nearly linearly:
@@ -733,7 +745,7 @@ class DualPathDiffusion(AnimationModel):
         denoiser = self.denoiser(conditions, blend)
         noise = denoiser.noise(of_mean(self._empty(denoiser, conditions)))
         ends = [
-            self._motion(denoiser, denoiser.denoise(start, self.process.steps - 1), first) for start in (noise, -noise)
+            self._motion(denoiser, denoiser.denoise(start, self.process.steps - 1), wanted) for start in (noise, -noise)
         ]
         return (ends[0] + ends[1]) / 2
 
@@ -753,10 +765,10 @@ class DualPathDiffusion(AnimationModel):
         return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
 
     def _motion(
-        self, denoiser: ConditionalDenoiser, sample: Tensor, first: int
+        self, denoiser: ConditionalDenoiser, sample: Tensor, wanted: slice
     ) -> Float[Tensor, "batch wanted points dims"]:
-        """Offsets from the template, from a first frame on."""
-        return self.motion_space.decode(denoiser.motion(sample, first)) / self.scale
+        """Offsets from the template in some frames."""
+        return self.motion_space.decode(denoiser.motion(sample, wanted)) / self.scale
 
 
 def mean_names(batch: Batch) -> list[str]:

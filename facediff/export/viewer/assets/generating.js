@@ -43,11 +43,12 @@ async function windowMotion(model, heard, window, conditions, before, check) {
   }
   const { data, shape } = await model.features(heard, heard.frames);
   const width = data.length / heard.frames;
-  const features = { data: data.slice(context * width, (context + frames) * width), shape: [1, frames, ...shape.slice(2)] };
+  const count = frames + window.plan.ahead;
+  const features = { data: data.slice(context * width, (context + count) * width), shape: [1, count, ...shape.slice(2)] };
   const sampling = new Sampling(model, conditions, features, before, window, check);
   const noise = new WindowNoise(CLIP_NAME, window, conditions.seed);
   const motion = await sampling.run(noise, new WindowNoise(`${CLIP_NAME}/mean`, window, 0));
-  return { motion, kept: sampling.kept.map((each) => lastOf(each, window.kept * about.kept)) };
+  return { motion, kept: sampling.kept.map((each) => lastOf(each.subarray(0, frames * about.kept), window.kept * about.kept)) };
 }
 
 /** What every graph after the first is given; each takes what it has a use for. */
@@ -137,10 +138,11 @@ class Sampling {
   }
 
   async decoded({ prediction, kept }, unit) {
-    const { model, frames } = this, last = model.about.decoded === "kept" ? kept : prediction, fixed = this.window?.fixed ?? 0;
+    const { model, frames } = this, last = model.about.decoded === "kept" ? kept : prediction;
+    const { fixed, frames: end } = this.window ?? { fixed: 0, frames };
     const shaped = (values) => {
       const width = values.length / frames;
-      return ["float32", values.subarray(fixed * width), [1, frames - fixed, width]];
+      return ["float32", values.subarray(fixed * width, end * width), [1, end - fixed, width]];
     };
     return (await model.run("motion", { sample: shaped(last), noise: shaped(unit) }))[0].data;
   }

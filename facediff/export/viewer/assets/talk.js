@@ -104,7 +104,8 @@ class TalkingPage {
     find("identity").value = about.identities.find((name) => about.faces.includes(name)) ?? about.faces[0];
     this.wear();
     const usual = about.windows;
-    this.delays = this.facts.delays.map((each) => ({ ...usual, past: 0, ...each })).filter((each) => each.seconds < usual.seconds);
+    const drawn = about.blending === "steps" ? {} : { ahead: 0 }; // no noise of the frames ahead
+    this.delays = this.facts.delays.map((each) => ({ ...usual, past: 0, ...each, ...drawn })).filter((each) => each.seconds < usual.seconds);
     this.delays.push(usual);
     find("delay").append(...this.delays.map((plan, number) => new Option(`${(plan.seconds + plan.after).toFixed(1)} s`, number)));
     const rows = [

@@ -12,14 +12,14 @@ function nearest(value) {
 
 const samplesFor = (frames, frameRate) => nearest((frames * SAMPLE_RATE) / frameRate);
 
-/** A plan { seconds, overlap, before, after, past } in frames. */
+/** A plan { seconds, overlap, before, after, past, ahead } in frames. */
 function inFrames(plan, frameRate) {
   const frames = nearest(plan.seconds * frameRate), past = nearest((plan.past ?? 0) * frameRate);
   if (frames < (past ? 1 : 4)) throw new Error(`windows of ${plan.seconds} s are too few frames at ${frameRate} a second; choose longer ones`);
   const wanted = nearest(plan.overlap * frameRate);
   const overlap = past ? Math.min(wanted, frames - 1) : Math.max(1, Math.min(wanted, Math.floor(frames / 2)));
   const before = nearest(plan.before * frameRate), after = nearest(plan.after * frameRate);
-  return { frames, overlap, before, after, past, hop: frames - overlap };
+  return { frames, overlap, before, after, past, ahead: nearest((plan.ahead ?? 0) * frameRate), hop: frames - overlap };
 }
 
 /** One window of long speech. Args: the plan; how many windows come before it; its new frames, fewer for the last one. */
@@ -37,12 +37,13 @@ class SpeechWindow {
     this.kept = Math.min(plan.past, at + plan.hop) + plan.overlap; // its last frames, which the next window has as well
   }
 
-  /** The windows in which its frames first appeared: [index, from, to], of the frames that are new in that window. */
+  /** The windows in which its frames, and those ahead of it, first appear: [index, from, to], of the frames that are new in that window. */
   get origins() {
-    const { overlap, hop } = this.plan, found = [];
-    for (let index = Math.max(0, Math.floor((this.start - overlap) / hop)); index <= this.index; index++) {
+    const { overlap, hop, ahead } = this.plan, found = [], last = this.end + ahead;
+    const latest = Math.max(this.index, Math.floor((last - 1 - overlap) / hop));
+    for (let index = Math.max(0, Math.floor((this.start - overlap) / hop)); index <= latest; index++) {
       const first = index ? index * hop + overlap : 0;
-      const begin = Math.max(this.start, first), end = Math.min(this.end, (index + 1) * hop + overlap);
+      const begin = Math.max(this.start, first), end = Math.min(last, (index + 1) * hop + overlap);
       if (begin < end) found.push([index, begin - first, end - first]);
     }
     return found;
@@ -146,7 +147,10 @@ class SpeechWindows {
     const first = this.sample(start) - this.dropped, last = this.sample(heard) - this.dropped;
     this.level.hear(this.speech.subarray(Math.max(0, this.level.count - this.dropped), last));
     const deviation = Math.max(this.level.deviation, QUIETEST_DEVIATION);
-    const motion = await this.generate(window, this.speech.slice(first, last), heard - start, this.level.mean, deviation);
+    let speech = this.speech.slice(first, last);
+    const seen = window.end + this.plan.ahead;
+    if (seen > heard) speech = joined(speech, new Float32Array(this.sample(seen) - this.sample(heard)).fill(this.level.mean));
+    const motion = await this.generate(window, speech, Math.max(heard, seen) - start, this.level.mean, deviation);
     this.held = motion.slice(motion.length - this.plan.overlap * this.size);
     return motion;
   }
