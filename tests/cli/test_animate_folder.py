@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from facediff.models import load_model
 from facediff.pipelines.folder import LOCK, output_names, recordings, seed_of_recording
 from facediff.utils.files import locked
 from tests.fakes.batches import run
+from tests.fakes.waiting import PATIENCE, wait_until, wait_until_signalled
 
 ROOT = Path(__file__).parents[2]
 FACES = "".join(f"f {r * 6 + c + 1} {r * 6 + c + 2} {r * 6 + c + 7}\n" for r in range(3) for c in range(5))
@@ -177,15 +177,16 @@ def test_names_that_collide_keep_their_suffix(folder: Path, tmp_path: Path) -> N
 PROGRAM = """
 from pathlib import Path
 from tests.fakes.batches import run
+from tests.fakes.waiting import PATIENCE, wait_until, wait_until_signalled
 if __name__ == "__main__":
-    run(Path({folder!r}), "--pause", "0.6", workers=2)
+    run(Path({folder!r}), "--hold", {hold!r}, workers=2)
 """
 
 
 def started(folder: Path, tmp_path: Path) -> subprocess.Popen[str]:
-    """A batch in a process group of its own, at work on its second pair of recordings."""
+    """A batch in a process group of its own, at work on its second pair of recordings until the file ``hold`` comes."""
     script = tmp_path / "batch.py"
-    script.write_text(PROGRAM.format(folder=str(folder)))
+    script.write_text(PROGRAM.format(folder=str(folder), hold=str(tmp_path / "hold")))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
         [sys.executable, str(script)],
@@ -196,10 +197,10 @@ def started(folder: Path, tmp_path: Path) -> subprocess.Popen[str]:
         start_new_session=True,
     )
     out = folder.parent / "out"
-    deadline = time.monotonic() + 60
-    while not (list(out.glob("*.npy")) and list(out.glob(".*.partial-*"))) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert process.poll() is None
+    wait_until(
+        lambda: len(list(out.glob("[!.]*.npy"))) == len(list(out.glob(".*.partial-*"))) == 2,
+        lambda: process.poll() is None,
+    )
     return process
 
 
@@ -209,14 +210,16 @@ def test_ctrl_c_finishes_running_recordings_and_a_second_run_the_rest(folder: Pa
         (folder / f"{name}.wav").write_text(name)
     process = started(folder, tmp_path)
     os.killpg(process.pid, signal.SIGINT)
-    out, error = process.communicate(timeout=60)
+    wait_until_signalled(process.pid)
+    (tmp_path / "hold").touch()
+    out, error = process.communicate(timeout=PATIENCE)
     assert "KeyboardInterrupt" in error
     assert "the same command" in out
     done = outputs(folder)  # no partial files
     assert 2 <= len(done) < 6
     assert f"6 recordings: {len(done)} made, {6 - len(done)} left" in out  # also what was finished after the signal
     before = times(folder)
-    assert run(folder, "--pause", "0.6", workers=1) == 0
+    assert run(folder, "--hold", str(tmp_path / "hold"), workers=1) == 0
     after = times(folder)
     assert len(after) == 6
     assert {name: after[name] for name in before} == before
@@ -226,7 +229,7 @@ def test_ctrl_c_finishes_running_recordings_and_a_second_run_the_rest(folder: Pa
 def test_workers_end_when_their_parent_is_killed(folder: Path, tmp_path: Path) -> None:
     process = started(folder, tmp_path)
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate(timeout=PATIENCE)
 
     def of_the_group() -> list[str]:
         found = []
@@ -239,10 +242,7 @@ def test_workers_end_when_their_parent_is_killed(folder: Path, tmp_path: Path) -
                 found.append(stat.parent.name)
         return found
 
-    deadline = time.monotonic() + 10
-    while of_the_group() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert of_the_group() == []
+    wait_until(lambda: not of_the_group())
     assert run(folder) == 0
     assert len(outputs(folder)) == 4
 

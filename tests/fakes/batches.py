@@ -14,10 +14,14 @@ from facediff.utils.files import atomic
 
 
 def worker(command: list[str]) -> Callable[[Path, Path], list[Path]]:
-    """Writes which process animated, the how many-th recording of that process it is, and the seed."""
+    """Writes which process animated, the how many-th recording of that process it is, and the seed.
+
+    With ``--pause`` each takes so many seconds; with ``--hold FILE`` all but the first of a process wait for that file.
+    """
     done: list[Path] = []
     if "no-model" in command:
         raise FaceDiffError("C.ckpt: no such checkpoint")
+    hold = Path(command[command.index("--hold") + 1]) if "--hold" in command else None
     pause = float(command[command.index("--pause") + 1]) if "--pause" in command else 0.0
 
     def animate(speech: Path, output: Path) -> list[Path]:
@@ -32,6 +36,8 @@ def worker(command: list[str]) -> Callable[[Path, Path], list[Path]]:
         with atomic(output) as temporary:
             temporary.write_text("half")
             time.sleep(pause)
+            while hold is not None and len(done) > 1 and not hold.exists():
+                time.sleep(0.02)
             seed = seed_of_recording(speech, 3)
             temporary.write_text(json.dumps({"pid": os.getpid(), "nth": len(done), "said": words, "seed": seed}))
         if words != "with sound":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import sys
 import time
@@ -42,6 +43,17 @@ def wait_until_read(pipe: IO[bytes], reader: int) -> None:
         return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "S"
 
     wait_until(lambda: not unread() and sleeps())
+
+
+def wait_until_signalled(process: int) -> None:
+    """Wait until no signal waits any more for a process to take it."""
+    status = Path(f"/proc/{process}/status")
+
+    def pending() -> bool:
+        masks = re.findall(r"(?:SigPnd|ShdPnd):\s*(\w+)", status.read_text()) if status.exists() else []
+        return any(int(mask, 16) for mask in masks)
+
+    wait_until(lambda: not pending())
 
 
 def free_port() -> int:

@@ -15,7 +15,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import namedtuple
 from collections.abc import Callable
 from functools import partial
@@ -32,6 +31,7 @@ from facediff.data.prepare import biwi, runner
 from facediff.data.prepare.runner import Job, PreparationPlan, prepare, write_motion, write_speech, write_templates
 from facediff.errors import FaceDiffError, MissingExtraError
 from tests.fakes.biwi import vl_bytes, write_raw_biwi
+from tests.fakes.waiting import PATIENCE, wait_until, wait_until_signalled
 
 CLIPS = ["A_e01", "A_e02", "B_e01"]
 
@@ -306,10 +306,14 @@ if __name__ == "__main__":
 """
 SLOW = """
 import os, time
+jobs = 0
 def slow(work, out):
+    global jobs
     (out.parent / f"pid-{os.getpid()}").touch()
     frames = work(out)
-    time.sleep(0.6)  # so that the signal comes long before the end, however busy the machine is
+    jobs += 1
+    while jobs > 3 and not (out.parent / "go on").exists():  # the signal comes long before the end
+        time.sleep(0.02)
     return frames
 """
 
@@ -326,20 +330,17 @@ def test_a_stopped_run_is_resumed_to_equal_bytes(tmp_path: Path, how: signal.Sig
         text=True,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 60
-    while len(list(out.glob("wav/[FM]*.wav"))) < 4:
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: len(list(out.glob("wav/[FM]*.wav"))) == 8, lambda: process.poll() is None)
     # Ctrl-C reaches every process of the terminal; the kill reaches the first only, and the workers must notice.
     os.killpg(process.pid, how) if how == signal.SIGINT else process.kill()
-    assert "Traceback" not in process.communicate(timeout=30)[1]
+    if how == signal.SIGINT:
+        wait_until_signalled(process.pid)
+        (tmp_path / "go on").touch()
+    assert "Traceback" not in process.communicate(timeout=PATIENCE)[1]
     assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
     workers = [int(path.name.partition("-")[2]) for path in tmp_path.glob("pid-*")]
     assert len(workers) == 2
-    while any(Path(f"/proc/{pid}").exists() for pid in workers):
-        assert time.monotonic() < deadline, "a worker has outlived the run"
-        time.sleep(0.02)
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
     kept = len(list(out.glob("wav/[FM]*.wav")))
     assert 4 <= kept < 33
     assert (out / "prepare.json").is_file()
