@@ -97,6 +97,15 @@ def fetch(address: str) -> bytes:
         return bytes(answer.read())
 
 
+def wait_for(address: str, process: subprocess.Popen[str]) -> None:
+    """Wait until a server answers, unless its process has ended."""
+    while process.poll() is None:
+        with contextlib.suppress(OSError):
+            fetch(address)
+            return
+        time.sleep(0.1)
+
+
 def visit(address: str, until: float, failures: list[str]) -> None:
     """Load the page and what it names, again and again, as a visitor does who leaves and returns."""
     while time.time() < until:
@@ -125,11 +134,12 @@ def performing(args: argparse.Namespace, until: float) -> Running:
 def serving(args: argparse.Namespace, until: float) -> Running:
     """``facediff serve`` with visitors."""
     port, failures = free_port(), list[str]()
+    address = f"http://127.0.0.1:{port}/"
     with open(args.output / "serve.log", "w") as log:
         process = start(["serve", "--port", str(port)], args, stdout=log, stderr=log)
-        time.sleep(10)
+        wait_for(address, process)
         for _ in range(args.visitors):
-            threading.Thread(target=visit, args=(f"http://127.0.0.1:{port}/", until, failures), daemon=True).start()
+            threading.Thread(target=visit, args=(address, until, failures), daemon=True).start()
         yield process, lambda: [f"{args.visitors} visitors, {len(failures)} requests failed", *failures[:3]]
 
 
@@ -175,6 +185,8 @@ def main() -> int:
             process.send_signal(signal.SIGINT)
         status = process.wait(timeout=600)
         lines = report()
+    if not rows:
+        sys.exit("\n".join([f"{args.kind}: ended with status {status} before the first figures", *lines]))
     with open(args.output / f"{args.kind}.csv", "w", newline="") as table:
         csv.writer(table).writerows([COLUMNS, *([f"{value:.1f}" for value in row] for row in rows)])
     tenth = max(1, len(rows) // 10)
