@@ -48,11 +48,14 @@ class Channels:
         values: (T, C) float32, finite.
         vertices: the animation's array of vertices. Whatever changes the vertices makes another array, with which the
             channels have nothing to do any more.
+        deltas: (K, V, 3) float32, what each channel of :attr:`Space.face` moves the vertices by at 1, the head aside;
+            None if the vertices are no weighted sum.
     """
 
     space: Space
     values: npt.NDArray[np.float32]
     vertices: npt.NDArray[np.float32]
+    deltas: npt.NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,6 +139,12 @@ class Animation:
                 raise FaceDiffError(
                     f"{self.name}: its values have the shape {self.values.shape}; expected finite numbers {expected}"
                 )
+        if self.deltas is not None:
+            moved = (len(self.space.face), *shape[1:])
+            if self.deltas.shape != moved or not in_range(self.deltas):
+                raise FaceDiffError(
+                    f"{self.name}: its deltas have the shape {self.deltas.shape}; expected finite numbers {moved}"
+                )
         if not in_range(self.template):
             raise FaceDiffError(f"{self.name}: its template holds {OUT_OF_RANGE}; give another one")
         if self.speech is not None and not np.isfinite(self.speech).all():
@@ -156,13 +165,21 @@ class Animation:
         return VERTICES if self.values is None or self.channels is None else self.channels.space
 
     @property
+    def deltas(self) -> npt.NDArray[np.float32] | None:
+        """What each channel of the face (K, V, 3) moves the vertices by; None without :attr:`values`, or if unknown."""
+        return None if self.values is None or self.channels is None else self.channels.deltas
+
+    @property
     def without_face(self) -> bool:
         """Whether it is channels alone: each of its points then stands for one of them."""
         return self.metadata.get("face") == WITHOUT_FACE and self.values is not None
 
-    def made_of(self, space: Space, values: npt.NDArray[np.float32]) -> Self:
-        """The same with the channels that its vertices were made of."""
-        return replace(self, channels=Channels(space, values, self.vertices))
+    def made_of(
+        self, space: Space, values: npt.NDArray[np.float32], deltas: npt.NDArray[np.floating] | None = None
+    ) -> Self:
+        """The same with the channels that its vertices were made of; the arguments are those of :class:`Channels`."""
+        shapes = None if deltas is None else np.asarray(deltas, np.float32)
+        return replace(self, channels=Channels(space, values, self.vertices, shapes))
 
     @property
     def seconds(self) -> float:
@@ -191,7 +208,7 @@ class Animation:
     def part(self, frames: slice | list[int]) -> Self:
         """The same with some of the frames only."""
         part = replace(self, vertices=self.vertices[frames], head=None if self.head is None else self.head[frames])
-        return part if self.values is None else part.made_of(self.space, self.values[frames])
+        return part if self.values is None else part.made_of(self.space, self.values[frames], self.deltas)
 
     def still(self) -> Self:
         """The same with a head that does not move as a whole; itself if it does not.
@@ -205,7 +222,7 @@ class Animation:
         if self.head is None:
             return self
         still = replace(self, vertices=without_head(self.vertices, self.head), head=None)
-        return still if self.values is None else still.made_of(self.space, self.values)
+        return still if self.values is None else still.made_of(self.space, self.values, self.deltas)
 
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
         """Frame after frame (V, 3); the pages of a memory map that have been read are released."""

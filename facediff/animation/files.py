@@ -32,6 +32,7 @@ ARRAYS: dict[str, tuple[str, str, tuple[int | None, ...], type[np.generic]]] = {
     "colours": ("u", "bytes (vertices, 3)", (None, 3), np.uint8),
     "head": ("f", "floating point (frames, 6)", (None, 6), np.float64),
     "values": ("f", "floating point (frames, channels)", (None, None), np.float32),
+    "deltas": ("f", "floating point (channels, vertices, 3)", (None, None, 3), np.float32),
     "inner_lip_pairs": ("iu", "whole numbers (pairs, 2)", (None, 2), np.int64),
 }
 """An archive's arrays: kinds of number, in words, lengths of the axes, and the type that :class:`Animation` has."""
@@ -164,9 +165,9 @@ def read_archive(path: Path) -> Animation:
     LIMITS.check("seconds", len(checked["vertices"]) / facts["frame_rate"], path)
     regions = {name.removeprefix("region_"): array for name, array in checked.items() if name.startswith("region_")}
     parts: dict[str, Any] = {name: checked[name] for name in ARRAYS if name in checked and checked[name].size}
-    values, space = parts.pop("values", None), facts.pop("space")
+    values, deltas, space = parts.pop("values", None), parts.pop("deltas", None), facts.pop("space")
     if values is not None:
-        parts["channels"] = Channels(_named(path, lambda: Space.from_state(space)), values, parts["vertices"])
+        parts["channels"] = Channels(_named(path, lambda: Space.from_state(space)), values, parts["vertices"], deltas)
     animation = _named(path, lambda: Animation(**parts, regions=regions, **facts))
     _named(path, animation.refuse_not_finite)
     return animation

@@ -46,4 +46,4 @@ def read_weights(path: Path) -> Animation:
     turns = decoder.head_turns(points)
     if turns is not None and turns.any():
         animation = move_head(animation, turns, 0 * turns)
-    return animation.made_of(space, decoder.values(points))
+    return animation.made_of(space, decoder.values(points), decoder.deltas)

@@ -5,7 +5,7 @@ Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks alon
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -13,23 +13,26 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import Animation
+from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions
+from facediff.editing.eyes import puppet_eyes
 from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
 from facediff.mesh.obj_surface import ObjSurface
 from facediff.registry import export_format
 from facediff.render.rasteriser import to_linear
+from facediff.spaces.rotations import convert
 
 Array = npt.NDArray[np.float32]
 
 BLOCK = 3000  # Coordinates that are processed together; bounds the memory for residuals
+ROUNDING = 1e-5  # Share of a face's size that single precision loses over several steps
 LINEAR = "LINEAR"  # Interpolation between keys
 
 
 @export_format.register("glb")
 class GlbFormat(Format):
-    """glTF 2.0 with morph targets, exact or under the names of --shapes: Blender, Unity, three.js, Unreal."""
+    """glTF 2.0 with morph targets, exact, or under the names of weights or --shapes: Blender, Unity, three.js."""
 
     next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
     speech = "next to it"
@@ -38,7 +41,7 @@ class GlbFormat(Format):
     uses = ("tolerance", "shapes", "key_tolerance", "surface")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation: all of it, or what the given shapes can show of it."""
+        """Write one animation: all of it, under the names of its own weights if it has some, or what shapes can show."""
         (animation,) = animations
         space = FileSpace.of(animation, options, "m")
         head, animation = animation.head, animation.still()
@@ -47,6 +50,9 @@ class GlbFormat(Format):
         if options.shapes is not None:
             morphs, fit = named_shapes(animation, space, Path(options.shapes), options.key_tolerance)
             extras |= fit
+        elif (own := weighted_shapes(animation, space, options.tolerance / 1000)) is not None:
+            rest, morphs = own
+            extras["tolerance_mm"] = options.tolerance
         else:
             offsets = np.stack([frame - rest for frame in space.frames(animation)])
             morphs = compress(offsets, options.tolerance / 1000)
@@ -56,6 +62,7 @@ class GlbFormat(Format):
         document = make_document(animation, space, rest, morphs, extras, surface_of(animation, options))
         if head is not None:
             add_head(document, animation.frame_rate, head * np.repeat([1.0, space.factor], 3))
+        add_eyes(document, animation, space)
         document.write(path)
 
 
@@ -64,7 +71,7 @@ class Morphs:
     """A motion as shapes and their weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``."""
 
     shapes: Array  # (M, V, 3) offsets from the rest face
-    weights: Array  # (K, M) from 0 to 1, at the keys
+    weights: Array  # (K, M) at the keys; from 0 to 1, but for a motion's own
     components: int | None  # number of principal components that were kept; None where there is a shape for every frame
     names: tuple[str, ...] = ()  # M names; numbers if there are none
     keys: npt.NDArray[np.int64] | None = None  # (K,) frames that have a key; all T if None
@@ -90,6 +97,33 @@ def named_shapes(
         "key_tolerance": key_tolerance,
         "keys": len(keys),
     }
+
+
+def weighted_shapes(animation: Animation, space: FileSpace, tolerance: float) -> tuple[Array, Morphs] | None:
+    """The weights of ARKit's shapes that an animation was made of, and the face (V, 3) where all are 0.
+
+    Args:
+        animation: with a head that does not move.
+        space: of the file.
+        tolerance: largest distance of a vertex, in the unit of the file.
+
+    Returns:
+        None if there are no weights, or vertices that are not their sum.
+    """
+    values, deltas = animation.values, animation.deltas
+    if values is None or deltas is None or animation.space.kind != "arkit":
+        return None
+    names = tuple(animation.space.channels[channel] for channel in animation.space.face)
+    weights = np.ascontiguousarray(values[:, list(animation.space.face)])
+    shapes = np.asarray(deltas * space.factor, np.float32)
+    moved = (frame - np.tensordot(row, shapes, 1) for row, frame in zip(weights, space.frames(animation), strict=True))
+    rest = next(moved)
+    # A person's resting values need not be 0: the template is not always the face of weights 0.
+    if np.abs(rest - space.place(animation.template)).max() < ROUNDING * np.ptp(rest):
+        rest = space.place(animation.template)
+    if any(np.square(other - rest).sum(-1).max() > tolerance**2 for other in moved):
+        return None
+    return rest, Morphs(shapes, weights, None, names)
 
 
 def compress(offsets: Array, tolerance: float) -> Morphs:
@@ -305,13 +339,48 @@ def add_head(document: GlbWriter, frame_rate: float, head: npt.NDArray[np.float6
         frame_rate: frames a second.
         head: (T, 6) rotations, axis-angle in radians, and shifts in metres.
     """
-    half = 0.5 * np.linalg.norm(head[:, :3], axis=1, keepdims=True)
-    quaternions = np.concatenate([0.5 * np.sinc(half / np.pi) * head[:, :3], np.cos(half)], axis=1)
-    times = document.add((np.arange(len(head)) / frame_rate).astype(np.float32), bounds=True)
-    (motion,) = document.content["animations"]
-    for path, values in (("rotation", quaternions), ("translation", head[:, 3:])):
-        output = document.add(values.astype(np.float32))
-        motion["samplers"].append({"input": times, "output": output, "interpolation": LINEAR})
-        motion["channels"].append({"sampler": len(motion["samplers"]) - 1, "target": {"node": 1, "path": path}})
     document.content["nodes"].append({"name": "head", "children": [0]})
     document.content["scenes"][0]["nodes"] = [1]
+    turns = convert(head[:, :3], "axis_angle", "quaternion")
+    _add_motion(document, frame_rate, {"rotation": gltf_rotations(turns), "translation": head[:, 3:]})
+
+
+def add_eyes(document: GlbWriter, animation: Animation, space: FileSpace) -> None:
+    """Add nodes "left_eye" and "right_eye" without a mesh, which turn as the eyes' channels say.
+
+    Where shapes move the eyeballs of the one mesh (``eyeLook…``), these carry the angles themselves. They are at the
+    eyeballs' centres where these are known.
+    """
+    turns = [turn for turn in animation.space.rotations if turn.joint in ("left_eye", "right_eye")]
+    if animation.values is None or not turns:
+        return
+    eyes = puppet_eyes(animation.template * metres_per_unit(animation.unit), animation.faces)
+    centres = [] if eyes is None else [animation.template[ball].mean(0) for ball in eyes.eyeballs]
+    nodes, scene = document.content["nodes"], document.content["scenes"][0]
+    parent = nodes[1]["children"] if len(nodes) > 1 else scene["nodes"]
+    for turn in turns:
+        side = ("left_eye", "right_eye").index(turn.joint)
+        nodes.append({"name": turn.joint})
+        parent.append(len(nodes) - 1)
+        if centres:
+            nodes[-1]["translation"] = [float(part) for part in centres[side] * space.factor]
+        quaternions = convert(animation.values[:, list(turn.channels)], turn.form, "quaternion")
+        _add_motion(document, animation.frame_rate, {"rotation": gltf_rotations(quaternions)})
+
+
+def gltf_rotations(quaternions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Quaternions (T, 4) w, x, y, z as glTF has them: x, y, z, w."""
+    # One rotation has two quaternions: the one nearer to the frame before it keeps players on the short way.
+    signs = np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0, -1.0, 1.0)
+    return np.roll(quaternions * np.cumprod([1.0, *signs])[:, None], -1, axis=1)
+
+
+def _add_motion(document: GlbWriter, frame_rate: float, curves: Mapping[str, npt.NDArray[np.float64]]) -> None:
+    """Move the last node: values (T, n) by the path that they change."""
+    (motion,) = document.content["animations"]
+    node = len(document.content["nodes"]) - 1
+    for path, values in curves.items():
+        times = document.add((np.arange(len(values)) / frame_rate).astype(np.float32), bounds=True)
+        output = document.add(values.astype(np.float32))
+        motion["samplers"].append({"input": times, "output": output, "interpolation": LINEAR})
+        motion["channels"].append({"sampler": len(motion["samplers"]) - 1, "target": {"node": node, "path": path}})

@@ -19,6 +19,7 @@ from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, Weights, arkit_weights, has_arkit_weights, solve
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError
+from facediff.export.glb import gltf_rotations
 from facediff.export.glb_added import open_to_add, parts_of
 from facediff.export.glb_writer import GlbWriter
 from facediff.mesh.glb import POSITIONS, Glb, open_glb, whole
@@ -333,10 +334,7 @@ def _local(glb: Glb, node: int, turns: Array) -> npt.NDArray[np.float32]:
         nodes[node] |= {"translation": own[:3, 3].tolist(), "scale": scale.tolist(), "rotation": _quaternion(rest)}
     local = frame.T @ matrices(turns) @ frame @ rest
     quaternions = convert(np.concatenate([local[..., 0], local[..., 1]], axis=-1), "six_d", "quaternion")
-    # One rotation has two quaternions: the one nearer to the frame before it keeps players on the short way.
-    signs = np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0, -1.0, 1.0)
-    quaternions[1:] *= np.cumprod(signs)[:, None]
-    return np.roll(quaternions, -1, axis=1).astype(np.float32)
+    return gltf_rotations(quaternions).astype(np.float32)
 
 
 def _rotation(matrix: Array) -> Array:

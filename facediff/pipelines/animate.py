@@ -197,7 +197,9 @@ class AnimationPipeline(ABC):
     def made_of(self, animation: Animation, points: Array) -> Animation:
         """An animation of the face alone with the channels that its vertices were decoded from; of vertices none."""
         decoder = self.decoder
-        return animation if decoder is None else animation.made_of(decoder.space, decoder.values(points))
+        if decoder is None:
+            return animation
+        return animation.made_of(decoder.space, decoder.values(points), decoder.deltas)
 
     def posed(self, animation: Animation, points: Array) -> Animation:
         """A finished animation with the turns of the head that its channels say, unless something else moves it."""
@@ -208,7 +210,7 @@ class AnimationPipeline(ABC):
             return animation
         values = animation.values
         turned = move_head(animation, turns, 0 * turns)
-        return turned if values is None else turned.made_of(animation.space, values)
+        return turned if values is None else turned.made_of(animation.space, values, animation.deltas)
 
     def shown(self, points: Array) -> Array:
         """Absolute vertices (T, V, 3) of points as the model generates them."""

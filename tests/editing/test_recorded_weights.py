@@ -6,12 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import facediff
+from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.spaces import layout
+from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
 from facediff.synthetic.known_faces import built_in_rig
+from tests.fakes.glb_reader import Reader
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
@@ -47,3 +51,54 @@ def test_other_parameters_are_refused(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("a,b\n1,2\n")
     with pytest.raises(FaceDiffError, match=r"take\.csv"):
         facediff.read(tmp_path / "take.csv")
+
+
+def take_of(path: Path, frames: int = 30) -> ParameterClip:
+    """Weights above 1, a head and eyes that turn."""
+    space, rng, time = layout("live_link"), np.random.default_rng(3), np.arange(frames)[:, None] / 30
+    values = np.abs(np.sin(time * rng.uniform(1, 9, 61))) * rng.uniform(0.0, 0.6, 61)
+    values[:, space.index("jawOpen")] = 0.5 + 0.55 * np.sin(6 * time[:, 0])
+    for turn in space.rotations:
+        values[:, list(turn.channels)] = 0.3 * np.sin(time * rng.uniform(1, 9, 3))
+    clip = ParameterClip("take", values.astype(np.float32), space, 30.0)
+    write_parameters(path, clip)
+    return clip
+
+
+def test_a_glb_has_the_weights_under_their_names_and_the_turns_of_head_and_eyes(tmp_path: Path) -> None:
+    clip = take_of(tmp_path / "take.csv")
+    assert main(["export", str(tmp_path / "take.csv"), "-o", str(tmp_path / "take.npz")]) == 0
+    for source in ("take.csv", "take.npz"):
+        assert main(["export", str(tmp_path / source), "-o", str(tmp_path / "a.glb")]) == 0
+        read, recorded = Reader(tmp_path / "a.glb"), facediff.read(tmp_path / "take.csv")
+        names = read.gltf.meshes[0].extras["targetNames"]
+        assert set(names) == set(ARKIT)
+        written = read.weights[:30]
+        kept = clip.values[:, [clip.space.index(name) for name in names]]
+        np.testing.assert_allclose(written, kept, atol=1e-6)  # as the table's digits
+        assert kept.max() > 1
+        shapes = np.stack([read.values(target["POSITION"]) for target in read.primitive.targets])
+        face = read.values(read.primitive.attributes.POSITION) + np.tensordot(written, shapes, 1)
+        rig = built_in_rig()
+        decoded = rig.decode(np.asarray(clip.values[:, [clip.space.index(name) for name in rig.names]]))
+        np.testing.assert_allclose(face, decoded, atol=1e-6)
+        nodes, motion = read.gltf.nodes, read.gltf.animations[0]
+        curves = {
+            (nodes[channel.target.node].name, channel.target.path): read.values(motion.samplers[channel.sampler].output)
+            for channel in motion.channels
+        }
+        for turn in clip.space.rotations:
+            made = Rotation.from_quat(curves[turn.joint, "rotation"][:30])
+            euler = clip.values[:, list(turn.channels)]
+            assert (made.inv() * Rotation.from_euler("YXZ", euler)).magnitude().max() < 1e-5
+        head, shift = Rotation.from_quat(curves["head", "rotation"]), curves["head", "translation"]
+        posed = np.stack([head[t].apply(face[t]) + shift[t] for t in (0, 11, 29)])
+        np.testing.assert_allclose(posed, recorded.vertices[[0, 11, 29]], atol=1e-5)
+
+
+def test_a_glb_of_vertices_that_are_not_the_sum_of_the_weights_is_exact(tmp_path: Path) -> None:
+    take_of(tmp_path / "take.csv")
+    recorded = facediff.read(tmp_path / "take.csv").still()
+    wrong = recorded.made_of(recorded.space, np.asarray(recorded.values)[::-1].copy(), recorded.deltas)
+    wrong.save(tmp_path / "a.glb")
+    assert "jawOpen" not in Reader(tmp_path / "a.glb").gltf.meshes[0].extras["targetNames"]
