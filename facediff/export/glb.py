@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,9 +61,7 @@ class GlbFormat(Format):
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
         document = make_document(animation, space, rest, morphs, extras, surface_of(animation, options))
-        if head is not None:
-            add_head(document, animation.frame_rate, head * np.repeat([1.0, space.factor], 3))
-        add_eyes(document, animation, space)
+        add_nodes(document, animation.frame_rate, moving_nodes(animation, space, head))
         document.write(path)
 
 
@@ -331,56 +330,74 @@ def add_materials(document: GlbWriter, surface: ObjSurface) -> None:
     content["materials"] = materials
 
 
-def add_head(document: GlbWriter, frame_rate: float, head: npt.NDArray[np.float64]) -> None:
-    """Add a node "head" that carries the face, and turns and shifts it.
+@dataclass(frozen=True)
+class MovingNode:
+    """A node that turns or moves: the head, which carries the face, or an eye, which carries nothing.
+
+    Attributes:
+        name: ``head``, ``left_eye`` or ``right_eye``.
+        curves: (T, n) values by the path that they change, ``rotation`` x, y, z, w and ``translation`` in metres.
+        place: (3,) where it is; None at the origin.
+    """
+
+    name: str
+    curves: Mapping[str, Array]
+    place: Array | None = None
+
+
+def moving_nodes(animation: Animation, space: FileSpace, head: npt.NDArray[np.float64] | None) -> list[MovingNode]:
+    """What turns besides the face.
+
+    Shapes (``eyeLook…``) move the eyeballs of the one mesh: the eyes' nodes carry the angles that channels say, at the
+    eyeballs' centres where these are known.
 
     Args:
-        document: of :func:`make_document`, with the face as its only node.
-        frame_rate: frames a second.
-        head: (T, 6) rotations, axis-angle in radians, and shifts in metres.
+        animation: with a head that does not move.
+        space: of the file.
+        head: (T, 6) rotations, axis-angle in radians, and shifts in the animation's unit; None for none.
     """
-    document.content["nodes"].append({"name": "head", "children": [0]})
-    document.content["scenes"][0]["nodes"] = [1]
-    turns = convert(head[:, :3], "axis_angle", "quaternion")
-    _add_motion(document, frame_rate, {"rotation": gltf_rotations(turns), "translation": head[:, 3:]})
-
-
-def add_eyes(document: GlbWriter, animation: Animation, space: FileSpace) -> None:
-    """Add nodes "left_eye" and "right_eye" without a mesh, which turn as the eyes' channels say.
-
-    Where shapes move the eyeballs of the one mesh (``eyeLook…``), these carry the angles themselves. They are at the
-    eyeballs' centres where these are known.
-    """
-    turns = [turn for turn in animation.space.rotations if turn.joint in ("left_eye", "right_eye")]
-    if animation.values is None or not turns:
-        return
+    nodes = []
+    if head is not None:
+        turns = gltf_rotations(convert(head[:, :3], "axis_angle", "quaternion"))
+        nodes.append(
+            MovingNode("head", {"rotation": turns, "translation": (head[:, 3:] * space.factor).astype(np.float32)})
+        )
+    turning = [turn for turn in animation.space.rotations if turn.joint in ("left_eye", "right_eye")]
+    if animation.values is None or not turning:
+        return nodes
     eyes = puppet_eyes(animation.template * metres_per_unit(animation.unit), animation.faces)
-    centres = [] if eyes is None else [animation.template[ball].mean(0) for ball in eyes.eyeballs]
-    nodes, scene = document.content["nodes"], document.content["scenes"][0]
-    parent = nodes[1]["children"] if len(nodes) > 1 else scene["nodes"]
-    for turn in turns:
-        side = ("left_eye", "right_eye").index(turn.joint)
-        nodes.append({"name": turn.joint})
-        parent.append(len(nodes) - 1)
-        if centres:
-            nodes[-1]["translation"] = [float(part) for part in centres[side] * space.factor]
-        quaternions = convert(animation.values[:, list(turn.channels)], turn.form, "quaternion")
-        _add_motion(document, animation.frame_rate, {"rotation": gltf_rotations(quaternions)})
+    for turn in turning:
+        ball = None if eyes is None else eyes.eyeballs[turn.joint == "right_eye"]
+        place = None if ball is None else (animation.template[ball].mean(0) * space.factor).astype(np.float32)
+        turns = gltf_rotations(convert(animation.values[:, list(turn.channels)], turn.form, "quaternion"))
+        nodes.append(MovingNode(turn.joint, {"rotation": turns}, place))
+    return nodes
 
 
-def gltf_rotations(quaternions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def gltf_rotations(quaternions: npt.NDArray[np.float64]) -> Array:
     """Quaternions (T, 4) w, x, y, z as glTF has them: x, y, z, w."""
     # One rotation has two quaternions: the one nearer to the frame before it keeps players on the short way.
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0, -1.0, 1.0)
-    return np.roll(quaternions * np.cumprod([1.0, *signs])[:, None], -1, axis=1)
+    return np.roll(quaternions * np.cumprod([1.0, *signs])[:, None], -1, axis=1).astype(np.float32)
 
 
-def _add_motion(document: GlbWriter, frame_rate: float, curves: Mapping[str, npt.NDArray[np.float64]]) -> None:
-    """Move the last node: values (T, n) by the path that they change."""
+def add_nodes(document: GlbWriter, frame_rate: float, added: Sequence[MovingNode]) -> None:
+    """Add nodes to a document of :func:`make_document`, whose only node is the face; a head carries all others."""
+    nodes, siblings = document.content["nodes"], document.content["scenes"][0]["nodes"]
     (motion,) = document.content["animations"]
-    node = len(document.content["nodes"]) - 1
-    for path, values in curves.items():
-        times = document.add((np.arange(len(values)) / frame_rate).astype(np.float32), bounds=True)
-        output = document.add(values.astype(np.float32))
-        motion["samplers"].append({"input": times, "output": output, "interpolation": LINEAR})
-        motion["channels"].append({"sampler": len(motion["samplers"]) - 1, "target": {"node": node, "path": path}})
+    for moving in added:
+        node: dict[str, Any] = {"name": moving.name}
+        if moving.place is not None:
+            node["translation"] = moving.place.tolist()
+        nodes.append(node)
+        if moving.name == "head":
+            node["children"] = siblings
+            document.content["scenes"][0]["nodes"] = [len(nodes) - 1]
+        else:
+            siblings.append(len(nodes) - 1)
+        for path, values in moving.curves.items():
+            times = document.add((np.arange(len(values)) / frame_rate).astype(np.float32), bounds=True)
+            output = document.add(values)
+            motion["samplers"].append({"input": times, "output": output, "interpolation": LINEAR})
+            target = {"node": len(nodes) - 1, "path": path}
+            motion["channels"].append({"sampler": len(motion["samplers"]) - 1, "target": target})

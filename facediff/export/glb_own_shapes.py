@@ -334,7 +334,7 @@ def _local(glb: Glb, node: int, turns: Array) -> npt.NDArray[np.float32]:
         nodes[node] |= {"translation": own[:3, 3].tolist(), "scale": scale.tolist(), "rotation": _quaternion(rest)}
     local = frame.T @ matrices(turns) @ frame @ rest
     quaternions = convert(np.concatenate([local[..., 0], local[..., 1]], axis=-1), "six_d", "quaternion")
-    return gltf_rotations(quaternions).astype(np.float32)
+    return gltf_rotations(quaternions)
 
 
 def _rotation(matrix: Array) -> Array:
