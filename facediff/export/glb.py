@@ -42,7 +42,7 @@ class GlbFormat(Format):
     uses = ("tolerance", "shapes", "key_tolerance", "surface")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation: all of it, under the names of its own weights if it has some, or what shapes can show."""
+        """Write one animation: all of it, by its own weights where it has some, or what the given shapes can show."""
         (animation,) = animations
         space = FileSpace.of(animation, options, "m")
         head, animation = animation.head, animation.still()

@@ -144,7 +144,9 @@ class RuntimeModel(ExportedGraphs):
             metadata=metadata,
             **cast(Any, optional),
         )
-        return animation if decoder is None else animation.made_of(decoder.space, decoder.values(points), decoder.deltas)
+        if decoder is None:
+            return animation
+        return animation.made_of(decoder.space, decoder.values(points), decoder.deltas)
 
     def _face(self, choice: RuntimeChoices) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and the conditions of its motion."""

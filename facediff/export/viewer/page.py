@@ -21,6 +21,7 @@ from facediff.editing.expressiveness import ALL, region_factors
 from facediff.editing.procedural import neck
 from facediff.errors import FaceDiffError
 from facediff.export.format import Format, check_animation, outward, speech_wav
+from facediff.export.viewer.channels import channel_facts
 from facediff.export.viewer.packing import (
     CHUNK_FRAMES,
     STEP,
@@ -264,6 +265,7 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
         "head": None if animation.head is None else blobs.add(_head_in_mm(animation.head, animation)),
         "fields": pose_fields(animation, blobs),
         "acted": acted_curves(animation, blobs),
+        "weighted": channel_facts(animation, blobs),
         "weights": _weights_of(animation, blobs),
         "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),
         "direction": _keys_of(animation),

@@ -100,7 +100,7 @@ def downloaded(page: Page, folder: Path, action: Callable[[], object]) -> Path:
     action()
 
     def files() -> list[Path]:  # whole: while it comes, a file has another suffix
-        return [file for file in folder.iterdir() if file.suffix in (".json", ".npz", ".glb", ".wav")]
+        return [file for file in folder.iterdir() if file.suffix in (".json", ".npz", ".glb", ".wav", ".csv")]
 
     wait_until(files)
     return files()[0]

@@ -1,5 +1,11 @@
 // Files that a page gives its reader: zip archives of NumPy's arrays, as facediff and NumPy read them.
 
+/** Displacements in mm, vertex by vertex, from a blob that holds steps, axis by axis. */
+async function readField(blob, step, vertices) {
+  const steps = new Int16Array(await readBlob(blob));
+  return Float32Array.from(steps, (_, i) => steps[(i % 3) * vertices + Math.floor(i / 3)] * step);
+}
+
 /** A name as a file may have it. */
 const fileName = (name) => name.replace(/[^\p{L}\p{N}._ -]+/gu, "_").trim() || "take";
 

@@ -31,12 +31,8 @@ const withoutRules = (words) => {
 /** How far straight lines between keys may be from each frame; 0.05 degrees for the head. */
 const TOLERANCES = { brows: 0.03, lids: 0.01 };
 
-/** Displacements in mm, vertex by vertex, from blobs that hold steps, axis by axis. */
 async function readFields(fields, vertices) {
-  const read = async (blob) => {
-    const steps = new Int16Array(await readBlob(blob));
-    return Float32Array.from(steps, (_, i) => steps[(i % 3) * vertices + Math.floor(i / 3)] * fields.step);
-  };
+  const read = (blob) => readField(blob, fields.step, vertices);
   const shapes = Object.entries(fields.shapes).map(async ([name, blob]) => [name, await read(blob)]);
   const [browsUp, browsDown, closing] = await Promise.all([fields.browsUp, fields.browsDown, fields.closing].map(read));
   return { browsUp, browsDown, closing, shapes: Object.fromEntries(await Promise.all(shapes)) };

@@ -54,18 +54,32 @@ function halvesOf(shapes) {
 /** Weights (T) of a shape that is one of the frames. */
 const oneOf = (frames, frame) => Float32Array.from({ length: frames }, (_, each) => Number(each === frame));
 
-/**
- * The parts of a .glb. Args: the face; what makes its offsets in mm (T · 3 V); frames a second; the name; facts that are
- * written with it.
- */
-async function glb(face, offsetsOf, frameRate, name, extras) {
+/** Shapes with weights that give back every frame. Args: what makes the offsets in mm (T · 3 V); numbers in a frame. */
+async function compressed(offsetsOf, size) {
   let offsets = await offsetsOf();
-  const size = face.template.length, frames = offsets.length / size;
+  const frames = offsets.length / size;
+  const few = await shapesOf(offsets, frames, GLB_TOLERANCE);
+  let shapes = few && halvesOf(few);
+  if (!few) { // a shape for every frame is exact, and fewer
+    offsets = await offsetsOf();
+    shapes = Array.from({ length: frames }, (_, frame) => [offsets.slice(frame * size, (frame + 1) * size), oneOf(frames, frame)]);
+  }
+  // A face that never moves still needs something to animate.
+  if (!shapes.length) shapes.push([new Float32Array(size), new Float32Array(frames)]);
+  return { shapes, names: shapes.map((_, i) => `shape_${String(i).padStart(4, "0")}`), nodes: [] };
+}
+
+/**
+ * The parts of a .glb. Args: the face, whose template is that of all weights 0; shapes (3 V, in mm) with their weights
+ * (T), their names, and nodes that turn beside the face; frames a second; the name; facts that are written with it.
+ */
+async function glb(face, { shapes, names, nodes }, frameRate, name, extras) {
+  const size = face.template.length, frames = shapes[0][1].length;
   const times = Array.from({ length: frames }, (_, frame) => frame / frameRate);
   const views = [], accessors = [], parts = [];
   let length = 0;
   const add = (array, type, bounds, target) => {
-    const columns = type === "VEC3" ? 3 : 1;
+    const columns = { VEC4: 4, VEC3: 3 }[type] ?? 1;
     const accessor = {
       bufferView: views.length,
       componentType: array instanceof Uint32Array ? 5125 : 5126,
@@ -94,14 +108,6 @@ async function glb(face, offsetsOf, frameRate, name, extras) {
     attributes.COLOR_0 = add(Float32Array.from(face.colours, linear), "VEC3", false, 34962);
   }
   const indices = add(face.faces, "SCALAR", false, 34963);
-  const few = await shapesOf(offsets, frames, GLB_TOLERANCE);
-  let shapes = few && halvesOf(few);
-  if (!few) { // a shape for every frame is exact, and fewer
-    offsets = await offsetsOf();
-    shapes = times.map((_, frame) => [offsets.slice(frame * size, (frame + 1) * size), oneOf(frames, frame)]);
-  }
-  // A face that never moves still needs something to animate.
-  if (!shapes.length) shapes.push([new Float32Array(size), new Float32Array(frames)]);
   const targets = shapes.map(([shape]) => {
     orient(turned, face.template.map((value, i) => value + shape[i]), face.faces);
     const change = turned.map((value, i) => value - normals[i]);
@@ -120,7 +126,7 @@ async function glb(face, offsetsOf, frameRate, name, extras) {
       name: "face",
       primitives: [{ attributes, indices, material: 0, targets }],
       weights: shapes.map(() => 0),
-      extras: { targetNames: shapes.map((_, i) => `shape_${String(i).padStart(4, "0")}`) },
+      extras: { targetNames: names },
     }],
     materials: [material],
     animations: [{
@@ -132,6 +138,20 @@ async function glb(face, offsetsOf, frameRate, name, extras) {
     bufferViews: views,
     buffers: [{ byteLength: length }],
   };
+  const [scene] = document.scenes, [motion] = document.animations;
+  const siblings = scene.nodes;
+  for (const { name: joint, place: translation, curves } of nodes) {
+    const node = document.nodes.push({ name: joint, ...(translation && { translation }) }) - 1;
+    if (joint === "head") { // carries all others
+      document.nodes[node].children = siblings;
+      scene.nodes = [node];
+    } else siblings.push(node);
+    for (const [path, values] of Object.entries(curves)) {
+      const output = add(values, path === "rotation" ? "VEC4" : "VEC3");
+      const sampler = motion.samplers.push({ input: motion.samplers[0].input, output, interpolation: "LINEAR" }) - 1;
+      motion.channels.push({ sampler, target: { node, path } });
+    }
+  }
   const text = new TextEncoder().encode(JSON.stringify(document));
   const padding = new Uint8Array(-text.length & 3).fill(32);
   const chunk = text.length + padding.length;

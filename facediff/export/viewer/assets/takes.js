@@ -1,5 +1,21 @@
 // A take as files: the motion as the page holds it, as an archive that facediff and NumPy read, the speech, and the keys.
 
+const readNumbers = async (blob) => new Float32Array(await readBlob(blob));
+
+/** Shapes under the names of a take's own weights, as a .glb has them. */
+async function named(scene, size) {
+  const weights = await readNumbers(scene.weights), count = scene.names.length;
+  const shapes = scene.shapes.map(async (blob, column) => [
+    await readField(blob, scene.step, size / 3),
+    Float32Array.from({ length: weights.length / count }, (_, frame) => weights[frame * count + column]),
+  ]);
+  const nodes = scene.nodes.map(async (node) => {
+    const curves = Object.entries(node.curves).map(async ([path, blob]) => [path, await readNumbers(blob)]);
+    return { ...node, curves: Object.fromEntries(await Promise.all(curves)) };
+  });
+  return { names: scene.names, shapes: await Promise.all(shapes), nodes: await Promise.all(nodes) };
+}
+
 /** The download of takes. */
 class Takes {
   constructor(player) {
@@ -10,9 +26,15 @@ class Takes {
     find("take-motion").addEventListener("click", () => this.motion("npz"));
     find("take-glb").addEventListener("click", () => this.motion("glb"));
     find("take-sound").addEventListener("click", () => this.sound());
+    for (const button of this.tables) button.addEventListener("click", () => this.table(button.dataset.tracks));
     find("take-keys").addEventListener("click", () => player.editor.save(this.number));
     find("taken").addEventListener("change", () => this.choose());
     find("downloads").addEventListener("click", () => this.open());
+  }
+
+  /** Buttons of tables of weights. */
+  get tables() {
+    return find("take-tables").querySelectorAll("button");
   }
 
   get number() {
@@ -27,8 +49,9 @@ class Takes {
     find("takes").showModal();
   }
 
-  /** Another take may have no keys. */
+  /** Another take may have no keys, and no weights. */
   choose() {
+    find("take-tables").hidden = !this.facts.animations[this.number].weighted;
     find("take-keys").disabled = !this.player.editor.directions[this.number].keys.length;
   }
 
@@ -49,6 +72,13 @@ class Takes {
     for (const button of buttons) button.disabled = false;
   }
 
+  /** Download a table of the take's weights, or of visemes. */
+  async table(tracks) {
+    const { name, weighted } = this.facts.animations[this.number];
+    const file = tracks === "arkit" ? fileName(name) : `${fileName(name)}_${tracks}`;
+    download(`${file}.csv`, "text/csv", [await readBlob(weighted.tables[tracks])]);
+  }
+
   async sound() {
     const name = fileName(this.facts.animations[this.number].name);
     download(`${name}.wav`, "audio/wav", [await readBlob(this.facts.sound)]);
@@ -64,6 +94,7 @@ class Takes {
       frame_rate: facts.frameRate,
       unit: "mm",
       sample_rate: this.player.wav ? this.player.wav.rate : 16000,
+      ...(animation.weighted && { space: animation.weighted.space }),
       metadata: { ...animation.metadata, precision_of_positions: `${facts.step} mm, from a page` },
     });
     const entries = [
@@ -84,6 +115,10 @@ class Takes {
       const pairs = new Uint8Array(await readBlob(animation.pairs));
       entries.push(["inner_lip_pairs", "<i4", [pairs.length / 8, 2], [pairs]]);
     }
+    if (animation.weighted) {
+      const { values, channels } = animation.weighted;
+      entries.push(["values", "<f4", [facts.frames, channels], [new Uint8Array(await readBlob(values))]]);
+    }
     for (const [name, blob] of Object.entries(animation.regions)) {
       const indices = new Uint8Array(await readBlob(blob));
       entries.push([`region_${name}`, "<i4", [indices.length / 4], [indices]]);
@@ -95,6 +130,10 @@ class Takes {
   async scene(number) {
     const { facts } = this;
     const face = this.player.faces[number], size = face.template.length;
+    const { name, metadata, weighted } = face.animation;
+    if (weighted?.scene) {
+      return glb({ ...face, template: new Float32Array(await readBlob(weighted.scene.rest)) }, await named(weighted.scene, size), facts.frameRate, name, metadata);
+    }
     if (4 * size * facts.frames > GLB_MEMORY) {
       throw new Error("too much motion for a .glb made in a page: download the .npz, and run facediff export");
     }
@@ -108,8 +147,8 @@ class Takes {
       }
       return offsets;
     };
-    const extras = { ...face.animation.metadata, tolerance_mm: GLB_TOLERANCE };
-    return glb(face, offsetsOf, facts.frameRate, face.animation.name, extras);
+    const extras = { ...metadata, tolerance_mm: GLB_TOLERANCE };
+    return glb(face, await compressed(offsetsOf, size), facts.frameRate, name, extras);
   }
 
   /** Positions of all frames, as the page holds them: without the preview of changed keys. */

@@ -464,13 +464,14 @@ class TalkingPage {
   }
 
   /** The parts of the animation's .glb, in metres. */
-  scene() {
+  async scene() {
     const { animated, facts } = this;
     if (4 * animated.offsets.length > GLB_MEMORY) {
       throw new Error("too much motion for a .glb made in a page: download the .npz, and run facediff export");
     }
     const offsetsOf = async () => animated.offsets.map((value) => value * facts.millimetres);
-    return glb(this.stage.face, offsetsOf, animated.frameRate, animated.name, { ...this.metadata, tolerance_mm: GLB_TOLERANCE });
+    const shapes = await compressed(offsetsOf, this.stage.face.template.length);
+    return glb(this.stage.face, shapes, animated.frameRate, animated.name, { ...this.metadata, tolerance_mm: GLB_TOLERANCE });
   }
 
   async download(kind) {
