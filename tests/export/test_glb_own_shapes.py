@@ -23,8 +23,8 @@ from facediff.spaces.arkit import ALPHABETICAL
 from facediff.spaces.visemes import visemes
 from facediff.synthetic.arkit import puppet_shapes
 from tests.fakes.avatar import AvatarPart, avatar_parts, write_avatar
-from tests.fakes.gltf_scene import GltfScene
 from tests.fakes.glb_targets import pack
+from tests.fakes.gltf_scene import GltfScene
 
 FRAMES = 30
 NECK = np.array([0.0, 1.5, 0.0])  # where the avatar's bone of the head is
