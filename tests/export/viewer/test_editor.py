@@ -196,6 +196,29 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
         assert keys_in(page).rows() == wanted.rows()
 
 
+def test_keys_are_added_and_moved_by_a_finger(show: Show) -> None:
+    page = show([directed(Direction([Key(1.0, "expressiveness", 2.0)]))], width=760, height=800)
+    page.send("Emulation.setTouchEmulationEnabled", enabled=True)
+
+    def touch(*points: tuple[float, float]) -> None:
+        """A finger is put down, goes from point to point, and is lifted."""
+        for k, (x, y) in enumerate(points):
+            page.send(
+                "Input.dispatchTouchEvent", type="touchMove" if k else "touchStart", touchPoints=[{"x": x, "y": y}]
+            )
+        page.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    # A fingertip lies next to the key by more than a mouse would.
+    (left, top), end = at(page, "expressiveness", 1.0, 0.5), at(page, "expressiveness", 1.4, 0.75)
+    touch((left + 12, top), ((left + end[0]) / 2, (top + end[1]) / 2), end)
+    (key,) = keys_in(page).channels["expressiveness"]
+    assert key.time == pytest.approx(1.4)
+    assert key.value == pytest.approx(3.0, abs=0.1)
+    for _ in range(2):
+        touch(at(page, "expressiveness", 0.4, 0.25))
+    assert [key.time for key in keys_in(page).channels["expressiveness"]] == [0.4, 1.4]
+
+
 def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
     """The page starts from the take that was made with old keys; the other way is from the bare motion."""
     bare = directed(Direction([Key(0, "head.roll", 0.0)]))

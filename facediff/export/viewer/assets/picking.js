@@ -1,7 +1,7 @@
 // Landmarks: the same places are picked on two faces, by pointer or keys, mirrored, and saved.
 
 const SNAP = 0.995; // a place that weighs a corner by this is the corner
-const CLICK = 4; // pixels that a pointer may move in a click
+const CLICK = { mouse: 4, pen: 6, touch: 12 }; // pixels that a pointer may move in a click
 
 const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -88,7 +88,7 @@ class Side {
       this.cross.hidden = true;
     });
     this.box.addEventListener("pointerup", (event) => {
-      if (!pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > CLICK) return;
+      if (!pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > CLICK[event.pointerType || "mouse"]) return;
       pressed = null;
       const { left, top } = this.canvas.getBoundingClientRect();
       this.app.pick(this, event.clientX - left, event.clientY - top);
