@@ -258,96 +258,48 @@ def style_of(
     return Reference(path.stem, offsets)
 
 
-PARAMETER_FILES = (".csv", ".json", ".npy", ".npz", ".pt")
-"""Suffixes of motion in parameters; ``.pt`` are ARTalk's style clips."""
-
-
 def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
-    """Motion in parameters from the words of a style: ``clip.json``, or ``clip.npy@flame_artalk`` with its layout.
-
-    None if the words are none: a name, a style vector, or an animation of vertices.
-
-    Args:
-        words: a file, with ``@`` and its layout if it does not say that itself.
-        frame_rate: frames a second of an array whose layout has no rate of its own.
-
-    Raises:
-        FaceDiffError: if there is no such file, or it is not of that layout.
-    """
+    """As :func:`facediff.animation.parameter_styles.recorded_parameters`, and ARTalk's style clips (``.pt``)."""
     import numpy as np
 
-    from facediff.spaces.files import ParameterClip, read_parameters
-    from facediff.spaces.layouts import LAYOUTS, find_layout
-    from facediff.utils.arrays import read_arrays
+    from facediff.animation import parameter_styles
+    from facediff.spaces.files import ParameterClip
+    from facediff.spaces.layouts import find_layout
 
     path, stated = with_layout(words)
-    if path.suffix not in PARAMETER_FILES or (stated is None and not path.is_file()):
-        return None
-    if not path.is_file():
-        raise OptionError.naming(f"{{style}} {path}: no such file")
-    if path.suffix == ".npz" and stated is None:
-        from facediff.animation import read_archive
+    if path.suffix != ".pt" or not path.is_file():
+        return parameter_styles.recorded_parameters(words, frame_rate)
+    import torch
 
-        if "template" in read_arrays(path, {"template"}):
-            animation = read_archive(path)
-            if animation.values is None:
-                return None
-            return ParameterClip(animation.name, animation.values, animation.space, animation.frame_rate)
-    if path.suffix == ".npy" and open_style(path).array.ndim == 1:
-        return None
-    if path.suffix == ".pt":
-        import torch
+    from facediff.utils.torch_files import load_tensors, open_checkpoint
 
-        from facediff.utils.torch_files import load_tensors, open_checkpoint
-
-        entry = find_layout(stated or "flame_artalk", f"--style {path}")
-        with open_checkpoint(path) as (stream, source):
-            content = load_tensors(stream, source)
-        values: npt.NDArray[np.floating] = np.zeros(0, np.float32)
-        if isinstance(content, torch.Tensor) and content.is_floating_point():
-            values = content.float().numpy()
-        if values.ndim != 2 or values.shape[1] != len(entry.space.channels) or not np.isfinite(values).all():
-            raise OptionError.naming(
-                f"{{style}} {path}: holds no tensor of finite numbers (frames, {len(entry.space.channels)}); expected "
-                f"a style clip such as ARTalk's, or state its layout: {path.name}@LAYOUT"
-            )
-        return ParameterClip(path.stem, values, entry.space, entry.frame_rate or 25.0)
-    if stated is None and path.suffix in (".npy", ".npz"):
-        try:
-            return read_parameters(path)  # which says what layouts fit
-        except FaceDiffError as error:
-            raise OptionError.naming(f"{{style}} {error}, as in {path.name}@LAYOUT") from error
-    without_rate = path.suffix == ".npy" and stated in LAYOUTS and LAYOUTS[stated].frame_rate is None
-    return read_parameters(path, layout=stated, frame_rate=frame_rate if without_rate else None)
+    entry = find_layout(stated or "flame_artalk", f"--style {path}")
+    with open_checkpoint(path) as (stream, source):
+        content = load_tensors(stream, source)
+    values: npt.NDArray[np.floating] = np.zeros(0, np.float32)
+    if isinstance(content, torch.Tensor) and content.is_floating_point():
+        values = content.float().numpy()
+    if values.ndim != 2 or values.shape[1] != len(entry.space.channels) or not np.isfinite(values).all():
+        raise OptionError.naming(
+            f"{{style}} {path}: holds no tensor of finite numbers (frames, {len(entry.space.channels)}); expected "
+            f"a style clip such as ARTalk's, or state its layout: {path.name}@LAYOUT"
+        )
+    return ParameterClip(path.stem, values, entry.space, entry.frame_rate or 25.0)
 
 
 def style_of_channels(recorded: ParameterClip, identity: str, model: AnimationModel) -> Reference:
-    """Motion in parameters as a reference of a model of channels: in its order, at its rate, from the person's rest.
+    """Motion in parameters as a reference of a model of channels, as offsets from the person's rest.
 
     Raises:
         FaceDiffError: if the model takes vertices, or the motion lacks one of its channels.
     """
     import torch
 
+    from facediff.animation.parameter_styles import channels_of
     from facediff.data import Reference
-    from facediff.spaces.operations import permuted, resampled
 
-    assets = model.assets
-    if assets.space.is_vertices:
-        raise OptionError.naming(
-            f"{{style}} {recorded.name}: is motion in parameters, and this model takes vertices; give such a motion"
-        )
-    values, space = permuted(recorded.values, recorded.space, assets.space)
-    own = [name for name in space.absent if name in assets.space.channels and name not in assets.space.absent]
-    if own:
-        raise OptionError.naming(
-            f"{{style}} {recorded.name}: lacks {', '.join(own[:4])}{' …' if len(own) > 4 else ''}; give a motion with "
-            f"the model's channels"
-        )
-    if abs(recorded.frame_rate - assets.frame_rate) > 1e-6:
-        values = resampled(values, assets.space, recorded.frame_rate, assets.frame_rate)
-    motion = torch.from_numpy(values.astype("float32"))[..., None]
-    return Reference(recorded.name, motion - assets.template(identity))
+    motion = torch.from_numpy(channels_of(recorded, model.assets.space, model.assets.frame_rate))[..., None]
+    return Reference(recorded.name, motion - model.assets.template(identity))
 
 
 def refuse_vertices(source: object, model: AnimationModel) -> None:

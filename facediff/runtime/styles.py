@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
+from facediff.animation.parameter_styles import channels_of, recorded_parameters
 from facediff.animation.style_files import FILES, Stillness, frames_of, normalised, open_style, split_styles, stride_of
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.graphs import ExportedGraphs
@@ -52,6 +53,11 @@ def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyl
     about, vectors = model.description, model.arrays["styles"]
     if name in about.styles:
         return RuntimeStyle(name, vectors[about.styles.index(name)].astype(np.float32))
+    recorded = recorded_parameters(name, about.frame_rate) if not about.motion_space.is_vertices else None
+    if recorded is not None:
+        resting = model.arrays["resting"][about.faces.index(identity) if identity in about.faces else 0]
+        values = channels_of(recorded, about.motion_space, about.frame_rate)
+        return encode_style(model, (values - resting)[..., None], recorded.name)
     if not name.endswith(FILES):
         raise FaceDiffError(f'style: there is no "{name}", and it is no file: {choices(name, about.styles)}')
     path = Path(name)
@@ -66,8 +72,8 @@ def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyl
         return RuntimeStyle(path.stem, vector)
     if not about.motion_space.is_vertices:
         raise OptionError.naming(
-            f"{{style}} {path}: motion files hold vertices, and this model takes channels; name a style of the folder, "
-            f"or a style vector of this model"
+            f"{{style}} {path}: holds vertices, and this model takes channels; give motion in parameters, a style of "
+            f"the folder, or a style vector of this model"
         )
     templates, rate, scale = model.arrays["templates"], opened.frame_rate or about.frame_rate, 1.0
     whose = next((name for name in (path.stem.rpartition("_")[0], identity) if name in about.faces), about.faces[0])

@@ -13,10 +13,11 @@ from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.pipelines.exported import ExportedPipeline
-from facediff.runtime import RuntimeModel
+from facediff.runtime import RuntimeModel, styles
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, packed_deltas
 from facediff.runtime.site import make_site
-from facediff.spaces.files import read_parameters
+from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
+from facediff.spaces.layouts import layout
 from facediff.spaces.rotations import convert
 from tests.fakes.exported import CHANNELS, STATE, fit_sizes, write_exported
 from tests.runtime.test_runtime import sound
@@ -66,6 +67,22 @@ def test_the_command_writes_weights_as_they_are(folder: Path, tmp_path: Path) ->
         turns = [convert(angles, "euler", "six_d") for angles in (written[:, head], animation.values[:, -3:])]
         np.testing.assert_allclose(turns[0], turns[1], atol=1e-3)
     assert main([*arguments, str(tmp_path / "louder.csv"), "--expressiveness", "1.5"]) != 0
+
+
+def test_a_recording_in_weights_is_a_style(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    live_link = layout("live_link")
+    values = np.random.default_rng(0).random((25, 61)).astype(np.float32) / 4
+    write_parameters(tmp_path / "take.csv", ParameterClip("take", values, live_link, 25.0))
+    model, encoded = RuntimeModel.open(folder), []
+    monkeypatch.setattr(styles, "encode_style", lambda _, motion, name: encoded.append((motion, name)))
+    styles.read_style(str(tmp_path / "take.csv"), model, "A")
+    ((motion, name),) = encoded
+    assert (name, motion.shape) == ("take", (25, STATE, 1))
+    jaw = values[:, live_link.index("jawOpen")]
+    np.testing.assert_allclose(motion[:, CHANNELS.index("jawOpen"), 0], jaw, atol=1e-6)
+    np.save(tmp_path / "motion.npy", np.zeros((5, 6, 3), np.float32))
+    with pytest.raises(FaceDiffError, match=r"motion\.npy"):
+        styles.read_style(str(tmp_path / "motion.npy"), model, "A")
 
 
 def test_the_page_says_that_it_plays_vertices_only(folder: Path) -> None:
