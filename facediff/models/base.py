@@ -415,6 +415,12 @@ class AnimationModel(PersonStyles, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("facediff's models train and test on a SpeechMotionDataModule; pass datamodule=…")
+        faces = dict(self.heads())
+        if stage in ("fit", "validate") and data.further.keys() != faces.keys():
+            raise FaceDiffError(
+                f"data.further_corpora: has {', '.join(data.further) or 'none'}; expected a corpus for each further "
+                f"face of the model: {', '.join(faces) or 'none, since it is no model of many faces (ManyFaces)'}"
+            )
         self.use_corpus(data, stage)
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
@@ -452,6 +458,10 @@ class AnimationModel(PersonStyles, ABC):
                 self.trainer.strategy.root_device,
                 data,
             )
+
+    def heads(self) -> Iterator[tuple[str, AnimationModel]]:
+        """The models of further faces by name: none, by itself."""
+        return iter(())
 
     def model_of(self, batch: Batch) -> AnimationModel:  # noqa: ARG002 - a model of one face
         """The model of the face that a batch is of."""

@@ -263,3 +263,5 @@ def test_corpora_that_are_not_those_of_the_faces_are_refused(roots: dict[str, Pa
     data = corpora(roots)
     with pytest.raises(FaceDiffError, match="data.further_corpora"):
         make_trainer().fit(many_faces(data), Tiny(root=str(roots["tiny"])))
+    with pytest.raises(FaceDiffError, match=r"data\.further_corpora.*ManyFaces"):
+        make_trainer().fit(DualPathDiffusion(**tiny_model_options()), data)

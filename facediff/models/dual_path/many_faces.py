@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError
 from facediff.models.base import SIZES
 from facediff.models.checkpoint import face_content
 from facediff.models.checkpoint_content import FACES_KEY
@@ -77,20 +77,11 @@ class ManyFaces(DualPathDiffusion):
         return cast(DualPathDiffusion, self.further_faces[name]) if name else self
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
-        """Let every face take its own corpus.
-
-        Raises:
-            FaceDiffError: if the corpora are not those of the faces.
-        """
+        """Let every face take its own corpus."""
         untrained = self._assets is None
         super().use_corpus(data, stage)
         if stage not in ("fit", "validate"):
             return  # each face is tested by itself
-        if data.further.keys() != dict(self.heads()).keys():
-            raise FaceDiffError(
-                f"data.further_corpora: has {', '.join(data.further) or 'none'}; expected a corpus for each further "
-                f"face of the model: {', '.join(self.further_faces) or 'none'}"
-            )
         for name, face in self.heads():
             face.trainer = self.trainer
             data.further[name].trainer = self.trainer
