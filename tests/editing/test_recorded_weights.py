@@ -9,11 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import facediff
+from facediff.animation import Animation
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
+from facediff.synthetic.arkit import puppet_shapes
 from facediff.synthetic.known_faces import built_in_rig
 from tests.fakes.glb_reader import Reader
 
@@ -102,3 +104,27 @@ def test_a_glb_of_vertices_that_are_not_the_sum_of_the_weights_is_exact(tmp_path
     wrong = recorded.made_of(recorded.space, np.asarray(recorded.values)[::-1].copy(), recorded.deltas)
     wrong.save(tmp_path / "a.glb")
     assert "jawOpen" not in Reader(tmp_path / "a.glb").gltf.meshes[0].extras["targetNames"]
+
+
+def test_the_command_writes_the_weights_of_a_take_and_plays_it_on_an_avatars_own_rig(tmp_path: Path) -> None:
+    clip, take = take_of(tmp_path / "take.csv"), str(tmp_path / "take.csv")
+    assert main(["export", take, "-o", str(tmp_path / "beat.json")]) == 0
+    assert main(["export", take, "-o", str(tmp_path / "again.csv")]) == 0
+    assert main(["export", take, "-o", str(tmp_path / "vowels.csv"), "--tracks", "vrm"]) == 0
+    beat, again = read_parameters(tmp_path / "beat.json"), read_parameters(tmp_path / "again.csv")
+    weights = clip.values[:, [clip.space.index(name) for name in beat.space.channels]]
+    np.testing.assert_allclose(beat.values, weights, atol=1e-6)
+    np.testing.assert_allclose(again.values[:30], clip.values, atol=1e-5)
+    assert "Blink_L" in (tmp_path / "vowels.csv").read_text().splitlines()[0]
+    rest, faces, shapes = puppet_shapes("F1")  # another head than the one that plays takes, of another topology
+    avatar = Animation("avatar", rest[None].astype(np.float32), rest.astype(np.float32), 30.0, faces=faces)
+    deltas = np.stack([shapes[name] - rest for name in layout("arkit").channels])
+    avatar.made_of(layout("arkit"), np.zeros((1, 52), np.float32), deltas).save(tmp_path / "avatar.glb")
+    words = ["retarget", take, "--target-mesh", str(tmp_path / "avatar.glb"), "--own-shapes"]
+    assert main([*words, "-o", str(tmp_path / "speaks.glb")]) == 0
+    read = Reader(tmp_path / "speaks.glb")
+    targets = read.gltf.meshes[0].extras["targetNames"]
+    (motion,) = [motion for motion in read.gltf.animations if motion.name == "take"]
+    played = read.values(motion.samplers[motion.channels[0].sampler].output).reshape(30, -1)
+    wanted = clip.values[:, [clip.space.index(name) for name in targets]]
+    np.testing.assert_allclose(played, np.clip(wanted, 0, 1), atol=1e-6)
