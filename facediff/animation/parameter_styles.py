@@ -21,19 +21,19 @@ PARAMETER_FILES = (".csv", ".json", ".npy", ".npz", ".pt")
 """Suffixes of motion in parameters; ``.pt`` are ARTalk's style clips, which need PyTorch."""
 
 
-def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
-    """Motion in parameters from the words of a style: ``clip.json``, or ``clip.npy@flame_artalk`` with its layout.
+def recorded_parameters(source: str, frame_rate: float) -> ParameterClip | None:
+    """Motion in parameters of a style: ``clip.json``, or ``clip.npy@flame_artalk`` with its layout.
 
-    None if the words are none: a name, a style vector, or an animation of vertices.
+    None if it is none: a name, a style vector, or an animation of vertices.
 
     Args:
-        words: a file, with ``@`` and its layout if it does not say that itself.
+        source: a file, with ``@`` and its layout if it does not say that itself.
         frame_rate: frames a second of an array whose layout has no rate of its own.
 
     Raises:
         FaceDiffError: if there is no such file, or it is not of that layout.
     """
-    path, stated = with_layout(words)
+    path, stated = with_layout(source)
     if path.suffix not in PARAMETER_FILES or (stated is None and not path.is_file()):
         return None
     if not path.is_file():

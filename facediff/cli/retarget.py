@@ -213,17 +213,17 @@ def pick_on_page(
     tell(picked)
 
 
-def surface_notes(target_mesh: Path, output: Path, made: Animation) -> list[str]:
+def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
     """What of an .obj's texture coordinates and materials a file does not get, a sentence each."""
     from facediff.export import FORMATS
     from facediff.mesh.obj_surface import has_uvs, read_surface
 
-    if not has_uvs(target_mesh):
+    if not has_uvs(mesh):
         return []
     if output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses:
-        return list(read_surface(target_mesh, len(made.triangles)).lost)
+        return list(read_surface(mesh, len(made.triangles)).lost)
     return [
-        f"{output.suffix} has no texture coordinates: those of {target_mesh.name} are left out; write .obj, .glb "
+        f"{output.suffix} has no texture coordinates: those of {mesh.name} are left out; write .obj, .glb "
         f"or .usdc, or give it to `facediff export` as --surface"
     ]
 
