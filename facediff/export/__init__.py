@@ -3,7 +3,7 @@
 Example:
     >>> from facediff.export import FORMATS
     >>> FORMATS[".glb"].help
-    'glTF 2.0 with morph targets, exact or under the names of --shapes: Blender, Unity, three.js, Unreal'
+    'glTF 2.0 with morph targets, exact or named by weights or --shapes: Blender, Unity, three.js, Unreal'
 """
 
 from facediff.animation.options import ExportOptions

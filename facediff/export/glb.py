@@ -33,7 +33,7 @@ LINEAR = "LINEAR"  # Interpolation between keys
 
 @export_format.register("glb")
 class GlbFormat(Format):
-    """glTF 2.0 with morph targets, exact, or under the names of weights or --shapes: Blender, Unity, three.js."""
+    """glTF 2.0 with morph targets, exact or named by weights or --shapes: Blender, Unity, three.js, Unreal."""
 
     next_step = "Blender: File > Import > glTF 2.0, then play; other programs: docs/export.md"
     speech = "next to it"
