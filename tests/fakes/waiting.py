@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 import socket
 import sys
@@ -12,8 +13,6 @@ from typing import IO
 
 PATIENCE = 120.0
 """Seconds after which an event counts as one that does not come."""
-
-_RESERVED: list[socket.socket] = []
 
 
 def wait_until(condition: Callable[[], object], goes_on: Callable[[], bool] = lambda: True) -> None:
@@ -63,7 +62,7 @@ def free_port() -> int:
     probe.bind(("127.0.0.1", 0))
     port = int(probe.getsockname()[1])
     if sys.platform == "linux":  # where a socket that does not listen keeps nobody away who asks for this very port
-        _RESERVED.append(probe)
+        atexit.register(probe.close)  # which keeps it until then
     else:
         probe.close()
     return port
