@@ -43,11 +43,16 @@ class SpeechFeatureCache(Callback):
         """Encode the clips that have no features yet, each process its share, and let the data module read all.
 
         Raises:
-            FaceDiffError: if the audio encoder has no frozen part.
+            FaceDiffError: if the audio encoder has no frozen part, or hears pieces of clips.
         """
         data = trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("SpeechFeatureCache works with facediff's models and data modules only")
+        if not pl_module.hears_whole_clips:
+            raise FaceDiffError(
+                f"SpeechFeatureCache: {type(pl_module).__name__} encodes pieces of the speech that are cut anew in "
+                f"each step, so that there is nothing to keep; omit the callback"
+            )
         encoder = pl_module.speech_encoder
         key = encoder.frozen_key()
         if key is None:

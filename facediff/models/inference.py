@@ -83,6 +83,7 @@ class Inference(ABC):
         samples: whether motion depends on random noise, by a sampler that :meth:`choose_sampler` changes.
         hears_all: whether the model counts its frames by itself (:attr:`clock`) and encodes all samples of a
             recording; else speech is cut or filled up to whole frames.
+        hears_whole_clips: whether training encodes a clip's speech as a whole, so that its features can be kept.
         chosen: attributes that the methods ``choose_…`` change, and :meth:`choosing` restores.
 
     Attributes:
@@ -93,6 +94,7 @@ class Inference(ABC):
     """
 
     samples: ClassVar[bool] = False
+    hears_whole_clips: ClassVar[bool] = True
     hears_all: ClassVar[bool] = False
     chosen: ClassVar[tuple[str, ...]] = ("windows", "expressivity")
     frame_rate: float

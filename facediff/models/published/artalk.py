@@ -92,6 +92,7 @@ class ARTalk(ParametricModel):
         options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
     """
 
+    hears_whole_clips: ClassVar[bool] = False  # but chunks that are cut anew in each step
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="facebook/wav2vec2-xls-r-300m", edges=False
     )

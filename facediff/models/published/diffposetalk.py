@@ -92,6 +92,7 @@ class DiffPoseTalk(ParametricModel):
     """
 
     samples: ClassVar[bool] = True
+    hears_whole_clips: ClassVar[bool] = False  # but windows that are cut anew in each step
     chosen: ClassVar[tuple[str, ...]] = (*ParametricModel.chosen, "scales", "guiding")
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="facebook/hubert-base-ls960", frozen_layers=2, edges=False
