@@ -142,7 +142,7 @@ class DualPathDiffusion(AnimationModel):
 
     samples: ClassVar[bool] = True
     low_latency_steps = LOW_LATENCY_STEPS
-    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "sampler_options", "guidance")
+    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class DualPathDiffusion(AnimationModel):
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
         # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
         # weight averaging would copy together with the model.
-        self.sampler_options: dict[str, Any] | None = None
+        self._sampler_options: dict[str, Any] | None = None
         self.sampler = sampler(process=self.process)
         self.sampling_space: SamplingSpace = sampling_space
         self.motion_space = motion_space(n_vertices=self.n_vertices, dims=self.dims, steps=diffusion_steps)
@@ -324,7 +324,7 @@ class DualPathDiffusion(AnimationModel):
     def rescale_noise(self, scale: float) -> None:
         """Noise motion at another scale from now on."""
         self.process = NoiseProcess(self.process.steps, self.process.schedule, scale)
-        options = self.sampler_options
+        options = self._sampler_options
         options = self.hparams["sampler"]["init_args"] if options is None else options
         self.sampler = type(self.sampler)(process=self.process, **options)
 
@@ -371,7 +371,7 @@ class DualPathDiffusion(AnimationModel):
             # A thousand steps of ddpm go to the clean end: fewer of the process have the last noise of ten.
             options = {}
             self.sampler = chosen(process=self.process, **more)
-        self.sampler_options = options | more
+        self._sampler_options = options | more
 
     def choose_low_latency(self) -> None:
         """Frame by frame, and in :attr:`low_latency_steps` denoising steps of the present sampler at most."""
@@ -521,23 +521,12 @@ class DualPathDiffusion(AnimationModel):
         scales: Preconditioning,
     ) -> dict[str, Tensor]:
         """The losses in a space of known variances."""
-        predicted = self.predict(conditions, self.process.add_noise(clean, noise, step), step, mask)
-        return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
-
-    def predict(
-        self,
-        conditions: Conditions,
-        noisy: Float[Tensor, "draws frames coordinates"],
-        step: Int[Tensor, " draws"],
-        mask: Bool[Tensor, "draws frames"],
-    ) -> Float[Tensor, "draws frames coordinates"]:
-        """Clean motion from noisy motion, in the motion space and with gradients."""
-        network, scales = self.network, self.motion_space.preconditioning
-        if scales is None:
-            return network(noisy, step, conditions)
+        noisy = self.process.add_noise(clean, noise, step)
         mean = scales.posterior_mean(noisy, step, mask)
-        features = network.core(network.embed(scales.inputs(noisy, mean, step, mask)), step, conditions)
-        return scales.clean(mean, network.clean_motion(features), step, mask)
+        embedded = self.network.embed(scales.inputs(noisy, mean, step, mask))
+        features = self.network.clean_motion(self.network.core(embedded, step, conditions))
+        predicted = scales.clean(mean, features, step, mask)
+        return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
 
     def _with_style_losses(self, losses: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:
         """The terms of the dynamic style, where they are asked for, and the sum with them."""
