@@ -385,6 +385,7 @@ def add_nodes(document: GlbWriter, frame_rate: float, added: Sequence[MovingNode
     """Add nodes to a document of :func:`make_document`, whose only node is the face; a head carries all others."""
     nodes, siblings = document.content["nodes"], document.content["scenes"][0]["nodes"]
     (motion,) = document.content["animations"]
+    times: int | None = None  # of all curves
     for moving in added:
         node: dict[str, Any] = {"name": moving.name}
         if moving.place is not None:
@@ -396,7 +397,8 @@ def add_nodes(document: GlbWriter, frame_rate: float, added: Sequence[MovingNode
         else:
             siblings.append(len(nodes) - 1)
         for path, values in moving.curves.items():
-            times = document.add((np.arange(len(values)) / frame_rate).astype(np.float32), bounds=True)
+            if times is None:
+                times = document.add((np.arange(len(values)) / frame_rate).astype(np.float32), bounds=True)
             output = document.add(values)
             motion["samplers"].append({"input": times, "output": output, "interpolation": LINEAR})
             target = {"node": len(nodes) - 1, "path": path}

@@ -123,8 +123,7 @@ def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animat
         )
         own["samplers"].append({"input": times, "output": writer.add(rows.ravel()), "interpolation": "LINEAR"})
         own["channels"].append({"sampler": len(own["samplers"]) - 1, "target": {"node": node, "path": "weights"}})
-    # The first one is what Blender and viewers play of themselves.
-    glb.content["animations"] = [own, *glb.entries("animations")]
+    glb.put_first(own)
 
 
 def _append(

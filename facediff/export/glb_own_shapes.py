@@ -297,8 +297,7 @@ def _animate(
     for node, turns in _turns(own, weights):
         add(node, "rotation", _local(glb, node, turns))
     if motion["channels"]:
-        # The first one is what Blender and viewers play of themselves.
-        glb.content["animations"] = [motion, *glb.entries("animations")]
+        glb.put_first(motion)
 
 
 def _turns(own: OwnShapes, weights: Weights) -> list[tuple[int, Array]]:

@@ -79,6 +79,10 @@ class Glb:
             raise ValueError(f"has {kind} that are no list of objects")
         return listed
 
+    def put_first(self, animation: dict[str, Any]) -> None:
+        """Add an animation before those of the file: Blender and viewers play the first one of themselves."""
+        self.content["animations"] = [animation, *self.entries("animations")]
+
     def entry(self, kind: str, index: object) -> dict[str, Any]:
         """An object by its number; numbers from the end, which Python would accept, are refused."""
         listed = self.content.get(kind, [])
