@@ -99,8 +99,9 @@ def downloaded(page: Page, folder: Path, action: Callable[[], object]) -> Path:
     page.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
     action()
 
-    def files() -> list[Path]:  # whole: while it comes, a file has another suffix
-        return [file for file in folder.iterdir() if file.suffix in (".json", ".npz", ".glb", ".wav", ".csv")]
+    def files() -> list[Path]:  # whole: while it comes, its name is held by an empty file
+        ours = (".json", ".npz", ".glb", ".wav", ".csv")
+        return [file for file in folder.iterdir() if file.suffix in ours and file.stat().st_size]
 
     wait_until(files)
     return files()[0]
