@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -202,6 +203,24 @@ def test_another_sampler_keeps_spacing_and_last_noise_where_its_steps_allow(make
     assert model.sampler.timesteps == [*range(model.process.steps)][::-1]
     with pytest.raises(FaceDiffError, match="steps"):
         model.choose_sampler("ddpm", model.process.steps + 1)
+
+
+@pytest.mark.parametrize("name", [None, "ddim"])
+def test_fewer_steps_end_at_more_noise(make_model: Make, name: str | None) -> None:
+    made = {"steps": 10, "spacing": "log_snr", "first_noise": 200.0, "last_noise": 2.0}
+    model = make_model(diffusion_steps=1000, sampler=partial(registry.sampler.dpm_solver, **made))
+
+    def last_noise(steps: int | None) -> float:
+        model.choose_sampler(name, steps)
+        kept = model.sampler.signal[-2]
+        return math.sqrt((1 - kept) / kept)
+
+    ends = [last_noise(steps) for steps in (2, 3, 5, 10, 20)]
+    assert ends == sorted(ends, reverse=True)
+    assert ends[0] > 5 * ends[3]
+    assert ends[3:] == pytest.approx([2.0, 2.0], rel=0.02)  # as it was made, where the steps are as many or more
+    if name is None:
+        assert last_noise(None) == ends[3]
 
 
 def test_sizes_that_do_not_fit_are_named(make_model: Make, tiny: Tiny) -> None:

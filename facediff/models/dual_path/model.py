@@ -50,6 +50,7 @@ from facediff.models.samplers import (
     NoiseProcess,
     NoiseSource,
     SamplerFactory,
+    ended_earlier,
     half_hidden,
     unit_noise,
 )
@@ -211,6 +212,7 @@ class DualPathDiffusion(AnimationModel):
         # weight averaging would copy together with the model.
         self._sampler_options: dict[str, Any] | None = None
         self.sampler = sampler(process=self.process)
+        self._usual_steps = self.sampler.steps
         self.sampling_space: SamplingSpace = sampling_space
         self.motion_space = motion_space(n_vertices=self.n_vertices, dims=self.dims, steps=diffusion_steps)
         if timestep_sampling == "log_snr" and (self.motion_space.preconditioning is None or min_snr is not None):
@@ -355,7 +357,8 @@ class DualPathDiffusion(AnimationModel):
         """Sample in another way from now on; checkpoints keep the sampler that the model was made with.
 
         A sampler chosen by name keeps the spacing and the last noise that the model was made with, where as many steps
-        have that much noise; its other options are its own.
+        have that much noise; its other options are its own. With fewer steps than the model was made with, the last is
+        at more noise (:func:`~facediff.models.samplers.ended_earlier`).
         """
         chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
         options = dict(self.hparams["sampler"]["init_args"])
@@ -363,13 +366,15 @@ class DualPathDiffusion(AnimationModel):
         if name is not None:
             shared = {"spacing", "last_noise", "first_noise"} & options.keys() & registry.defaults(chosen).keys()
             options = {key: options[key] for key in sorted(shared)}
+        if steps is not None and options.get("first_noise") and options.get("last_noise"):
+            more["last_noise"] = ended_earlier(options["first_noise"], options["last_noise"], steps / self._usual_steps)
         try:
             self.sampler = chosen(process=self.process, **options | more)
         except ArgumentError:
             if name is None:
                 raise
             # A thousand steps of ddpm go to the clean end: fewer of the process have the last noise of ten.
-            options = {}
+            options, more = {}, {} if steps is None else {"steps": steps}
             self.sampler = chosen(process=self.process, **more)
         self._sampler_options = options | more
 
