@@ -73,7 +73,7 @@ def adapt(
         audio_encoder: with --low-latency: an encoder that replaces the checkpoint's and learns to reproduce its
             features, such as mel or mel:num_layers=6
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
-            docs/voices.md)
+            docs/voices.md); --low-latency does not unless it is given
         output: checkpoint to write (.ckpt)
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
         train: train all weights, those of identity and style only (person), or those of the face only (head); by
@@ -101,8 +101,8 @@ def adapt(
     train = train or ("all" if face is None else "head")
     if train == "head" and face is None:
         raise FaceDiffError("--train head: is for --face; give all or person")
-    if augmentation and voices is None:
-        raise FaceDiffError("--augmentation: is an option of --voices; give --voices as well")
+    if augmentation and voices is None and low_latency is None:
+        raise FaceDiffError("--augmentation: is an option of --voices and --low-latency; give one of them as well")
     if audio_encoder is not None and low_latency is None:
         raise FaceDiffError("--audio-encoder: is an option of --low-latency; give --low-latency as well")
     check_model_source(checkpoint, "--checkpoint")
@@ -113,7 +113,7 @@ def adapt(
             chosen = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
             chosen = DistillationOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed)
-            chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
+        chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
         adapt_audio_encoder(
             *(checkpoint, output, data_root, corpus, device, licence.commercial_only, chosen, audio_encoder),
@@ -213,9 +213,8 @@ def adapt_audio_encoder(
         raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
     content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
     error = write_distilled(checkpoint, content, data, output, chosen, encoder, device=device, quiet=quiet)
-    goal = "other voices" if chosen.look_ahead is None else "low latency"
     tell(
-        f"{output}: audio encoder adapted to {goal} in {time.monotonic() - started:.0f} s; its features err by "
+        f"{output}: audio encoder adapted to {chosen.goal} in {time.monotonic() - started:.0f} s; its features err by "
         f"{error:.2f} of their variance"
     )
 
@@ -264,8 +263,7 @@ def write_distilled(
         content["state_dict"] = {key: weight for key, weight in content["state_dict"].items() if key not in replaced}
         for key in OF_TRAINING:  # it belongs to the encoder that was replaced; `fit` starts from the beginning
             content.pop(key, None)
-    goal = "other voices" if options.look_ahead is None else "low latency"
-    with progress_bar(goal, options.steps, shown=not quiet) as step:
+    with progress_bar(options.goal, options.steps, shown=not quiet) as step:
         error = distil_audio_encoder(model, data, options, step, teacher=teacher)
     weights = {**encoder_weights(model), **model.fit_to_features(data)}
     # With averaged weights, those of the last step are kept for a training that goes on.

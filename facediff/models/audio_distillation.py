@@ -9,8 +9,11 @@ which gives back most of the accuracy on clean speech and keeps most of the robu
 fine-tuning of zero-shot models").
 
 **Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
-features of the whole recording. The student may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean
-2015, "Distilling the knowledge in a neural network"): HuBERT takes a fifth of a second for each frame of a stream.
+features of the whole recording. A model whose windows reach further than what is heard animates silence there, from
+which a trained model concludes that the speech is over, and begins to close the mouth: the student must expect of that
+silence what the teacher hears, as far as that can be known. Some pieces stay whole, so that recordings are heard as
+before. The student may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean 2015, "Distilling the
+knowledge in a neural network"): HuBERT takes a fifth of a second for each frame of a stream.
 """
 
 from __future__ import annotations
@@ -32,8 +35,7 @@ from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, r
 from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
-from facediff.models.layers import frame_mask
-from facediff.speech.windows import LOW_LATENCY, QUIETEST
+from facediff.speech.windows import QUIETEST, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
 from facediff.utils.workers import processors
@@ -79,8 +81,9 @@ class DistillationOptions:
         pauses: share of the pieces that get a pause, in which the background of augmented speech goes on: what the
             teacher hears in silence, the student is to hear in noise, music and babble.
         workers: processes that augment speech; 0 for this one.
-        look_ahead: seconds of speech after a feature that the student gets; None for the whole recording, which the
-            teacher always gets.
+        low_latency: the student hears what the model's windows hear at low latency; the teacher always hears the whole
+            recording.
+        whole: with ``low_latency``, the share of the pieces that the student hears as a whole all the same.
     """
 
     augmentations: Sequence[str] = ROBUST_AUGMENTATIONS
@@ -93,11 +96,17 @@ class DistillationOptions:
     learning_rate: float = 1e-3
     seed: int = 0
     workers: int = 1
-    look_ahead: float | None = None
+    low_latency: bool = False
+    whole: float = 0.3
+
+    @property
+    def goal(self) -> str:
+        """What the encoder is adapted to, in words."""
+        return "low latency" if self.low_latency else "other voices"
 
 
 LOW_LATENCY_DISTILLATION = DistillationOptions(
-    augmentations=(), share=0.0, pauses=0.0, interpolation=1.0, look_ahead=LOW_LATENCY.after
+    augmentations=(), share=0.5, pauses=0.2, interpolation=1.0, low_latency=True
 )
 """How an audio encoder is distilled for low latency."""
 
@@ -108,10 +117,12 @@ class DistillationBatch(NamedTuple):
     Attributes:
         clean: the teacher's input (batch, samples).
         lengths: valid samples of each clip.
-        student_input: the same speech, augmented, or cut to the steps from ``start`` to ``end`` (batch, fewer samples).
-        start: first step of the student's input.
-        end: the step after its last one.
-        mean: of each clip's speech up to ``end``; None where the student gets all of it.
+        student_input: the same speech, augmented, or a part of it with silence after it (batch, samples).
+        start: the teacher's step at which the student's input begins.
+        steps: of the student's input.
+        compared: the student's steps that are compared, as first and last of each clip (batch, 2); the last is the
+            one after them.
+        mean: of each clip's speech as far as the student hears it; None where it hears all of it.
         deviation: standard deviation of the same speech.
     """
 
@@ -119,7 +130,8 @@ class DistillationBatch(NamedTuple):
     lengths: Tensor
     student_input: Tensor
     start: Tensor
-    end: Tensor
+    steps: Tensor
+    compared: Tensor
     mean: Tensor | None = None
     deviation: Tensor | None = None
 
@@ -165,7 +177,10 @@ def distil_audio_encoder(
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
     teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
-    pairs = SpeechPairs(data, Augmenter(augmentations), options)
+    with model.choosing():
+        model.choose_low_latency()
+        windows = model.windows
+    pairs = SpeechPairs(data, Augmenter(augmentations), options, windows)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
@@ -180,7 +195,7 @@ def distil_audio_encoder(
             speech: DistillationBatch = batch.to(model.device)
             with torch.no_grad():
                 target = teacher(speech.clean, speech.lengths, _steps(speech.lengths))
-            error = _difference(_features(student, speech), *_compared(target, speech, options.look_ahead))
+            error = _difference(_features(student, speech), *_compared(target, speech))
             optimiser.zero_grad()
             error.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(weights, 1.0)
@@ -210,26 +225,20 @@ def _steps(samples: Tensor) -> Tensor:
 
 def _features(student: AudioEncoder, speech: DistillationBatch) -> Tensor:
     """The student's features, standardised by the level of all speech so far as in a stream."""
-    steps = speech.end - speech.start
     if speech.mean is None or speech.deviation is None:
-        features: Tensor = student(speech.student_input, speech.lengths, steps)
+        features: Tensor = student(speech.student_input, speech.lengths, speech.steps)
         return features
     with student.at_level(speech.mean[:, None], speech.deviation[:, None]):
-        features = student(speech.student_input, steps * SAMPLE_RATE // STEP_RATE, steps)
+        features = student(speech.student_input, speech.steps * SAMPLE_RATE // STEP_RATE, speech.steps)
     return features
 
 
-def _compared(target: Tensor, speech: DistillationBatch, look_ahead: float | None) -> tuple[Tensor, Tensor]:
+def _compared(target: Tensor, speech: DistillationBatch) -> tuple[Tensor, Tensor]:
     """The teacher's features of the student's steps, and True on the steps that are compared."""
-    count = speech.end - speech.start
-    if look_ahead is None:
-        return target, frame_mask(count, target.shape[1])[..., None]
-    place = torch.arange(int(count.max()), device=target.device)[None]
+    place = torch.arange(int(speech.steps.max()), device=target.device)[None]
     steps = (speech.start[:, None] + place).clamp_max(target.shape[1] - 1)
-    # Steps within the look-ahead are context only. Steps more than half a second before it have enough context
-    # already, and would drown the error of the hard ones.
-    last = (count - round(look_ahead * STEP_RATE))[:, None]
-    mask = (place < last) & (place >= last - STEP_RATE // 2)
+    first, last = speech.compared[:, :, None].unbind(1)
+    mask = (place >= first) & (place < last)
     return target.gather(1, steps[..., None].expand(-1, -1, target.shape[2])), mask[..., None]
 
 
@@ -250,16 +259,29 @@ def _rate(step: int, steps: int) -> float:
     return (step + 1) / rise if step < rise else 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
 
 
+class Piece(NamedTuple):
+    """What the student hears of a clip; see :class:`DistillationBatch`."""
+
+    speech: npt.NDArray[np.float32]
+    start: int
+    steps: int
+    compared: tuple[int, int]
+    mean: float
+    deviation: float
+
+
 class SpeechPairs(Dataset[DistillationBatch]):
     """Batches of clean speech with the student's version of it.
 
     A batch follows from its number and the seed, independently of the process that makes it.
     """
 
-    def __init__(self, data: SpeechMotionDataModule, augmenter: Augmenter, options: DistillationOptions) -> None:
+    def __init__(
+        self, data: SpeechMotionDataModule, augmenter: Augmenter, options: DistillationOptions, windows: WindowPlan
+    ) -> None:
         # Not the data module itself, which may hold what cannot be pickled for a worker.
         self.corpus, self.clips, self.further = data.corpus, data.clips("train"), data.further_speech()
-        self.augmenter, self.options = augmenter, options
+        self.augmenter, self.options, self.windows = augmenter, options, windows
         self._further_speech: dict[int, npt.NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
@@ -279,24 +301,32 @@ class SpeechPairs(Dataset[DistillationBatch]):
             clean.append(speech)
             augmented.append(self._augmented(speech, random) if random.random() < self.options.share else speech)
         lengths = torch.tensor([len(speech) for speech in clean])
-        end = _steps(lengths)
-        if self.options.look_ahead is None:
-            return DistillationBatch(_padded(clean), lengths, _padded(augmented), torch.zeros_like(end), end)
-        spans = [self._span(steps, random) for steps in end.tolist()]
-        size = SAMPLE_RATE // STEP_RATE
-        so_far = [clip[: stop * size].astype(np.float64) for clip, (_, stop) in zip(augmented, spans, strict=True)]
-        windows = [clip[start * size : stop * size] for clip, (start, stop) in zip(augmented, spans, strict=True)]
-        means, deviations = zip(*map(_level, so_far), strict=True)
-        mean, deviation = torch.tensor(means, dtype=torch.float32), torch.tensor(deviations, dtype=torch.float32)
-        start, stop = torch.tensor(spans).unbind(1)
-        return DistillationBatch(_padded(clean), lengths, _padded(windows), start, stop, mean, deviation)
+        steps = _steps(lengths)
+        if not self.options.low_latency:
+            start = torch.zeros_like(steps)
+            compared = torch.stack([start, steps], 1)
+            return DistillationBatch(_padded(clean), lengths, _padded(augmented), start, steps, compared)
+        pieces = [self._piece(clip, count, random) for clip, count in zip(augmented, steps.tolist(), strict=True)]
+        heard, *numbers = zip(*pieces, strict=True)
+        return DistillationBatch(_padded(clean), lengths, _padded(heard), *map(torch.tensor, numbers))
 
-    def _span(self, steps: int, random: np.random.Generator) -> tuple[int, int]:
-        """Where a window of low latency begins and ends in a clip, in steps."""
-        least = min(steps, round((self.options.look_ahead or 0) * STEP_RATE) + 2)
-        end = int(random.integers(least, steps + 1))
+    def _piece(self, speech: npt.NDArray[np.float32], steps: int, random: np.random.Generator) -> Piece:
+        """Speech as a window of low latency hears it, at a random place; now and then all of it."""
+        size, windows = SAMPLE_RATE // STEP_RATE, self.windows
+        if random.random() < self.options.whole:
+            return Piece(speech[: steps * size], 0, steps, (0, steps), *_level(speech.astype(np.float64)))
+        after, ahead = (round(seconds * STEP_RATE) for seconds in (windows.after, windows.ahead))
+        end = int(random.integers(min(steps, after + 2), steps + 1))
         shortest, longest = (round(seconds * STEP_RATE) for seconds in LOW_LATENCY_WINDOW)
-        return max(0, end - int(random.integers(shortest, longest + 1))), end
+        start = max(0, end - int(random.integers(shortest, longest + 1)))
+        mean, deviation = _level(speech[: end * size].astype(np.float64))
+        # At the mean, which is silence once it is standardised, as in a stream.
+        heard = np.pad(speech[start * size : end * size], (0, ahead * size), constant_values=mean)
+        # More than half a second before the frame, steps have enough context already, and would drown the error of the
+        # hard ones. Where nothing is animated ahead, those within the look-ahead are context only.
+        frame = end - after - start
+        last = min(steps, end + ahead) - start if ahead else frame
+        return Piece(heard, start, end - start + ahead, (max(0, frame - STEP_RATE // 2), last), mean, deviation)
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
         """A clip or a piece of further speech, or a random window of it."""
@@ -336,5 +366,5 @@ def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:
     return float(speech.mean()), max(float(speech.std()), QUIETEST)
 
 
-def _padded(speech: list[Any]) -> Tensor:
+def _padded(speech: Sequence[Any]) -> Tensor:
     return nn.utils.rnn.pad_sequence([torch.from_numpy(clip) for clip in speech], batch_first=True)

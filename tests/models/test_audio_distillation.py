@@ -23,6 +23,7 @@ from facediff.models.audio_distillation import (
     encoder_weights,
 )
 from facediff.models.base import AnimationModel
+from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, WindowPlan
 from tests.fakes.tiny import Tiny
 
 FEW = DistillationOptions(steps=3, batch_size=2, workers=0)
@@ -137,7 +138,8 @@ def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., Ani
 
 def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> None:
     options = replace(FEW, further=0, pauses=1.0, share=1.0, steps=20)
-    pairs = SpeechPairs(tiny, Augmenter(read_augmentations(["music:share=1,least=6,most=6"])), options)
+    augmenter = Augmenter(read_augmentations(["music:share=1,least=6,most=6"]))
+    pairs = SpeechPairs(tiny, augmenter, options, LOW_LATENCY_AHEAD)
     pauses = 0
     for number in range(len(pairs)):
         batch = pairs[number]
@@ -150,9 +152,37 @@ def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> N
     assert pauses > 20
 
 
+@pytest.mark.parametrize(("whole", "windows"), [(0.0, LOW_LATENCY_AHEAD), (0.0, LOW_LATENCY), (1.0, LOW_LATENCY_AHEAD)])
+def test_a_student_hears_what_a_window_hears(tiny: Tiny, whole: float, windows: WindowPlan) -> None:
+    """Speech up to a moment after the frame and then silence, in place of which it is to expect what comes."""
+    options = replace(FEW, further=0, pauses=0.0, share=0.0, steps=20, low_latency=True, whole=whole)
+    pairs = SpeechPairs(tiny, Augmenter([]), options, windows)
+    after, ahead = round(windows.after * 50), round(windows.ahead * 50)
+    for number in range(len(pairs)):
+        batch = pairs[number]
+        assert batch.mean is not None
+        assert batch.deviation is not None
+        rows = zip(*(each.tolist() for each in (batch.start, batch.steps, batch.compared, batch.lengths)), strict=True)
+        for row, (start, steps, (first, last), length) in enumerate(rows):
+            heard = steps if whole else steps - ahead
+            clip, student = batch.clean[row, :length].numpy(), batch.student_input[row].numpy()
+            so_far = clip[: (start + heard) * 320]
+            np.testing.assert_array_equal(student[: heard * 320], so_far[start * 320 :])
+            assert float(batch.mean[row]) == pytest.approx(so_far.mean(), abs=1e-6)
+            assert float(batch.deviation[row]) == pytest.approx(max(so_far.std(), 0.003), rel=1e-4)
+            if whole:
+                assert (start, steps, first, last) == (0, length // 320, 0, steps)
+            else:
+                np.testing.assert_allclose(student[heard * 320 : steps * 320], so_far.mean(), atol=1e-6)
+                frame = heard - after
+                # Half a second before the frame; after it, as far as the clip and the window reach.
+                assert first == max(0, frame - 25)
+                assert last == (min(steps, length // 320 - start) if ahead else frame)
+
+
 @pytest.mark.slow
 def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tiny: Tiny) -> None:
-    """On test clips: features 0.12 s before the end of what has been heard are those of the whole recording."""
+    """On test clips: features 0.12 s before the end of what has been heard, and after it, are those of the whole."""
     speech = [tiny.dataset("test_a")[index].audio.numpy() for index in range(4)]
     wanted = [features(model, each) for each in speech]
 
@@ -160,13 +190,13 @@ def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tin
         found = []
         for each, whole in zip(speech, wanted, strict=True):
             for frames in (6, 9, 12, 15):
-                count = torch.tensor([640 * frames])
-                level = model.speech_encoder.at_level(
-                    float(each[: 640 * frames].mean()), float(each[: 640 * frames].std())
-                )
+                heard, end = each[: 640 * frames], min(frames + 12, len(whole))
+                silent = np.pad(heard, (0, 640 * 12), constant_values=heard.mean())
+                count = torch.tensor([len(silent)])
+                level = model.speech_encoder.at_level(float(heard.mean()), float(heard.std()))
                 with torch.inference_mode(), level:
-                    made = model.speech_encoder(torch.from_numpy(each[None, : 640 * frames]), count, count // 640)[0]
-                found.append((made[frames - 4] - whole[frames - 4]).square())
+                    made = model.speech_encoder(torch.from_numpy(silent[None]), count, count // 640)[0]
+                found.append((made[frames - 4 : end] - whole[frames - 4 : end]).square().flatten())
         return float(torch.cat(found).mean())
 
     before = error()
