@@ -131,7 +131,7 @@ class WindowOptions(CheckedOptions):
     Attributes:
         window: seconds of a window (default: 4)
         overlap: seconds that neighbouring windows share (default: 1)
-        low_latency: windows of one frame, 0.12 s of look-ahead and two denoising steps, for immediate answers
+        low_latency: windows of one frame, 0.08 s of look-ahead and two denoising steps, for immediate answers
     """
 
     window: Annotated[ranges.Window | None, Option(metavar="S")] = None

@@ -59,7 +59,7 @@ def adapt(
     With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --face, a
     dual-path model gets a new head for another topology, or for channels, from a minute of motion. With --voices, its
     audio encoder is distilled to be robust to other voices, rooms and noise; with --low-latency, to need no more
-    than 0.12 s of speech ahead, and a smaller encoder may take its place. The corpus that the checkpoint was trained on
+    than 0.08 s of speech ahead, and a smaller encoder may take its place. The corpus that the checkpoint was trained on
     must be on this machine.
 
     Args:

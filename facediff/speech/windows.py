@@ -205,8 +205,8 @@ class WindowPlan:
         return self.seconds + self.after
 
 
-LOW_LATENCY = WindowPlan(seconds=1 / 30, overlap=0.0, before=0.4, after=0.12, above=0.0, past=1.0)
-"""Windows of one frame that hear 0.12 s ahead and continue the last second of motion; see docs/streaming.md."""
+LOW_LATENCY = WindowPlan(seconds=1 / 30, overlap=0.0, before=0.4, after=0.08, above=0.0, past=1.0)
+"""Windows of one frame that hear 0.08 s ahead and continue the last second of motion; see docs/streaming.md."""
 
 LOW_LATENCY_AHEAD = replace(LOW_LATENCY, past=0.48, ahead=0.48)
 """The same for a model that draws noise for each frame, whose motion depends on the noise before and after a frame."""

@@ -96,9 +96,9 @@ def ways(rate: float) -> list[Way]:
         Way("low latency", LOW_LATENCY_AHEAD, 2),
         Way("low latency, 1 step", LOW_LATENCY_AHEAD, 1),
         Way("low latency, 10 steps", LOW_LATENCY_AHEAD, 10),
-        Way("… hears 0.08 s ahead", replace(LOW_LATENCY_AHEAD, after=0.08), 2),
+        Way("… hears 0.12 s ahead", replace(LOW_LATENCY_AHEAD, after=0.12), 2),
         Way("… hears 0.16 s ahead", replace(LOW_LATENCY_AHEAD, after=0.16), 2),
-        Way("… hears 0.08 s ahead, shares 1 frame", overlapping, 2),
+        Way("… hears 0.04 s ahead, shares 1 frame", overlapping, 2),
         Way("… a second of past", replace(LOW_LATENCY_AHEAD, past=1.0), 2),
         Way("… no noise ahead", LOW_LATENCY, 2),
     ]
