@@ -54,10 +54,12 @@ function halvesOf(shapes) {
 /** Weights (T) of a shape that is one of the frames. */
 const oneOf = (frames, frame) => Float32Array.from({ length: frames }, (_, each) => Number(each === frame));
 
-/** Shapes with weights that give back every frame. Args: what makes the offsets in mm (T · 3 V); numbers in a frame. */
-async function compressed(offsetsOf, size) {
+/** Shapes with weights that give back every frame. Args: what makes the offsets in mm (T · 3 V); frames; numbers in one. */
+async function compressed(offsetsOf, frames, size) {
+  if (4 * size * frames > GLB_MEMORY) {
+    throw new Error("too much motion for a .glb made in a page: download the .npz, and run facediff export");
+  }
   let offsets = await offsetsOf();
-  const frames = offsets.length / size;
   const few = await shapesOf(offsets, frames, GLB_TOLERANCE);
   let shapes = few && halvesOf(few);
   if (!few) { // a shape for every frame is exact, and fewer

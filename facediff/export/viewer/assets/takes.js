@@ -134,9 +134,6 @@ class Takes {
     if (weighted?.scene) {
       return glb({ ...face, template: new Float32Array(await readBlob(weighted.scene.rest)) }, await named(weighted.scene, size), facts.frameRate, name, metadata);
     }
-    if (4 * size * facts.frames > GLB_MEMORY) {
-      throw new Error("too much motion for a .glb made in a page: download the .npz, and run facediff export");
-    }
     const offsetsOf = async () => {
       const offsets = new Float32Array(size * facts.frames);
       let at = 0;
@@ -148,7 +145,7 @@ class Takes {
       return offsets;
     };
     const extras = { ...metadata, tolerance_mm: GLB_TOLERANCE };
-    return glb(face, await compressed(offsetsOf, size), facts.frameRate, name, extras);
+    return glb(face, await compressed(offsetsOf, facts.frames, size), facts.frameRate, name, extras);
   }
 
   /** Positions of all frames, as the page holds them: without the preview of changed keys. */

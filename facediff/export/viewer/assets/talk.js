@@ -466,11 +466,9 @@ class TalkingPage {
   /** The parts of the animation's .glb, in metres. */
   async scene() {
     const { animated, facts } = this;
-    if (4 * animated.offsets.length > GLB_MEMORY) {
-      throw new Error("too much motion for a .glb made in a page: download the .npz, and run facediff export");
-    }
     const offsetsOf = async () => animated.offsets.map((value) => value * facts.millimetres);
-    const shapes = await compressed(offsetsOf, this.stage.face.template.length);
+    const size = this.stage.face.template.length;
+    const shapes = await compressed(offsetsOf, animated.offsets.length / size, size);
     return glb(this.stage.face, shapes, animated.frameRate, animated.name, { ...this.metadata, tolerance_mm: GLB_TOLERANCE });
   }
 
