@@ -3,7 +3,7 @@ r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of
 The recipe, where flite is installed, on one core in about 50 minutes:
 
     $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
-        --model.motion_space.eyelids_weight=20 --model.style_identity_weight=0.01
+        --model.motion_space.eyelids_weight=20
     $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 2400 \
         --augmentation voice:share=0.9,semitones=8,formants=0.3 --augmentation loudness:share=0.3 \
         --augmentation room:share=0.6,seconds=0.8,direct=-4 --augmentation tilt:share=0.6 \
