@@ -369,7 +369,8 @@ class Inference(ABC):
         Raises:
             FaceDiffError: if the model does not sample, or there is no such sampler.
         """
-        raise OptionError.naming(f"{type(self).__name__} does not sample: omit {{sampler}} and {{steps}}")
+        how = "samples in its own way only" if self.samples else "does not sample"
+        raise OptionError.naming(f"{type(self).__name__} {how}: omit {{sampler}} and {{steps}}")
 
     def has_sampler(self, name: str | None) -> bool:
         """Whether :meth:`choose_sampler` takes this name; a model that samples is asked for registered ones."""

@@ -177,6 +177,10 @@ class DiffPoseTalk(ParametricModel):
             dropout=dropout,
         )
 
+    def has_sampler(self, name: str | None) -> bool:
+        """No registered one: its windows are denoised in the authors' way."""
+        return False
+
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
         """Follow speech (``audio``) or ``style`` by other scales.
 
