@@ -142,7 +142,8 @@ def test_preview_with_two_processes(tiny: Tiny, tiny_root: Path, tmp_path: Path)
     words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--data.batch_size=2"]
     words += ["--model.dim=16", "--model.diffusion_steps=20", "--model.sampler.steps=2"]
     # So that a few steps move the weights, and the pictures of averaged and latest ones differ.
-    words += ["--model.motion_space=vertices", "--model.warmup_steps=0", "--model.learning_rate=3e-3"]
+    words += ["--model.motion_space=vertices", "--model.timestep_sampling=uniform"]
+    words += ["--model.warmup_steps=0", "--model.learning_rate=3e-3"]
     done = subprocess.run(
         [sys.executable, "-m", "facediff", "fit", *words],
         capture_output=True,
@@ -350,7 +351,11 @@ def test_preview_of_the_last_bundled_config_counts(tiny_root: Path, tmp_path: Pa
     words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/preview.yaml"]
     words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.dim=16", "--trainer.max_steps=1"]
     words += ["--model.diffusion_steps=20", "--model.sampler.steps=2", "--trainer.log_every_n_steps=1"]
-    words += ["--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false"]
+    words += [
+        "--model.motion_space.prior_frames=5",
+        "--trainer.limit_val_batches=0",
+        "--trainer.enable_progress_bar=false",
+    ]
     assert main(["fit", *words, f"--trainer.logger.save_dir={tmp_path}"]) == 0
     sheets = list((tmp_path / "puppet/version_0/previews").glob("*/*.png"))
     assert sorted(path.stem for path in sheets) == CLIPS  # the trainer's config alone draws one

@@ -105,7 +105,8 @@ def test_train_person_leaves_the_rest_alone(checkpoint: Path, tmp_path: Path) ->
     words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--train", "person"]
     assert main(["adapt", *words, *FAST]) == 0
     before, after = load_model(checkpoint).state_dict(), load_model(path).state_dict()
-    personal = ("network.identity_encoder", "network.mesh_encoder", "network.style_encoder", "network.style_tokens")
+    parts = ("identity_encoder", "mesh_encoder", "style_encoder", "style_tokens", "speech_style")
+    personal = tuple(f"network.{part}" for part in parts)
     moved = {name for name in before if before[name].shape == after[name].shape}
     moved = {name for name in moved if not torch.equal(before[name], after[name])}
     assert moved
@@ -215,7 +216,7 @@ def test_a_persons_folder_is_learnt_by_name(checkpoint: Path, tiny_root: Path, t
     model = load_model(first)
     assert model.identities == ["Maria", "A", "B"]
     assert "Maria" in model.assets.templates
-    assert model.default_style("Maria").clip.startswith("Maria_")
+    assert model.assets.references["Maria"].clip.startswith("Maria_")
     words = ["--trainer.accelerator=cpu", f"--trainer.logger.save_dir={tmp_path}"]
     assert main(["test", "--ckpt_path", str(first), *words]) == 0
     (table,) = tmp_path.rglob("test_sequences.csv")

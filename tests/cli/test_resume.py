@@ -184,7 +184,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_checkpoint(
 def test_a_run_that_another_process_trains_is_left_alone(
     fit: Fit, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "small" / "version_7"
+    run = tmp_path / "puppet" / "version_7"
     shutil.copytree(whole, run)
     place = [f"--trainer.logger.save_dir={tmp_path}", "--trainer.logger.version=7"]
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
@@ -202,9 +202,9 @@ def test_a_run_that_another_process_trains_is_left_alone(
 
     monkeypatch.setattr(runs, "locked", taken)
     assert fit("--trainer.max_steps=1", place[0]) == 0
-    assert files(tmp_path / "small" / "version_8") == []
-    assert LOCK not in files(tmp_path / "small" / "version_9")
-    assert (tmp_path / "small" / "version_9" / "checkpoints" / "last.ckpt").is_file()
+    assert files(tmp_path / "puppet" / "version_8") == []
+    assert LOCK not in files(tmp_path / "puppet" / "version_9")
+    assert (tmp_path / "puppet" / "version_9" / "checkpoints" / "last.ckpt").is_file()
 
 
 def test_an_unwritable_place_is_one_sentence(fit: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
