@@ -351,11 +351,8 @@ def test_preview_of_the_last_bundled_config_counts(tiny_root: Path, tmp_path: Pa
     words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/preview.yaml"]
     words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.dim=16", "--trainer.max_steps=1"]
     words += ["--model.diffusion_steps=20", "--model.sampler.steps=2", "--trainer.log_every_n_steps=1"]
-    words += [
-        "--model.motion_space.prior_frames=5",
-        "--trainer.limit_val_batches=0",
-        "--trainer.enable_progress_bar=false",
-    ]
+    words += ["--model.motion_space.prior_frames=5"]  # clips of the miniature corpus are short
+    words += ["--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false"]
     assert main(["fit", *words, f"--trainer.logger.save_dir={tmp_path}"]) == 0
     sheets = list((tmp_path / "puppet/version_0/previews").glob("*/*.png"))
     assert sorted(path.stem for path in sheets) == CLIPS  # the trainer's config alone draws one

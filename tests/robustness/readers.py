@@ -959,6 +959,170 @@ def _output_to(stream: object) -> object:
     return redirect_stdout(stream)
 
 
+@functools.cache
+def surface_folder() -> Path:
+    """A textured .obj with its materials and a picture."""
+    from PIL import Image
+
+    folder = new_folder()
+    mesh(folder / "face.obj")
+    points = [line for line in (folder / "face.obj").read_text().splitlines() if line.startswith("v ")]
+    corners = ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in FACES]
+    uvs = [f"vt {i / VERTICES} {i % 2}" for i in range(VERTICES)]
+    lines = ["mtllib face.mtl", *points, *uvs, "usemtl skin", *corners[:4], "usemtl cloth", *corners[4:]]
+    (folder / "face.obj").write_text("\n".join(lines) + "\n")
+    (folder / "face.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd skin.png\nnewmtl cloth\nKd 0.2 0.4 0.6\n")
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "skin.png")
+    return folder
+
+
+def surface(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of a textured .obj, and reads its surface with it."""
+
+    def read(folder: Path) -> object:
+        from facediff.mesh import read_mesh
+        from facediff.mesh.obj_surface import read_surface
+
+        surface = read_surface(folder / "face.obj", len(read_mesh(folder / "face.obj").faces))
+        return [material.picture_bytes() for material in surface.materials]
+
+    return one_of(surface_folder, name, read)
+
+
+@functools.cache
+def audio2face_folder() -> Path:
+    """A network of Audio2Face-3D with all that its folder holds."""
+    from tests.fakes.audio2face import write_audio2face
+
+    folder = new_folder()
+    write_audio2face(folder)
+    return folder
+
+
+def audio2face(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of a folder of Audio2Face-3D, and reads the folder with it."""
+
+    def read(folder: Path) -> object:
+        from facediff.runtime.audio2face_folder import read_audio2face
+
+        return read_audio2face(folder)
+
+    return one_of(audio2face_folder, name, read)
+
+
+@functools.cache
+def diffposetalk_folder() -> Path:
+    """The two files of DiffPoseTalk, as its authors write them."""
+    from tests.fakes.published_parameters import write_diffposetalk
+
+    folder = new_folder()
+    write_diffposetalk(folder, head=True)
+    return folder
+
+
+def diffposetalk(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
+    """Writes one file of DiffPoseTalk, and imports the method with it."""
+
+    def read(folder: Path) -> object:
+        from facediff.models import import_checkpoint
+        from tests.fakes.published import AUDIO_CONFIG
+        from tests.fakes.published_parameters import SHAPE, statistics
+
+        files, shape = sorted(folder.glob("*.pt"))[::-1], np.zeros(SHAPE, np.float32)
+        options = {"audio_config": AUDIO_CONFIG, "statistics": statistics(), "templates": {"A": shape}}
+        return import_checkpoint(files, **options)
+
+    return one_of(diffposetalk_folder, name, read)
+
+
+def read_recorded_style(path: Path) -> object:
+    """Motion in parameters as a style."""
+    from facediff.animation.parameter_styles import recorded_parameters
+
+    return recorded_parameters(str(path), 30.0)
+
+
+def read_conversation(path: Path) -> object:
+    """The partner's motion of a clip."""
+    from facediff.data.conversations import conversation_file
+
+    (path.parent / "partner").mkdir(exist_ok=True)
+    shutil.copy(path, path.parent / "partner" / "clip.npy")
+    return conversation_file(path.parent, "partner", "clip")
+
+
+def channel_array(path: Path) -> None:
+    """Channels of a clip as a corpus stores them."""
+    np.save(path, np.random.default_rng(0).random((4, 52)).astype(np.float32))
+
+
+def read_channel_array(path: Path) -> object:
+    """The same."""
+    from facediff.data.storage import ChannelFolder
+    from facediff.spaces import layout
+
+    folder = ChannelFolder(path.parent, layout("arkit"))
+    folder.path_of("clip").parent.mkdir(exist_ok=True)
+    shutil.copy(path, folder.path_of("clip"))
+    motion = folder.open("clip")
+    return motion.offsets(range(motion.frames), np.zeros((52, 1), np.float32))
+
+
+def gaze_array(path: Path) -> None:
+    """Where the eyes of a clip of the built-in corpus look."""
+    np.save(path, np.random.default_rng(0).random((4, 2)).astype(np.float32))
+
+
+def read_puppet_channels(path: Path) -> object:
+    """Channels of a clip of the built-in corpus, of three files."""
+    from facediff.data.puppet import SHAPES, PuppetChannels, channel_space
+
+    folder = PuppetChannels(path.parent, channel_space())
+    for name, width in ((folder.folder, len(SHAPES)), ("head_npy", 3)):
+        (path.parent / name).mkdir(exist_ok=True)
+        np.save(path.parent / name / "clip.npy", np.zeros((4, width), np.float32))
+    (path.parent / "gaze_npy").mkdir(exist_ok=True)
+    shutil.copy(path, path.parent / "gaze_npy" / "clip.npy")
+    return folder.values("clip")
+
+
+def read_a_released_array(path: Path) -> object:
+    """Neutral faces of UniTalker's data release."""
+    from facediff.models.published.unitalker_checkpoints import released_array
+
+    return released_array(path.parent, ".", path.name, (None, 52))
+
+
+def released_components(path: Path) -> None:
+    """Mean and components of a data set of UniTalker's release."""
+    mean, basis = np.zeros(12, np.float32), np.ones((3, 12), np.float32)
+    np.savez(path, original_data_mean=mean, components_to_data=basis, data_components_mean=np.zeros(3))
+
+
+def read_released_components(path: Path) -> object:
+    """The same."""
+    from facediff.models.published.unitalker_checkpoints import ReleasedData, components_of
+
+    shutil.copy(path, path.parent / "pca.npz")
+    released = mock.create_autospec(ReleasedData, instance=True, folder=".", width=12)
+    return components_of(path.parent, released, 2)
+
+
+def read_whether_it_may_have_weights(path: Path) -> object:
+    """Whether an exported folder animates weights, by its description alone."""
+    from facediff.utils.hub import may_have_weights
+
+    shutil.copy(path, path.parent / "model.json")
+    return may_have_weights(path.parent)
+
+
+def read_whether_it_has_values(path: Path) -> object:
+    """Whether an archive has channels."""
+    from facediff.animation.files import has_values
+
+    return has_values(path)
+
+
 READERS = {
     "plan": Reader(".yaml", plan, read_plan),
     "benchmark, plan": Reader(".json", benchmark_plan, read_a_benchmark_plan),
@@ -982,6 +1146,28 @@ READERS = {
     "parameters, BEAT": Reader(".json", recorded("arkit"), read_recorded),
     "parameters, npy": Reader(".npy", recorded("flame_diffposetalk"), read_recorded),
     "parameters, npz": Reader(".npz", recorded("flame_diffposetalk"), read_recorded),
+    "parameters, a clip of the built-in corpus": Reader(".npy", gaze_array, read_puppet_channels, 0.3),
+    "unitalker, faces": Reader(".npy", channel_array, read_a_released_array, 0.3),
+    "unitalker, components": Reader(".npz", released_components, read_released_components, 0.3),
+    "exported model, at a glance": Reader(".json", exported_model, read_whether_it_may_have_weights, 0.3),
+    "parameters, a style": Reader(".csv", recorded("live_link"), read_recorded_style, 0.5),
+    "parameters, a clip of a corpus": Reader(".npy", channel_array, read_channel_array, 0.5),
+    "conversation": Reader(".npy", channel_array, read_conversation, 0.5),
+    **{
+        f"surface, {name}": Reader(Path(name).suffix, *surface(name), 0.5)
+        for name in ("face.obj", "face.mtl", "skin.png")
+    },
+    **{
+        f"audio2face, {name}": Reader(Path(name).suffix, *audio2face(name), 0.3)
+        for name in (
+            *("bs_skin.npz", "bs_skin_config.json", "implicit_emo_db.npz", "model.json"),
+            *("model_config_Nobody.json", "model_data.npz", "network.onnx", "network_info.json"),
+        )
+    },
+    **{
+        f"diffposetalk, {name}": Reader(".pt", *diffposetalk(name), 0.2)
+        for name in ("iter_0110000.pt", "iter_0026000.pt")
+    },
     "parts of a mesh, obj": Reader(".obj", mesh, read_parts),
     "mesh that an animation is added to, glb": Reader(".glb", targets, add_motion),
     "eyes": Reader(".json", eyes, read_the_eyes),
@@ -989,6 +1175,7 @@ READERS = {
     "eyes, arrays": Reader(".npz", eyes_arrays, read_the_eyes),
     **{f"direction, {suffix}": Reader(f".{suffix}", direction, read_the_direction) for suffix in ("json", "csv")},
     "animation": Reader(".npz", animation, read_an_animation),
+    "animation, its channels": Reader(".npz", animation, read_whether_it_has_values, 0.5),
     "style, archive": Reader(".npz", animation, read_a_style),
     "style, array": Reader(".npy", vertices, read_a_style),
     "correspondence": Reader(".npz", correspondence, read_correspondence),
