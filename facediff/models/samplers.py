@@ -263,7 +263,7 @@ def ended_earlier(first_noise: float, last_noise: float, share: float) -> float:
         last_noise: at which the usual number of steps ends.
         share: of the usual number of steps.
 
-    >>> [round(ended_earlier(2000, 10, steps / 10)) for steps in (2, 3, 5, 10, 20)]
+    >>> [round(ended_earlier(2000.0, 10.0, steps / 10)) for steps in (2, 3, 5, 10, 20)]
     [187, 110, 47, 10, 10]
     """
     return float(first_noise * (last_noise / first_noise) ** math.sqrt(min(1.0, share)))

@@ -58,7 +58,7 @@ def run(path: Path, kernel: KernelManager, folder: Path) -> NotebookNode:
         runner.kc.stop_channels()  # the client of a kernel that is used on leaves them open
 
 
-QUICK = ("first_animation", "score_anybodys_files")
+QUICK = ("score_anybodys_files",)
 """The others repeat their steps with a component and with formats that have tests of their own."""
 
 

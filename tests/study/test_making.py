@@ -97,6 +97,7 @@ def test_each_side_shows_what_the_key_says_and_the_sound_is_the_clips(place: Pat
     assert frames(place / "study" / "page" / "videos" / reference).shape[2] == 64
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_study_and_what_is_there_is_kept(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -202,7 +202,13 @@ class Frame:
             BrowserError: if it is not in time.
         """
         end = time.monotonic() + timeout
-        while not self.evaluate(f"Boolean({condition})"):
+        while True:
+            try:
+                if self.evaluate(f"Boolean({condition})"):
+                    return
+            except BrowserError as error:
+                if "target navigated" not in str(error):  # between two pages there is none to be asked
+                    raise
             if time.monotonic() > end:
                 raise BrowserError(f"not in {timeout:g} s: {condition}; {self.problems[:3]}")
             time.sleep(0.03)

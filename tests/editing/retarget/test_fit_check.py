@@ -34,7 +34,7 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
     return carry(animation, found, Mesh(head.vertices, head.faces.astype(np.int32))), found
 
 
-QUICK = ("slit mask", "few triangles")
+QUICK = ("slit mask",)
 EYES_REST = ("mask", "scan", "painted eyes", "decimated head", "few triangles")
 """Heads whose eyes are one skin, or whose lids have too few triangles to meet without a hole."""
 RAGGED = ("re-meshed head",)

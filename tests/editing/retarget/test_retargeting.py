@@ -137,6 +137,7 @@ def test_without_a_similarity_the_error_would_be_seen(
     assert error(wrong, far_copy[2]) > 5 * LIMIT
 
 
+@pytest.mark.slow
 def test_a_permuted_copy_is_found_vertex_by_vertex(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
     vertices, triangles, truth = reordered(rig.neutral, faces, motion)
     found = correspond(rig.neutral, faces, vertices, triangles)
