@@ -250,6 +250,10 @@ def visited(
     return chosen
 
 
+MANY_STEPS = 10
+"""So many steps go to the last noise, whatever number a model is used to: the rule below is of sweeps up to it."""
+
+
 def ended_earlier(first_noise: float, last_noise: float, share: float) -> float:
     """The noise at which a path of fewer steps ends best.
 
@@ -261,12 +265,14 @@ def ended_earlier(first_noise: float, last_noise: float, share: float) -> float:
     Args:
         first_noise: from which steps are spread evenly in ln SNR.
         last_noise: at which the usual number of steps ends.
-        share: of the usual number of steps.
+        share: of the steps that go to the last noise.
 
     >>> [round(ended_earlier(2000.0, 10.0, steps / 10)) for steps in (2, 3, 5, 10, 20)]
     [187, 110, 47, 10, 10]
     """
-    return float(first_noise * (last_noise / first_noise) ** math.sqrt(min(1.0, share)))
+    if share >= 1:
+        return last_noise
+    return float(first_noise * (last_noise / first_noise) ** math.sqrt(max(0.0, share)))
 
 
 PART = 2**21

@@ -46,6 +46,7 @@ from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import ComponentMeshEncoder, LinearMeshEncoder, MeshEncoderFactory
 from facediff.models.motion_space import ComponentMotion, MotionSpaceFactory, Preconditioning, Projection, VertexMotion
 from facediff.models.samplers import (
+    MANY_STEPS,
     DpmSolverSampler,
     NoiseProcess,
     NoiseSource,
@@ -357,26 +358,29 @@ class DualPathDiffusion(AnimationModel):
         """Sample in another way from now on; checkpoints keep the sampler that the model was made with.
 
         A sampler chosen by name keeps the spacing and the last noise that the model was made with, where as many steps
-        have that much noise; its other options are its own. With fewer steps than the model was made with, the last is
-        at more noise (:func:`~facediff.models.samplers.ended_earlier`).
+        have that much noise; its other options are its own. Where both ends of the path are set, as ``first_noise``
+        and ``last_noise``, fewer steps end at more noise (:func:`~facediff.models.samplers.ended_earlier`).
         """
         chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
-        options = dict(self.hparams["sampler"]["init_args"])
-        more: dict[str, Any] = {} if steps is None else {"steps": steps}
+        made: dict[str, Any] = self.hparams["sampler"]["init_args"]
+        options = dict(made if self._sampler_options is None else self._sampler_options)
         if name is not None:
-            shared = {"spacing", "last_noise", "first_noise"} & options.keys() & registry.defaults(chosen).keys()
-            options = {key: options[key] for key in sorted(shared)}
-        if steps is not None and options.get("first_noise") and options.get("last_noise"):
-            more["last_noise"] = ended_earlier(options["first_noise"], options["last_noise"], steps / self._usual_steps)
+            shared = {"spacing", "last_noise", "first_noise"} & made.keys() & registry.defaults(chosen).keys()
+            options = {key: made[key] for key in sorted(shared)}
+        options |= {} if steps is None else {"steps": steps}
+        count = options.get("steps", registry.defaults(chosen).get("steps"))
+        if count is not None and options.get("first_noise") and options.get("last_noise"):
+            share = count / min(self._usual_steps, MANY_STEPS)
+            options["last_noise"] = ended_earlier(made["first_noise"], made["last_noise"], share)
         try:
-            self.sampler = chosen(process=self.process, **options | more)
+            self.sampler = chosen(process=self.process, **options)
         except ArgumentError:
             if name is None:
                 raise
             # A thousand steps of ddpm go to the clean end: fewer of the process have the last noise of ten.
-            options, more = {}, {} if steps is None else {"steps": steps}
-            self.sampler = chosen(process=self.process, **more)
-        self._sampler_options = options | more
+            options = {} if steps is None else {"steps": steps}
+            self.sampler = chosen(process=self.process, **options)
+        self._sampler_options = options
 
     def choose_low_latency(self) -> None:
         """Frame by frame, and in :attr:`low_latency_steps` denoising steps of the present sampler at most."""
