@@ -120,9 +120,9 @@ class DistillationBatch(NamedTuple):
         student_input: the same speech, augmented, or a part of it with silence after it (batch, samples).
         start: the teacher's step at which the student's input begins.
         steps: of the student's input.
-        compared: the student's steps that are compared, as first and last of each clip (batch, 2); the last is the
-            one after them.
-        mean: of each clip's speech as far as the student hears it; None where it hears all of it.
+        compared: the student's steps that are compared, as the first of each clip and the one after the last
+            (batch, 2).
+        mean: of each clip's speech as far as the student hears it; None without low latency.
         deviation: standard deviation of the same speech.
     """
 
@@ -178,7 +178,8 @@ def distil_audio_encoder(
     teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
     with model.choosing():
-        model.choose_low_latency()
+        if options.low_latency:
+            model.choose_low_latency()
         windows = model.windows
     pairs = SpeechPairs(data, Augmenter(augmentations), options, windows)
     workers = min(options.workers, processors() - 1)
@@ -316,17 +317,18 @@ class SpeechPairs(Dataset[DistillationBatch]):
         if random.random() < self.options.whole:
             return Piece(speech[: steps * size], 0, steps, (0, steps), *_level(speech.astype(np.float64)))
         after, ahead = (round(seconds * STEP_RATE) for seconds in (windows.after, windows.ahead))
+        silent = max(0, ahead - after)
         end = int(random.integers(min(steps, after + 2), steps + 1))
         shortest, longest = (round(seconds * STEP_RATE) for seconds in LOW_LATENCY_WINDOW)
         start = max(0, end - int(random.integers(shortest, longest + 1)))
         mean, deviation = _level(speech[: end * size].astype(np.float64))
         # At the mean, which is silence once it is standardised, as in a stream.
-        heard = np.pad(speech[start * size : end * size], (0, ahead * size), constant_values=mean)
+        heard = np.pad(speech[start * size : end * size], (0, silent * size), constant_values=mean)
         # More than half a second before the frame, steps have enough context already, and would drown the error of the
         # hard ones. Where nothing is animated ahead, those within the look-ahead are context only.
         frame = end - after - start
-        last = min(steps, end + ahead) - start if ahead else frame
-        return Piece(heard, start, end - start + ahead, (max(0, frame - STEP_RATE // 2), last), mean, deviation)
+        last = min(steps, end + silent) - start if ahead else frame
+        return Piece(heard, start, end - start + silent, (max(0, frame - STEP_RATE // 2), last), mean, deviation)
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
         """A clip or a piece of further speech, or a random window of it."""

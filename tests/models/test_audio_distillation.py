@@ -164,7 +164,7 @@ def test_a_student_hears_what_a_window_hears(tiny: Tiny, whole: float, windows: 
         assert batch.deviation is not None
         rows = zip(*(each.tolist() for each in (batch.start, batch.steps, batch.compared, batch.lengths)), strict=True)
         for row, (start, steps, (first, last), length) in enumerate(rows):
-            heard = steps if whole else steps - ahead
+            heard = steps if whole else steps - max(0, ahead - after)
             clip, student = batch.clean[row, :length].numpy(), batch.student_input[row].numpy()
             so_far = clip[: (start + heard) * 320]
             np.testing.assert_array_equal(student[: heard * 320], so_far[start * 320 :])
@@ -190,8 +190,8 @@ def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tin
         found = []
         for each, whole in zip(speech, wanted, strict=True):
             for frames in (6, 9, 12, 15):
-                heard, end = each[: 640 * frames], min(frames + 12, len(whole))
-                silent = np.pad(heard, (0, 640 * 12), constant_values=heard.mean())
+                heard, end = each[: 640 * frames], min(frames + 10, len(whole))
+                silent = np.pad(heard, (0, 640 * 10), constant_values=heard.mean())
                 count = torch.tensor([len(silent)])
                 level = model.speech_encoder.at_level(float(heard.mean()), float(heard.std()))
                 with torch.inference_mode(), level:
