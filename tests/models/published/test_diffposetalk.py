@@ -156,6 +156,7 @@ def test_stream_hears_at_the_level_of_the_speech_so_far(tmp_path: Path) -> None:
 def test_chosen_windows_are_followed(tmp_path: Path) -> None:
     model = imported(tmp_path)
     assert type(model.stream(identity="A")).__name__ == "WindowStream"
+    assert not model.has_sampler("dpm_solver")
     model.choose_low_latency()
     assert type(model.stream(identity="A")).__name__ == "SpeechStream"
 
