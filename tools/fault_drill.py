@@ -1077,7 +1077,7 @@ def drill_on(drill: Drill, inputs: Path, scratch: Path, disk: Disk, args: argpar
         score = scores[fault] = Score()
         index = 0
         # A strike that comes after the end is none; but a command may be too short to be struck so often.
-        while (score.struck if fault == "kill" else index) < wanted[fault] and index < 3 * wanted[fault]:
+        while (score.struck if fault in ("kill", "stop") else index) < wanted[fault] and index < 3 * wanted[fault]:
             index += 1
             try:
                 if fault in ("kill", "stop"):
