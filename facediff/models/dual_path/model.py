@@ -362,16 +362,16 @@ class DualPathDiffusion(AnimationModel):
         and ``last_noise``, fewer steps end at more noise (:func:`~facediff.models.samplers.ended_earlier`).
         """
         chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
-        made: dict[str, Any] = self.hparams["sampler"]["init_args"]
-        options = dict(made if self._sampler_options is None else self._sampler_options)
+        first: dict[str, Any] = self.hparams["sampler"]["init_args"]
+        options = dict(first if self._sampler_options is None else self._sampler_options)
         if name is not None:
-            shared = {"spacing", "last_noise", "first_noise"} & made.keys() & registry.defaults(chosen).keys()
-            options = {key: made[key] for key in sorted(shared)}
+            shared = {"spacing", "last_noise", "first_noise"} & first.keys() & registry.defaults(chosen).keys()
+            options = {key: first[key] for key in sorted(shared)}
         options |= {} if steps is None else {"steps": steps}
         count = options.get("steps", registry.defaults(chosen).get("steps"))
         if count is not None and options.get("first_noise") and options.get("last_noise"):
             share = count / min(self._usual_steps, MANY_STEPS)
-            options["last_noise"] = ended_earlier(made["first_noise"], made["last_noise"], share)
+            options["last_noise"] = ended_earlier(first["first_noise"], first["last_noise"], share)
         try:
             self.sampler = chosen(process=self.process, **options)
         except ArgumentError:
