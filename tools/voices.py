@@ -9,6 +9,7 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
   share with the closures moved to every other time of the clip. *Within 1 mm* and *gap*: how far the lips' pairs are
   apart at their nearest in a closure, compared with the neutral face, in mm.
 - *kept out*: the clips of test C, whose voices nobody is trained with, by voice.
+- *people kept out*: all test sentences by voices of people that nobody is trained with, as far as they are installed.
 - *pauses*: two sentences with 1 s of silence before, between and after them. How far the lips are open in the pauses,
   from 0.3 s after speech to 0.2 s before it, how far a lip vertex moves from a frame to the next, and the lip vertex
   error of the first 0.2 s of speech, which a gate that opens late would raise.
@@ -23,7 +24,9 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from functools import lru_cache
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +39,10 @@ from scipy.signal import butter, fftconvolve, lfilter, sosfilt
 import facediff
 from facediff.data import Puppet, Sample
 from facediff.speech.audio import fit_length
-from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
-from facediff.synthetic.voices import Flite
+from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
+from facediff.synthetic.cast import KEPT_OUT_PEOPLE
+from facediff.synthetic.sentences import TEST
+from facediff.synthetic.voices import Flite, installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic
 from facediff.utils.tables import print_table
@@ -328,6 +333,18 @@ class Bench:
         still = [self.squared_error(each.template.double().numpy()[None] * 1000, self.truth(each)) for each in samples]
         return {**_closed(closures, chances, gaps), "LVE / still": float(errors.mean() / np.concatenate(still).mean())}
 
+    def person(self, voice: str) -> dict[str, float]:
+        """Closures of all test sentences in a voice without clips; faces and styles of test A take turns."""
+        speaker, gaps = open_voice(voice), []
+        for text, sample in zip(TEST, cycle(self.samples["test_a"][::3]), strict=False):
+            said = speaker.speak(text)
+            opened = self.opening(self.animate(0.6 * said.samples / np.abs(said.samples).max(), sample))
+            rest = self.opening(sample.template.double().numpy()[None] * 1000)
+            times = closures((TimedPhoneme(*astuple(each)) for each in said.phonemes), self.model.frame_rate)
+            gaps += [float((opened[start:end] - rest).min()) for start, end in times if end <= len(opened)]
+        found = np.array(gaps)
+        return {"within 1 mm": float((found < 1).mean()), "gap": float(np.median(found)), "closures": len(found)}
+
     def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
         """Of each closure: whether the lips close, by chance, and the gap in mm; of each frame: the squared error."""
         hits, chances, gaps, errors = [], [], [], []
@@ -419,6 +436,11 @@ def show(title: str, scores: dict[str, dict[str, float]]) -> None:
     print()
 
 
+def _installed(voice: str) -> bool:
+    program, _, name = voice.partition(":")
+    return name in installed_voices().get(program, [])
+
+
 def measured(
     checkpoint: Path, options: dict[str, Any], clips: int | None = None, only: str = "", root: str | None = None
 ) -> dict[str, Any]:
@@ -434,13 +456,15 @@ def measured(
     bench = Bench(checkpoint, options, clips, root)
     strangers = dict.fromkeys(clip.attributes["voice"] for clip in bench.data.clips("test_c"))
     found: dict[str, Any] = {}
-    for title, rows, measure in (
+    tables: tuple[tuple[str, dict[str, Any], Callable[[Any], dict[str, float]]], ...] = (
         ("voices", VOICES, bench.voice),
         ("kept out", {voice: voice for voice in strangers}, bench.kept_out),
+        ("people kept out", {voice: voice for voice in KEPT_OUT_PEOPLE if _installed(voice)}, bench.person),
         ("pauses, mm", PAUSES, bench.pause),
         ("nobody speaks, mm", NOTHING, bench.nothing),
-    ):
-        scores = {name: measure(change) for name, change in rows.items() if only in f"{title}: {name}"}  # type: ignore[operator]
+    )
+    for title, rows, measure in tables:
+        scores = {name: measure(change) for name, change in rows.items() if only in f"{title}: {name}"}
         if not scores:
             continue
         if title == "voices" and len(scores) == len(rows):

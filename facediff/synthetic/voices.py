@@ -8,11 +8,12 @@ is spoken, which no recogniser has to guess. Where one is missing, its voices sa
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -155,6 +156,21 @@ CMU_PHONES = {
     },
 }
 
+# Those of Festival's phone sets that are no symbols of that alphabet; figures at the end mark stress.
+_PHONES = {
+    "radio": CMU_PHONES,
+    "italian": {
+        **{"E": "ɛ", "O": "ɔ", "S": "ʃ", "Z": "ʒ", "tS": "tʃ", "dZ": "dʒ", "J": "ɲ", "L": "ʎ", "ng": "ŋ", "nf": "ɱ"},
+    },
+    "upc_catalan-central": {"ax": "ə", "E": "ɛ", "O": "ɔ", "S": "ʃ", "Z": "ʒ", "J": "ɲ", "L": "ʎ", "rr": "r", "r": "ɾ"},
+    "finnish": {"@": "æ", "7": "ø", "&": "ə", "T": "θ", "D": "ð", "S": "ʃ", "Z": "ʒ", "N": "ŋ", "L": "ʎ"},
+    "czech": {
+        **{"c": "ts", "c~": "tʃ", "ch": "x", "d~": "ɟ", "dz~": "dʒ", "h": "ɦ", "n*": "ŋ", "n~": "ɲ", "r~": "r"},
+        **{"r~*": "r", "s~": "ʃ", "t~": "c", "z~": "ʒ", "_": "ʔ"},
+    },
+}
+_PAUSES = {"pau", "#", "##"}
+
 
 @puppet_voice.register("flite")
 class Flite(Synthesiser):
@@ -185,14 +201,24 @@ class Flite(Synthesiser):
 
 @puppet_voice.register("festival")
 class Festival(Synthesiser):
-    """Festival: diphone voices of people in several languages, one package each (festvox-…)."""
+    """Festival: voices of people in several languages, one package each (festvox-…).
+
+    A voice reads English by the rules of its own language, which does no harm: what is said is what Festival says was.
+    """
 
     install = "install the packages festival and festvox-kallpc16k (apt install festival festvox-kallpc16k)"
 
     @classmethod
     def voices(cls) -> list[str]:
-        """Festival's voices, one package each."""
-        return sorted(_listed("festival", "-b", "(print (voice.list))").strip().strip("()").split())
+        """Festival's voices whose phones are known."""
+        return sorted(cls._phone_sets())
+
+    @staticmethod
+    def _phone_sets() -> dict[str, str]:
+        """The phone set of each voice."""
+        asked = "(mapcar (lambda (v) (voice.select v) (print (cons v (PhoneSet.description '(name))))) (voice.list))"
+        pairs = re.findall(r"\((\S+) \(name (\S+?)\)\)", _listed("festival", "-b", asked))
+        return {voice: phones for voice, phones in pairs if phones in _PHONES}
 
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
         """Speak a sentence."""
@@ -206,7 +232,8 @@ class Festival(Synthesiser):
             )
             _run(["festival", "-b", program])
             rows = [line.split() for line in labels.read_text().splitlines() if len(line.split()) == 3]
-            return _utterance(sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}")
+            phones = _PHONES[self._phone_sets()[self.voice]]
+            return _utterance(sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}", phones)
 
 
 @lru_cache
@@ -238,7 +265,9 @@ def _run(command: Sequence[str]) -> str:
     return done.stdout
 
 
-def _utterance(sound: Path, ends: Iterable[tuple[str, float]], voice: str) -> Utterance:
+def _utterance(
+    sound: Path, ends: Iterable[tuple[str, float]], voice: str, phones: Mapping[str, str] = CMU_PHONES
+) -> Utterance:
     """A sound file at 16 kHz with its phones, which are given by name and end in seconds."""
     import soundfile
     import soxr
@@ -250,7 +279,8 @@ def _utterance(sound: Path, ends: Iterable[tuple[str, float]], voice: str) -> Ut
     phonemes, start = [], 0.0
     for name, end in ends:
         if end > start:
-            phonemes.append(SpokenPhoneme(start, end, CMU_PHONES.get(name, name)))
+            plain = name.rstrip(":") if name.rstrip(":") in phones else name.rstrip("01:")
+            phonemes.append(SpokenPhoneme(start, end, "" if name in _PAUSES else phones.get(plain, plain)))
         start = max(start, end)
     if not any(phoneme.ipa for phoneme in phonemes):
         raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')

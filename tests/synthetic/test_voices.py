@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +28,30 @@ else:
                    [("pau", 0.1), ("m", 0.2), ("aa", 0.4), ("ch", 0.5), ("pau", 0.6)]))
 """
 
+FESTIVAL = """#!{python}
+import re, sys, wave
+program = sys.argv[2]
+if "voice.list" in program:
+    print("(lp_diphone (name italian))\\n(suo_fi_lj_diphone (name finnish))\\n(msu_ru (name msu_ru))")
+else:
+    labels, sound = re.findall('"([^"]+[.](?:lab|wav))"', program)
+    phones = ["#", "tS", "E1", "7:", "b", "#"]
+    with open(labels, "w") as out:
+        print("#", *(f"{{0.1 * (i + 1):.4f}} 100 {{name}}" for i, name in enumerate(phones)), sep="\\n", file=out)
+    with wave.open(sound, "wb") as out:
+        out.setnchannels(1); out.setsampwidth(2); out.setframerate(8000)
+        out.writeframes(b"ab" * 4800)
+"""
+
 
 @pytest.fixture
 def flite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    import sys
+    return _program(tmp_path / "bin" / "flite", FLITE, monkeypatch)
 
-    program = tmp_path / "bin" / "flite"
+
+def _program(program: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> Path:
     program.parent.mkdir()
-    program.write_text(FLITE.format(python=sys.executable))
+    program.write_text(text.format(python=sys.executable))
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", str(program.parent))
     return program
@@ -54,6 +71,19 @@ def test_flite_says_when_each_phoneme_is_spoken(flite: Path) -> None:
     ]
     slower = voice.speak("much", Delivery(rate=0.5))
     assert slower.phonemes[-1].end == pytest.approx(1.2)
+
+
+def test_festivals_voices_speak_in_the_phones_of_their_language(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _program(tmp_path / "bin" / "festival", FESTIVAL, monkeypatch)
+    assert installed_voices()["festival"] == ["lp_diphone", "suo_fi_lj_diphone"]  # phones of the third are not known
+    italian, finnish = (
+        open_voice(f"festival:{voice}").speak("ciao").phonemes for voice in ("lp_diphone", "suo_fi_lj_diphone")
+    )
+    assert [phoneme.ipa for phoneme in italian] == ["", "tʃ", "ɛ", "7", "b", ""]
+    assert [phoneme.ipa for phoneme in finnish] == ["", "tS", "E", "ø", "b", ""]
+    assert [phoneme.end for phoneme in italian] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
 
 
 @pytest.mark.parametrize(
