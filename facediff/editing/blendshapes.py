@@ -234,11 +234,15 @@ def own_weights(animation: Animation) -> Weights:
 
 def has_arkit_weights(animation: Animation) -> bool:
     """Whether an animation has weights of ARKit's shapes, or is of the built-in face, which has such shapes."""
+    own = animation.values is not None and animation.space.kind == "arkit"
+    return own or is_built_in_face(len(animation.template), animation.faces)
+
+
+def is_built_in_face(vertices: int, faces: npt.NDArray[np.integer] | None) -> bool:
+    """Whether a mesh of so many vertices with these triangles is one of the built-in faces."""
     from facediff.synthetic.known_faces import edition_of_mesh
 
-    faces = animation.faces
-    built_in = faces is not None and edition_of_mesh(len(animation.template), faces) is not None
-    return built_in or (animation.values is not None and animation.space.kind == "arkit")
+    return faces is not None and edition_of_mesh(vertices, faces) is not None
 
 
 def arkit_weights(animation: Animation) -> Weights:

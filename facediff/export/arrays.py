@@ -84,7 +84,7 @@ class _Weights(Format):
 
 @export_format.register("csv")
 class BlendshapeWeights(_Weights):
-    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for motion in such weights."""
+    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for the built-in face."""
 
     next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
     uses = ("shapes", "tracks", "key_tolerance")
@@ -104,7 +104,7 @@ class BlendshapeWeights(_Weights):
 
 @export_format.register("json")
 class BeatWeights(_Weights):
-    """Weights of blendshapes (ARKit) as BEAT writes them; needs --shapes, but for motion in such weights."""
+    """Weights of blendshapes (ARKit) as BEAT writes them; needs --shapes, but for the built-in face."""
 
     next_step = "programs that play BEAT's faces read it; head and eyes' rotations are not in it"
     uses = ("shapes",)
@@ -121,12 +121,12 @@ class BeatWeights(_Weights):
 
 
 def _arkit_weights(animation: Animation, options: ExportOptions) -> Weights:
-    """The animation's own weights, or those of the shapes that the options name."""
+    """The animation's own weights, or those of the shapes that the options name, on the built-in face of its own."""
     from facediff.editing.blendshapes import SolveOptions, own_weights, solve
-    from facediff.editing.shapes import read_shapes
+    from facediff.editing.shapes import BUILT_IN, read_shapes
 
-    if options.shapes is None:  # checked by check_export
+    if options.shapes is None and animation.space.kind == "arkit":
         return own_weights(animation)
     # Only ARKit's: others would take motion that the file then lacks
-    shapes = read_shapes(Path(options.shapes), animation.template, animation.unit).only(ARKIT)
+    shapes = read_shapes(Path(options.shapes or BUILT_IN), animation.template, animation.unit).only(ARKIT)
     return solve(animation, shapes, SolveOptions())

@@ -184,8 +184,10 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
 
 
 def have_weights(animations: Sequence[Animation]) -> bool:
-    """Whether animations have weights of ARKit's shapes by themselves, which need not be solved for."""
-    return all(animation.space.kind == "arkit" for animation in animations)
+    """Whether animations have weights of ARKit's shapes, or are of the built-in face, which has such shapes."""
+    from facediff.editing.blendshapes import has_arkit_weights
+
+    return all(map(has_arkit_weights, animations))
 
 
 def check_used(suffix: str, option_names: Collection[str]) -> None:

@@ -191,8 +191,13 @@ class AnimationPipeline(ABC):
 
     @property
     def has_weights(self) -> bool:
-        """Whether animations have weights of ARKit's shapes by themselves."""
-        return self.decoder is not None and self.decoder.space.kind == "arkit"
+        """Whether animations have weights of ARKit's shapes, or are of the built-in face, which has such shapes."""
+        if self.decoder is not None and self.decoder.space.kind == "arkit":
+            return True
+        from facediff.editing.blendshapes import is_built_in_face
+
+        faces = self.facts.get("faces")
+        return self.options.target_mesh is None and is_built_in_face(len(self.facts["template"]), faces)
 
     def made_of(self, animation: Animation, points: Array) -> Animation:
         """An animation of the face alone with the channels that its vertices were decoded from; of vertices none."""

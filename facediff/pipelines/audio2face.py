@@ -14,7 +14,7 @@ from facediff.animation.options import AnimationOptions
 from facediff.editing.regularised_weights import Regularisation, RegularisedSolver, TemporalTerm, pairs_of
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline
-from facediff.pipelines.exported import FIXED, style_text
+from facediff.pipelines.exported import FIXED
 from facediff.runtime.audio2face import LICENCE, Array, Audio2Face, FaceAnimator
 from facediff.runtime.audio2face_folder import Poses
 from facediff.spaces import Rotation, Space
@@ -146,7 +146,7 @@ class Audio2FacePipeline(AnimationPipeline):
         for name in ("identity", "condition"):
             if getattr(options, name) not in (None, self.actor):
                 raise OptionError(name, f"the folder has one face, {self.actor}; omit it", getattr(options, name))
-        text = style_text(options)
+        text = _style_text(options)
         self.emotion = {} if text is None else emotions_of(text)
         self.model.emotion(self.emotion)  # refuses what the model does not know
         self._animated: list[dict[str, Array]] = []
@@ -353,3 +353,13 @@ def emotions_of(text: str) -> dict[str, float]:
         except ValueError as error:
             raise OptionError("style", "expected emotions with strengths, such as joy:0.7,pain:0.2", text) from error
     return strengths
+
+
+def _style_text(options: AnimationOptions) -> str | None:
+    """The style as an Audio2Face folder reads it: emotions with their weights."""
+    style = options.style
+    if style is None or isinstance(style, str | Path):
+        return None if style is None else str(style)
+    if isinstance(style, dict):
+        return ",".join(f"{name}:{weight}" for name, weight in style.items())
+    raise FaceDiffError(f"style: is of the type {type(style).__name__}; this model takes emotions with their weights")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from facediff.animation.files import facts_of
 from facediff.animation.options import AnimationOptions
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of
 from facediff.runtime.model import RuntimeModel, RuntimeStream
 
@@ -54,7 +53,7 @@ class ExportedPipeline(AnimationPipeline):
         self._chosen: dict[str, Any] = {
             "identity": options.identity,
             "condition": options.condition,
-            "style": style_text(options),
+            "style": options.style,
             "expressivity": factors.get("all", 1.0),
         }
         stream = self.model.stream(seed=options.seed or 0, **self._chosen)
@@ -100,15 +99,3 @@ class ExportedPipeline(AnimationPipeline):
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
         return {**self._metadata, **({"seed": str(seed)} if "seed" in self._metadata else {})}
-
-
-def style_text(options: AnimationOptions) -> str | None:
-    """The style as an exported model reads it: a name, a file, or several of them with weights."""
-    style = options.style
-    if style is None or isinstance(style, str | Path):
-        return None if style is None else str(style)
-    if isinstance(style, dict):
-        return ",".join(f"{name}:{weight}" for name, weight in style.items())
-    raise FaceDiffError(
-        f"style: is of the type {type(style).__name__}; an exported model takes a name, a file or a mixture of them"
-    )

@@ -18,7 +18,7 @@ from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.folder import Arrays, Description, decoder_of
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, WindowSpeech, clip_motion, window_motion
-from facediff.runtime.styles import RuntimeStyle, encode_style, read_style
+from facediff.runtime.styles import RuntimeStyle, encode_style, style_from
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, MotionWindow, SpeechWindows, WindowPlan
 from facediff.utils.ranges import Expressivity, Seed, mismatch
@@ -162,15 +162,14 @@ class RuntimeModel(ExportedGraphs):
         conditioned_on = chosen if choice.condition is None else choice.condition
         vector = RuntimeStyle(conditioned_on, np.zeros(0, np.float32))
         if about.style_source == "reference":
-            source = chosen if style is None else style
-            vector = read_style(source, self, chosen) if isinstance(source, str) else source
+            vector = style_from(chosen if style is None else style, self, chosen)
             if vector.vector.shape != self.arrays["styles"].shape[1:]:
                 raise OptionError("style", f"{vector.name} is of another model; encode it with this one")
         elif style is not None:
             # The model's identities are its styles, if it has any: the one that it is conditioned on is the style.
             if about.style_source == "none":
                 raise OptionError("style", f"{about.model} knows no speaking styles; omit the option")
-            if style not in about.styles:
+            if str(style) not in about.styles:
                 raise OptionError("style", f'there is no "{style}": {choices(str(style), about.styles)}')
             conditioned_on = str(style)
             vector = RuntimeStyle(conditioned_on, vector.vector)

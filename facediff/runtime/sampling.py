@@ -12,7 +12,6 @@ import numpy.typing as npt
 from facediff.errors import OptionError
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.noise import NumpyClipNoise, NumpyWindowNoise, SeedNoise
-from facediff.runtime.styles import RuntimeStyle
 from facediff.speech.windows import MotionWindow
 from facediff.utils.limits import LIMITS
 
@@ -32,15 +31,14 @@ class RuntimeChoices:
     Attributes:
         identity: whose face and identity; the first one trained on if None.
         condition: the training identity that the model is conditioned on, where it is not that of the face.
-        style: name of a style in the folder, a file or a mixture as ``--style`` takes them, or the result of
-            :meth:`RuntimeModel.encode_style`; that of the face's identity if None.
+        style: what :func:`~facediff.runtime.styles.style_from` takes; that of the face's identity if None.
         seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
         expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
     """
 
     identity: str | None = None
     condition: str | None = None
-    style: str | RuntimeStyle | None = None
+    style: Any = None
     seed: int = 0
     expressivity: float = 1.0
 

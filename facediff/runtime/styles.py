@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import metres_per_unit
+from facediff.animation import Animation, metres_per_unit
 from facediff.animation.parameter_styles import channels_of, recorded_parameters
-from facediff.animation.style_files import FILES, Stillness, frames_of, normalised, open_style, split_styles, stride_of
+from facediff.animation.style_files import (
+    FILES,
+    Stillness,
+    StyleFile,
+    frames_of,
+    normalised,
+    open_style,
+    split_styles,
+    stride_of,
+)
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.graphs import ExportedGraphs
+from facediff.spaces.files import ParameterClip
 
 Array = npt.NDArray[np.float32]
 
@@ -28,6 +39,40 @@ class RuntimeStyle:
 
     name: str
     vector: Array
+
+
+def style_from(given: object, model: ExportedGraphs, identity: str) -> RuntimeStyle:
+    """The style that was given in Python; the model's styles must be those of reference motion.
+
+    Args:
+        given: the words of ``--style``; a path; names or paths with their weights; a motion as an animation, or as an
+            array (T, V, 3) of absolute vertices; a style vector (S,); or what this function has returned.
+        model: the model.
+        identity: whose motion an array holds, where a file's name does not say it.
+
+    Raises:
+        FaceDiffError: if there is no such style, or the motion is of another topology.
+    """
+    if isinstance(given, RuntimeStyle):
+        return given
+    if isinstance(given, Mapping):
+        given = ",".join(f"{name}:{float(weight)!r}" for name, weight in given.items())
+    if isinstance(given, str | Path):
+        return read_style(str(given), model, identity)
+    if isinstance(given, Animation) and given.values is not None and not model.description.motion_space.is_vertices:
+        given = ParameterClip(given.name, given.values, given.space, given.frame_rate)
+    if isinstance(given, ParameterClip):
+        return _of_parameters(given, model, identity)
+    if isinstance(given, Animation):
+        opened = StyleFile(Path(given.name), given.vertices, given.template, given.frame_rate, given.unit)
+        return _of_vertices(opened, model, identity)
+    array = np.asarray(given)
+    if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
+        raise OptionError.naming(
+            f"{{style}}: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
+            f"(frames, vertices, 3) or a style vector"
+        )
+    return _of_vertices(StyleFile(Path("style"), array), model, identity)
 
 
 def read_style(text: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
@@ -53,15 +98,25 @@ def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyl
     about, vectors = model.description, model.arrays["styles"]
     if name in about.styles:
         return RuntimeStyle(name, vectors[about.styles.index(name)].astype(np.float32))
-    recorded = recorded_parameters(name, about.frame_rate) if not about.motion_space.is_vertices else None
+    vertices = about.motion_space.is_vertices and name.endswith(FILES)
+    recorded = None if vertices else recorded_parameters(name, about.frame_rate)
     if recorded is not None:
-        resting = model.arrays["resting"][about.faces.index(identity) if identity in about.faces else 0]
-        values = channels_of(recorded, about.motion_space, about.frame_rate)
-        return encode_style(model, (values - resting)[..., None], recorded.name)
+        return _of_parameters(recorded, model, identity)
     if not name.endswith(FILES):
         raise FaceDiffError(f'style: there is no "{name}", and it is no file: {choices(name, about.styles)}')
-    path = Path(name)
-    opened = open_style(path)
+    return _of_vertices(open_style(Path(name)), model, identity)
+
+
+def _of_parameters(recorded: ParameterClip, model: ExportedGraphs, identity: str) -> RuntimeStyle:
+    about = model.description
+    values = channels_of(recorded, about.motion_space, about.frame_rate)
+    resting = model.arrays["resting"][about.faces.index(identity) if identity in about.faces else 0]
+    return encode_style(model, (values - resting)[..., None], recorded.name)
+
+
+def _of_vertices(opened: StyleFile, model: ExportedGraphs, identity: str) -> RuntimeStyle:
+    """The style of motion in vertices, or a vector."""
+    about, vectors, path = model.description, model.arrays["styles"], opened.path
     if opened.array.ndim == 1:
         vector = np.array(opened.array, np.float32)
         if vector.shape != vectors.shape[1:] or not np.isfinite(vector).all():

@@ -111,8 +111,9 @@ def may_have_weights(source: str | os.PathLike[str]) -> bool:
     from facediff.utils.plain_files import load_json
 
     content = load_json(Path(source) / "model.json", remedy=EXPECTED)
-    space = content.get("space") if isinstance(content, dict) else None
-    return isinstance(space, dict) and space.get("kind") == "arkit"
+    content = content if isinstance(content, dict) else {}
+    space = content.get("space")
+    return content.get("corpus") == "puppet" or (isinstance(space, dict) and space.get("kind") == "arkit")
 
 
 def check_animating_source(source: str | os.PathLike[str]) -> None:

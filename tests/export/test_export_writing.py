@@ -17,6 +17,7 @@ import pytest
 from facediff.animation import Animation, write_archive
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.export import FORMATS, ExportOptions, check_export, write_animations
+from facediff.synthetic.known_faces import built_in_shapes
 
 OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", ".mp4", ".npz", ".npy"]
 """Formats that need no blendshapes and no browser page."""
@@ -310,3 +311,15 @@ def test_format_of_an_installed_package_is_reached_by_its_suffix(animation: Anim
     assert "The box around the vertices" in facediff("export", "--help").stdout
     refused = facediff("export", "in.npz", "-o", "z.bound")
     assert (refused.returncode, 'did you mean ".bounds"' in refused.stderr) == (2, True)
+
+
+def test_weights_of_the_built_in_face_need_no_shapes(tmp_path: Path) -> None:
+    rest, faces, shapes = built_in_shapes("F1", 2)
+    opened = np.linspace(0, 0.5, 6, dtype=np.float32)
+    motion = (rest + opened[:, None, None] * (shapes["jawOpen"] - rest)).astype(np.float32)
+    animation = Animation(
+        name="jaw", vertices=motion, template=rest.astype(np.float32), faces=faces, frame_rate=25.0, unit="m"
+    )
+    write_animations(tmp_path / "a.csv", [animation])
+    table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    np.testing.assert_allclose(table["JawOpen"][:6], opened, atol=3e-3)

@@ -33,7 +33,7 @@ from facediff.pipelines.export_model import Precision, export_model, store_weigh
 from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel
 from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
-from facediff.runtime.styles import read_style
+from facediff.runtime.styles import read_style, style_from
 from facediff.speech.voice_activity import QUICK_GATE
 from facediff.speech.windows import MotionWindow, WindowPlan
 from tests.fakes.tiny import Tiny, tiny_model_options
@@ -225,6 +225,20 @@ def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Pat
     mixed = read_style(f"A:0.25,{tmp_path / 'b.npz'}:0.75", runtime, "A")
     wanted = 0.25 * runtime.arrays["styles"][runtime.description.styles.index("A")] + 0.75 * own
     np.testing.assert_allclose(mixed.vector, wanted, atol=1e-5)
+
+
+def test_style_comes_from_what_python_has_at_hand(model: AnimationModel, folder: Path, tmp_path: Path) -> None:
+    runtime = RuntimeModel.open(folder)
+    motion = (model.assets.references["B"].motion + model.assets.template("B")).numpy()
+    animation = replace(runtime.animate(sound(1.0), identity="B"), vertices=motion, speech=None)
+    own = runtime.arrays["styles"][runtime.description.styles.index("B")]
+    found = [style_from(given, runtime, "B").vector for given in (motion, animation, own, {"B": 1.0}, {"B": 3, "A": 0})]
+    np.testing.assert_allclose(found, np.broadcast_to(own, (5, len(own))), atol=1e-5)
+    animated = [facediff.load(folder).animate(sound(0.5), 16_000, identity="B", style=style) for style in (motion, "B")]
+    np.testing.assert_allclose(animated[0].vertices, animated[1].vertices, atol=1e-5)
+    for wrong, expected in ((motion[:, :3], "3"), (["B"], "shape"), (own[:2], "2 numbers")):
+        with pytest.raises(FaceDiffError, match=expected):
+            style_from(wrong, runtime, "B")
 
 
 @pytest.mark.parametrize("words", ["nobody.npz", "A:0.5,nobody", "short.npy", "A_2.npy", "bent.npy"])
