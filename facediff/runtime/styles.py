@@ -41,11 +41,11 @@ class RuntimeStyle:
     vector: Array
 
 
-def style_from(given: object, model: ExportedGraphs, identity: str) -> RuntimeStyle:
+def style_from(style: object, model: ExportedGraphs, identity: str) -> RuntimeStyle:
     """The style that was given in Python; the model's styles must be those of reference motion.
 
     Args:
-        given: the words of ``--style``; a path; names or paths with their weights; a motion as an animation, or as an
+        style: the words of ``--style``; a path; names or paths with their weights; a motion as an animation, or as an
             array (T, V, 3) of absolute vertices; a style vector (S,); or what this function has returned.
         model: the model.
         identity: whose motion an array holds, where a file's name does not say it.
@@ -53,20 +53,20 @@ def style_from(given: object, model: ExportedGraphs, identity: str) -> RuntimeSt
     Raises:
         FaceDiffError: if there is no such style, or the motion is of another topology.
     """
-    if isinstance(given, RuntimeStyle):
-        return given
-    if isinstance(given, Mapping):
-        given = ",".join(f"{name}:{float(weight)!r}" for name, weight in given.items())
-    if isinstance(given, str | Path):
-        return read_style(str(given), model, identity)
-    if isinstance(given, Animation) and given.values is not None and not model.description.motion_space.is_vertices:
-        given = ParameterClip(given.name, given.values, given.space, given.frame_rate)
-    if isinstance(given, ParameterClip):
-        return _of_parameters(given, model, identity)
-    if isinstance(given, Animation):
-        opened = StyleFile(Path(given.name), given.vertices, given.template, given.frame_rate, given.unit)
+    if isinstance(style, RuntimeStyle):
+        return style
+    if isinstance(style, Mapping):
+        style = ",".join(f"{name}:{float(weight)!r}" for name, weight in style.items())
+    if isinstance(style, str | Path):
+        return read_style(str(style), model, identity)
+    if isinstance(style, Animation) and style.values is not None and not model.description.motion_space.is_vertices:
+        style = ParameterClip(style.name, style.values, style.space, style.frame_rate)
+    if isinstance(style, ParameterClip):
+        return _of_parameters(style, model, identity)
+    if isinstance(style, Animation):
+        opened = StyleFile(Path(style.name), style.vertices, style.template, style.frame_rate, style.unit)
         return _of_vertices(opened, model, identity)
-    array = np.asarray(given)
+    array = np.asarray(style)
     if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
         raise OptionError.naming(
             f"{{style}}: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
