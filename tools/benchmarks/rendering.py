@@ -14,14 +14,12 @@ training the previews of `SamplingPreview` are; some minutes.
 import argparse
 import importlib
 import importlib.util
-import io
 import json
 import math
 import os
 import platform
 import subprocess
 import sys
-import tarfile
 import tempfile
 import time
 from collections.abc import Callable
@@ -212,8 +210,7 @@ def video(options: argparse.Namespace) -> None:
         if options.against:
             command = ["git", "-C", str(Path(__file__).parents[2]), "archive", options.against, "facediff"]
             archive = subprocess.run(command, capture_output=True, check=True).stdout
-            with tarfile.open(fileobj=io.BytesIO(archive)) as files:
-                files.extractall(older, filter="data")
+            subprocess.run(["tar", "-x", "-C", older], input=archive, check=True)
             versions[options.against] = Path(older)
         found: dict[str, list[dict[str, list[float]]]] = {version: [] for version in versions}
         for _ in range(options.rounds):
