@@ -217,7 +217,7 @@ class NearestSpeakerAccuracy(SequenceMetric):
 
     Args:
         gallery: recordings whose speakers are known.
-        components: principal components K, at most.
+        components: principal components K, at most; ``facediff generation-metrics`` takes 64.
         shrinkage: how much of an even covariance is added, so that no direction decides alone.
 
     >>> means = torch.tensor([[[0.0, 0.0, 0.0]], [[0.0, 2.0, 0.0]], [[5.0, 0.0, 0.0]], [[5.0, 2.0, 0.0]]])
@@ -240,7 +240,7 @@ class NearestSpeakerAccuracy(SequenceMetric):
         self,
         gallery: SpeakerGallery,
         *,
-        components: int = 64,
+        components: int = 16,
         shrinkage: float = 0.1,
         **options: Unpack[FiniteOptions],
     ) -> None:

@@ -269,8 +269,8 @@ class Measurement:
         }
         self.of_references["lve_default"] = LipVertexError(lips)
         if corpus.gallery is not None:
-            self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
-            self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery)
+            self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery, components=64)
+            self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery, components=64)
         self.speed = RealTimeFactor(device_name(model.device))
         for metrics in (self.of_samples, self.of_each, self.of_channels, self.of_baselines, self.of_references):
             for metric in metrics.values():

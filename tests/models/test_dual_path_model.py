@@ -14,6 +14,7 @@ from facediff import registry
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, losses
+from facediff.models.inference import ClipNoise
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -86,6 +87,19 @@ def test_ablations_leave_their_part_out(make_model: Make) -> None:
     assert len(bare.network.style_tokens.projections) == 3
     assert bare.network.mesh_encoder is None
     assert len(make_model(style_tokens="single").network.style_tokens.projections) == 1
+
+
+def test_the_first_frame_wanted_may_still_be_named(model: DualPathDiffusion, tiny: Tiny) -> None:
+    batch = collate([tiny.dataset("val")[0]])
+
+    def sampled(**wanted: object) -> torch.Tensor:
+        noise = [ClipNoise(batch.names, batch.frame_lengths.tolist(), [0], model.device) for _ in range(2)]
+        return model.sample(model.conditions(batch), *noise, **wanted)  # type: ignore[arg-type]
+
+    with pytest.warns(DeprecationWarning, match="wanted"):
+        later = sampled(first=3)
+    torch.testing.assert_close(later, sampled(wanted=slice(3, None)))
+    assert later.shape[1] == sampled().shape[1] - 3
 
 
 def test_the_neutral_face_is_a_token_of_what_it_has_of_its_own(make_model: Make, tiny: Tiny) -> None:

@@ -17,7 +17,8 @@ from facediff.runtime.folder import read_folder
 from facediff.synthetic.cast import SEEN, UNSEEN
 from facediff.utils import hub
 
-SPEECH = Path(__file__).parents[2] / "docs" / "examples" / "speech.wav"
+ROOT = Path(__file__).parents[2]
+SPEECH = ROOT / "docs" / "examples" / "speech.wav"
 WITHOUT_TORCH = "import sys; sys.modules['torch'] = None; from facediff.cli.app import main; main(sys.argv[1:])"
 
 
@@ -40,6 +41,11 @@ def test_it_is_small_and_knows_ten_people_and_their_moods() -> None:
     provenance = json.loads((hub.BUNDLED / "provenance.json").read_text())
     assert provenance["generation_metrics"]
     assert "facediff fit" in provenance["recipe"]
+    scores = {(row["split"], row["metric"]): row["mean"] for row in provenance["generation_metrics"]["metrics"]}
+    manual = " ".join((ROOT / "docs" / "exported_models.md").read_text(encoding="utf-8").split())
+    for metric in ("lve_still", "lve_default_still"):
+        shares = [f"{scores[split, metric]:.3f}" for split in ("test_a", "test_b", "test_c")]
+        assert "{}, {} and {}".format(*shares) in manual  # of the model that is there, not of one before
 
 
 def test_the_lively_style_moves_more_than_the_calm_one(capsys: pytest.CaptureFixture[str]) -> None:
