@@ -107,7 +107,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "mean_estimate_error": {"n_samples": 10, "squared": True, "pooling": "frames"},
     "mean_vertex_error": {"reduction": "mean", "squared": False, "pooling": "frames"},
     "mouth_opening_difference": {"pooling": "frames"},
-    "nearest_speaker_accuracy": {"components": 64, "shrinkage": 0.1},
+    "nearest_speaker_accuracy": {"components": 16, "shrinkage": 0.1},
     "sample_diversity": {"pairing": "shuffled", "n_samples": 10, "seed": 1234, "pooling": "sequences"},
     "spread_error_ratio": {"n_samples": 4},
     "style_retrieval_accuracy": {"closeness": "cosine"},

@@ -186,7 +186,7 @@ def test_fewer_recordings_than_components_have_one_less_than_themselves() -> Non
     torch.testing.assert_close(metric.basis @ metric.basis.T, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
     offsets = known.means.flatten(1) - known.means.flatten(1).mean(0)
     torch.testing.assert_close(offsets @ metric.basis.T @ metric.basis, offsets, rtol=0, atol=1e-9)
-    assert "among 3, by Mahalanobis distance within speakers in 64 principal components of 6" in metric.describe()
+    assert "among 3, by Mahalanobis distance within speakers in 16 principal components of 6" in metric.describe()
 
 
 def test_one_recording_of_each_speaker_is_compared_in_euclidean_distance() -> None:
