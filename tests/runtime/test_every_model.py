@@ -91,14 +91,10 @@ Sources = dict[str, Path]
 
 
 @pytest.fixture(scope="module")
-def channels_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_channels(tmp_path_factory.mktemp("corpus") / "channels")
-
-
-@pytest.fixture
-def sources(hubert_source: Path, deepspeech_source: Path, channels_root: Path) -> Sources:
+def sources(hubert_source: Path, deepspeech_source: Path, tmp_path_factory: pytest.TempPathFactory) -> Sources:
     """Pretrained networks in miniature by the audio encoder that reads them, and the corpus in channels."""
-    return {"wav2vec2": hubert_source, "deepspeech": deepspeech_source, "channels": channels_root}
+    channels = write_channels(tmp_path_factory.mktemp("corpus") / "channels")
+    return {"wav2vec2": hubert_source, "deepspeech": deepspeech_source, "channels": channels}
 
 
 @dataclass
