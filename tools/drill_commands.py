@@ -227,8 +227,9 @@ DRILLS = [
     Drill(
         "data import-person",
         "person.npy --audio person.wav --name Target --frame-rate 30 --corpus persons --quiet -o entry",
+        once=True,
     ),
-    Drill("data import-take", "take.csv person.wav --name Target --offset 0 -o entry"),
+    Drill("data import-take", "take.csv person.wav --name Target --offset 0 -o entry", once=True),
 ]
 """One or several for each command that writes, except ``fit``, which has a drill of its own."""
 

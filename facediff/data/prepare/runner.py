@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle  # noqa: S403 - writes a pickle, opens none
 import re
@@ -386,8 +387,10 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
     from facediff.speech.audio import SAMPLE_RATE
 
     whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
+    sound = io.BytesIO()  # libsndfile does not say that a disk is full
+    soundfile.write(sound, whole, SAMPLE_RATE, format="WAV", subtype="PCM_16")
     with atomic(path) as temporary:
-        soundfile.write(temporary, whole, SAMPLE_RATE, subtype="PCM_16")
+        temporary.write_bytes(sound.getvalue())
 
 
 def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:
