@@ -388,7 +388,7 @@ def readable(message: str, parameters: Collection[Parameter], program: str) -> s
             return f"{word}: one argument too many; {see}"
         known = [parameter.flag for parameter in parameters if not parameter.positional]
         hint = choices(word, known).partition("known are")[0].strip()
-        return f"{word}: there is no such option; {hint} S{see[1:]}" if hint else f"{word}: no such option; {see}"
+        return f"{word}: there is no such option; {hint}. S{see[1:]}" if hint else f"{word}: no such option; {see}"
     needed = re.search(r"arguments are required: (.*)", message)
     if needed is not None:
         names = [name.split("/")[-1].strip() for name in needed.group(1).split(",")]

@@ -215,14 +215,16 @@ class Direction:
         for channel in self.under(name):
             raise FaceDiffError(f"{self.source}: channel {channel}: --{name} says the same; give one of them")
 
-    def refuse_model_channels(self) -> None:
-        """Refuse keys of what only a model can follow, such as the style."""
+    def refuse_model_channels(self, exported: bool = False) -> None:
+        """Refuse keys of what only a model can follow, such as the style, and of those only one with PyTorch."""
         for channel in self.channels:
             if channel_of(channel).in_model:
-                raise FaceDiffError(
-                    f"{self.source}: channel {channel}: needs the model, and the animation is finished; give the keys "
-                    f"to `facediff animate --direction`"
+                reason = (
+                    "needs the model, and the animation is finished; give the keys to `facediff animate --direction`"
                 )
+                if exported:
+                    reason = "changes within a recording with a checkpoint only; leave these keys out, or give one"
+                raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
 
     def without_model_channels(self) -> Direction | None:
         """The keys of what changes finished motion; None if there are none."""

@@ -84,7 +84,7 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
     ]
     # A video must say that a corpus is synthetic, so that the footer names the corpora unless the user chose a text.
     corpora = dict.fromkeys(animation.metadata["corpus"] for animation in animations if "corpus" in animation.metadata)
-    footer = " – ".join(part for part in (options.footer or ", ".join(corpora), procedural(animations)) if part)
+    footer = " - ".join(part for part in (options.footer or ", ".join(corpora), procedural(animations)) if part)
     return side_by_side(renderers, motions, [animation.name for animation in animations], footer=footer or None)
 
 

@@ -49,8 +49,9 @@ class LiveOptions(CheckedOptions):
     def check(self) -> None:
         """Refuse options that contradict each other."""
         if (self.speech is None) == (self.microphone is None):
+            problem = "missing" if self.speech is None else "comes from one place"
             raise FaceDiffError(
-                "speech: comes from one place; give a recording, - for samples on standard input, or --microphone"
+                f"speech: {problem}; give a recording, - for samples on standard input, or --microphone"
             )
         if self.speech != "-" and self.rate != 16_000:
             raise OptionError("rate", "is for samples on standard input; omit it")

@@ -480,6 +480,53 @@ class ExportedAnimator(SpeechAnimator):
         """Where it computes."""
         return "cpu"
 
+    @property
+    def other_identities(self) -> list[str]:
+        """Faces that it was not trained on."""
+        return [name for name in self.model.description.faces if name not in self.identities]
+
+    @property
+    def unit(self) -> str:
+        """The unit of its vertices."""
+        return self.model.description.unit
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of its faces."""
+        return int(self.model.arrays["templates"].shape[1])
+
+    @property
+    def licence(self) -> str:
+        """The licences that it inherits, as its animations' metadata have them."""
+        return self.model.description.licences.get("licence", "")
+
+    @property
+    def commercial_use(self) -> str:
+        """Whether the strictest of its licences allows commercial use: allowed, forbidden or unknown."""
+        return self.model.description.licences.get("commercial_use", "unknown")
+
+    def extract_style(
+        self, clips: StyleLike | Sequence[str | Path | Animation], *, identity: str | None = None
+    ) -> npt.NDArray[np.float32]:
+        """The style vector (S,) of clips, their mean if there are several; :meth:`animate` takes it as ``style``.
+
+        Args:
+            clips: names of the folder's styles, files, animations or arrays; one, or a list of them.
+            identity: whose motion it is, where nothing else says it; the first one trained on if None.
+
+        Raises:
+            FaceDiffError: if a clip cannot be read, or the model takes no styles from motion.
+        """
+        import numpy as np
+
+        from facediff.runtime.styles import style_from
+
+        if self.model.description.style_source != "reference":
+            raise FaceDiffError(f"{self.source}: was trained without a dynamic style, so it has no style vectors")
+        several = clips if isinstance(clips, list | tuple) else [clips]
+        vectors = [style_from(clip, self.model, identity or self.identities[0]).vector for clip in several]
+        return np.mean(vectors, axis=0, dtype=np.float32)
+
     @contextmanager
     def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
         """The model with its choices made."""

@@ -255,7 +255,7 @@ class Audio2FacePipeline(AnimationPipeline):
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on; those that a model itself follows are for trained ones."""
         if direction is not None:
-            direction.refuse_model_channels()
+            direction.refuse_model_channels(exported=True)
         super().direct(direction)
 
     def metadata(self, seed: int) -> dict[str, str]:

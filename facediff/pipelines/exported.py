@@ -78,7 +78,7 @@ class ExportedPipeline(AnimationPipeline):
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on; those that a model itself follows need PyTorch."""
         if direction is not None:
-            direction.refuse_model_channels()
+            direction.refuse_model_channels(exported=True)
         super().direct(direction)
 
     def frames_of(self, samples: int) -> int:

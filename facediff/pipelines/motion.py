@@ -19,6 +19,7 @@ from facediff.animation.files import AnimationFacts, complete, facts_of, read_an
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
+from facediff.utils.hub import is_exported
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import SolveOptions, Weights
@@ -312,12 +313,7 @@ class SourceReader:
         overrides: dict[str, Any] = {}
         defaults = None
         if options.checkpoint is not None:
-            from facediff.models.checkpoint import read_assets
-            from facediff.pipelines.trained import facts_of as facts_of_assets
-
-            source = options.checkpoint
-            assets = read_assets(Path(source)) if isinstance(source, str | Path) else source.module.assets
-            defaults = facts_of_assets(assets, options.identity)
+            defaults = _facts_of_model(options.checkpoint, options.identity)
             if options.identity is not None:
                 overrides["template"] = defaults["template"]
         if options.mesh is not None:
@@ -331,7 +327,7 @@ class SourceReader:
             overrides |= {"speech": read_speech(Path(options.speech)), "sample_rate": SAMPLE_RATE}
         overrides |= {} if options.frame_rate is None else {"frame_rate": options.frame_rate}
         overrides |= {} if options.unit is None else {"unit": options.unit}
-        return cast("AnimationFacts", overrides), cast("AnimationFacts | None", defaults)
+        return cast("AnimationFacts", overrides), defaults
 
     def read(self, path: Path, lender: Animation | None = None) -> Animation:
         """The animation in a file, completed by this, then by another animation; all of its frames are finite."""
@@ -366,3 +362,19 @@ def solve_weights(
             notes.append(f"not ARKit's, left out so that they take no motion: {', '.join(found.extra)}")
         found = replace(found.only(ARKIT), notes=tuple(notes))
     return found, solve(animation, found, options)
+
+
+def _facts_of_model(source: Any, identity: str | None) -> AnimationFacts:  # noqa: ANN401 - a file, a folder or a model
+    """The facts of a model's animations of one of its faces."""
+    from facediff.runtime.model import RuntimeModel
+
+    is_file = isinstance(source, str | Path)
+    exported = RuntimeModel.open(Path(source)) if is_file and is_exported(source) else getattr(source, "model", None)
+    if isinstance(exported, RuntimeModel):
+        stream = exported.stream(identity=identity)
+        return facts_of(exported.animation(stream.conditions.template[None], stream, None, "face"))
+    from facediff.models.checkpoint import read_assets
+    from facediff.pipelines.trained import facts_of as facts_of_assets
+
+    assets = read_assets(Path(source)) if is_file else source.module.assets
+    return cast("AnimationFacts", facts_of_assets(assets, identity))

@@ -236,9 +236,27 @@ def test_style_comes_from_what_python_has_at_hand(model: AnimationModel, folder:
     np.testing.assert_allclose(found, np.broadcast_to(own, (5, len(own))), atol=1e-5)
     animated = [facediff.load(folder).animate(sound(0.5), 16_000, identity="B", style=style) for style in (motion, "B")]
     np.testing.assert_allclose(animated[0].vertices, animated[1].vertices, atol=1e-5)
+    np.testing.assert_allclose(facediff.load(folder).extract_style([motion, "B"], identity="B"), own, atol=1e-5)
     for wrong, expected in ((motion[:, :3], "3"), (["B"], "shape"), (own[:2], "2 numbers")):
         with pytest.raises(FaceDiffError, match=expected):
             style_from(wrong, runtime, "B")
+
+
+def test_a_bare_motion_is_completed_by_a_folder(folder: Path, tmp_path: Path) -> None:
+    exported = facediff.load(folder)
+    animation = exported.animate(sound(0.5), 16_000, identity="B")
+    np.save(tmp_path / "b.npy", animation.vertices)
+    for model in (exported, folder):
+        read = facediff.read(tmp_path / "b.npy", checkpoint=model, identity="B")
+        np.testing.assert_array_equal(read.template, animation.template)
+        assert (read.unit, read.frame_rate) == (animation.unit, animation.frame_rate) == (exported.unit, 25)
+    assert (exported.n_vertices, exported.other_identities) == (
+        len(animation.template),
+        [*({*exported.model.description.faces} - {*exported.identities})],
+    )
+    keys = [{"time": 0, "channel": "style", "value": "A"}]
+    with pytest.raises(FaceDiffError, match="with a checkpoint only"):
+        exported.animate(sound(0.5), 16_000, direction=keys)
 
 
 @pytest.mark.parametrize("words", ["nobody.npz", "A:0.5,nobody", "short.npy", "A_2.npy", "bent.npy"])
