@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +18,8 @@ from facediff.errors import OptionError
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
+
+    from facediff.spaces.files import ParameterClip
 
 FILES = (".npy", ".npz")
 """Suffixes of files that hold a style; anything else is the name of a clip."""
@@ -122,6 +124,40 @@ class StyleFile:
     template: npt.NDArray[np.float32] | None = None
     frame_rate: float | None = None
     unit: str | None = None
+
+
+def style_given(style: object, *, vertices: bool) -> str | ParameterClip | StyleFile:
+    """What a style was given as in Python: the words of ``--style``, motion in parameters, or what a file would hold.
+
+    Args:
+        style: words; a path; names or paths with their weights; an animation, an array of motion or a vector.
+        vertices: whether the model moves vertices, so that an animation's own values are of no use.
+
+    Raises:
+        FaceDiffError: if it is nothing of that kind.
+    """
+    import numpy as np
+
+    from facediff.animation import Animation
+    from facediff.spaces.files import ParameterClip
+
+    if isinstance(style, Mapping):
+        return ",".join(f"{name}:{float(weight)!r}" for name, weight in style.items())
+    if isinstance(style, str | Path):
+        return str(style)
+    if isinstance(style, ParameterClip):
+        return style
+    if isinstance(style, Animation) and style.values is not None and not vertices:
+        return ParameterClip(style.name, style.values, style.space, style.frame_rate)
+    if isinstance(style, Animation):
+        return StyleFile(Path(style.name), style.vertices, style.template, style.frame_rate, style.unit)
+    array = np.asarray(style)
+    if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
+        raise OptionError.naming(
+            f"{{style}}: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
+            f"(frames, vertices, 3) or a style vector"
+        )
+    return StyleFile(Path("style"), array)
 
 
 def open_style(path: Path) -> StyleFile:

@@ -141,6 +141,7 @@ def animate(
             scheduler=batch.scheduler,
             retry_failed=batch.retry_failed,
         )
+    from facediff.export.writing import seeks_weights
     from facediff.pipelines.animate import check_options, direction_for
     from facediff.pipelines.trained import open_pipeline
     from facediff.speech.audio import read_recording
@@ -155,7 +156,8 @@ def animate(
     for problem in speech_problems(speech_samples):
         tell(f"note: {speech[0]}: {problem}")
     pipeline = open_pipeline(options)
-    check_export(output, files, options.samples, weights=pipeline.has_weights)
+    weights = seeks_weights(output, files) and pipeline.has_weights
+    check_export(output, files, options.samples, weights=weights)
     seconds, size = pipeline.cost(speech_samples, output, files.size)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
     written, animation = pipeline.write(speech_samples, speech[0].stem, output, files)

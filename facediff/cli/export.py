@@ -48,10 +48,9 @@ def export(
 
     footer = ""  # under a video: the corpus, and whether it is synthetic
     if source.checkpoint is not None and output.suffix == ".mp4":
-        from facediff.models.checkpoint import read_assets
+        from facediff.pipelines.motion import corpus_of_model
 
-        assets = read_assets(source.checkpoint)
-        footer = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
+        footer = corpus_of_model(source.checkpoint)
     check_used(output.suffix, files.changed())
     options = replace(files, footer=footer, quiet=quiet)
     weights = all(path.suffix.lower() in SUFFIXES or has_values(path) for path in animations)

@@ -74,7 +74,7 @@ def write_animations(
         [PosixPath('hello.usdc'), PosixPath('hello.wav')]
     """
     options = options or ExportOptions()
-    check_export(path, options, len(animations), weights=have_weights(animations))
+    check_export(path, options, len(animations), weights=seeks_weights(path, options) and have_weights(animations))
     if path.suffix.lower() == ".fbx":
         names = [path] if len(animations) == 1 else _targets(path, FORMATS[".glb"], len(animations))
         written = []
@@ -166,7 +166,7 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
     if options.up is not None and options.up not in form.up_axes:
         reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
         raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
-    if form.needs_shapes and options.shapes is None and not weights:
+    if seeks_weights(path, options) and not weights:
         raise OptionError(
             "",
             f"{path}: {suffix} needs blendshapes; give {{shapes}}: a folder of meshes, a .glb with targets, or puppet",
@@ -181,6 +181,12 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         check_writable(target)
         if form.is_folder:
             check_free(folder_of(target))
+
+
+def seeks_weights(path: Path, options: ExportOptions) -> bool:
+    """Whether a format needs blendshapes, and none are named: only then is it worth while to look for weights."""
+    form = FORMATS.get(path.suffix)
+    return form is not None and form.needs_shapes and options.shapes is None
 
 
 def have_weights(animations: Sequence[Animation]) -> bool:

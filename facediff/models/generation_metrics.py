@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -269,8 +270,9 @@ class Measurement:
         }
         self.of_references["lve_default"] = LipVertexError(lips)
         if corpus.gallery is not None:
-            self.of_references["nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery, components=64)
-            self.of_baselines["true_nearest_speaker"] = NearestSpeakerAccuracy(corpus.gallery, components=64)
+            nearest = partial(NearestSpeakerAccuracy, corpus.gallery, components=64)
+            self.of_references["nearest_speaker"] = nearest()
+            self.of_baselines["true_nearest_speaker"] = nearest()
         self.speed = RealTimeFactor(device_name(model.device))
         for metrics in (self.of_samples, self.of_each, self.of_channels, self.of_baselines, self.of_references):
             for metric in metrics.values():

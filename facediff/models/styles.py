@@ -20,6 +20,7 @@ from facediff.animation.style_files import (
     split_styles,
     stillness_of,
     stride_of,
+    style_given,
     with_layout,
 )
 from facediff.errors import FaceDiffError, OptionError, choices
@@ -101,38 +102,22 @@ def style_from(
     Raises:
         FaceDiffError: as :func:`read_styles`, or if it is nothing of that kind.
     """
-    import numpy as np
-
-    from facediff.animation import Animation
     from facediff.data import Reference
     from facediff.models import Style
     from facediff.spaces.files import ParameterClip
 
     if isinstance(given, Reference | Style):
         return given
-    if isinstance(given, Mapping):
-        given = ",".join(f"{name}:{float(weight)!r}" for name, weight in given.items())
-    if isinstance(given, str | Path):
-        return read_styles(str(given), identity, model, template=template)
-    if not style_width(model):
+    if not isinstance(given, Mapping | str | Path) and not style_width(model):
         raise OptionError.naming(
             "{style}: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
         )
-    if isinstance(given, ParameterClip):
-        return style_of_channels(given, identity, model)
-    if isinstance(given, Animation) and given.values is not None and not model.assets.space.is_vertices:
-        values = ParameterClip(given.name, given.values, given.space, given.frame_rate)
-        return style_of_channels(values, identity, model)
-    if isinstance(given, Animation):
-        motion = StyleFile(Path(given.name), given.vertices, given.template, given.frame_rate, given.unit)
-        return style_of(motion, identity, model)
-    array = np.asarray(given)
-    if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
-        raise OptionError.naming(
-            f"{{style}}: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
-            f"(frames, vertices, 3) or a style vector"
-        )
-    return style_of(StyleFile(Path("style"), array), identity, model, template=template)
+    style = style_given(given, vertices=model.assets.space.is_vertices)
+    if isinstance(style, str):
+        return read_styles(style, identity, model, template=template)
+    if isinstance(style, ParameterClip):
+        return style_of_channels(style, identity, model)
+    return style_of(style, identity, model, template=template)
 
 
 def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:

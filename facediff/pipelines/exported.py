@@ -57,7 +57,7 @@ class ExportedPipeline(AnimationPipeline):
             "expressivity": factors.get("all", 1.0),
         }
         stream = self.model.stream(seed=options.seed or 0, **self._chosen)
-        still = self.model.animation(stream.conditions.template[None], stream, None, "face")
+        still = self.model.still(stream)
         self._metadata = dict(still.metadata)
         super().__init__(
             options,

@@ -19,7 +19,7 @@ from facediff.animation.files import AnimationFacts, complete, facts_of, read_an
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
-from facediff.utils.hub import is_exported
+from facediff.utils.hub import is_graphs
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import SolveOptions, Weights
@@ -369,12 +369,26 @@ def _facts_of_model(source: Any, identity: str | None) -> AnimationFacts:  # noq
     from facediff.runtime.model import RuntimeModel
 
     is_file = isinstance(source, str | Path)
-    exported = RuntimeModel.open(Path(source)) if is_file and is_exported(source) else getattr(source, "model", None)
+    exported = RuntimeModel.open(Path(source)) if is_file and is_graphs(source) else getattr(source, "model", None)
     if isinstance(exported, RuntimeModel):
-        stream = exported.stream(identity=identity)
-        return facts_of(exported.animation(stream.conditions.template[None], stream, None, "face"))
+        return facts_of(exported.still(exported.stream(identity=identity)))
     from facediff.models.checkpoint import read_assets
     from facediff.pipelines.trained import facts_of as facts_of_assets
 
     assets = read_assets(Path(source)) if is_file else source.module.assets
     return cast("AnimationFacts", facts_of_assets(assets, identity))
+
+
+def corpus_of_model(source: str | Path) -> str:
+    """The corpus of a checkpoint or a folder, and whether it is synthetic, as it stands under a video."""
+    if is_graphs(source):
+        from facediff.runtime.folder import read_folder
+
+        about = read_folder(Path(source))[0]
+        corpus, synthetic = about.corpus, about.synthetic
+    else:
+        from facediff.models.checkpoint import read_assets
+
+        assets = read_assets(source)
+        corpus, synthetic = assets.corpus, assets.synthetic
+    return f"{corpus} (synthetic)" if synthetic else corpus

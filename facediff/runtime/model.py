@@ -106,6 +106,10 @@ class RuntimeModel(ExportedGraphs):
         """What turns channels into the vertices of a face, by its place; None for a model of vertices."""
         return decoder_of(self.description, self.arrays, face)
 
+    def still(self, stream: RuntimeStream) -> Animation:
+        """A stream's face at rest, one frame, with everything that animations of it have in common."""
+        return self.animation(stream.conditions.template[None], stream, None, "face")
+
     def animation(self, points: Array, stream: RuntimeStream, audio: Array | None, name: str) -> Animation:
         """Points (T, points, dims) of a stream's face with everything that exporters need."""
         about, arrays, conditions = self.description, self.arrays, stream.conditions

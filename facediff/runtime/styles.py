@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import Animation, metres_per_unit
+from facediff.animation import metres_per_unit
 from facediff.animation.parameter_styles import channels_of, recorded_parameters
 from facediff.animation.style_files import (
     FILES,
@@ -20,6 +19,7 @@ from facediff.animation.style_files import (
     open_style,
     split_styles,
     stride_of,
+    style_given,
 )
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.graphs import ExportedGraphs
@@ -55,24 +55,12 @@ def style_from(style: object, model: ExportedGraphs, identity: str) -> RuntimeSt
     """
     if isinstance(style, RuntimeStyle):
         return style
-    if isinstance(style, Mapping):
-        style = ",".join(f"{name}:{float(weight)!r}" for name, weight in style.items())
-    if isinstance(style, str | Path):
-        return read_style(str(style), model, identity)
-    if isinstance(style, Animation) and style.values is not None and not model.description.motion_space.is_vertices:
-        style = ParameterClip(style.name, style.values, style.space, style.frame_rate)
-    if isinstance(style, ParameterClip):
-        return _of_parameters(style, model, identity)
-    if isinstance(style, Animation):
-        opened = StyleFile(Path(style.name), style.vertices, style.template, style.frame_rate, style.unit)
-        return _of_vertices(opened, model, identity)
-    array = np.asarray(style)
-    if array.dtype.kind != "f" or array.ndim not in (1, 2, 3):
-        raise OptionError.naming(
-            f"{{style}}: is {array.dtype} of shape {array.shape}; expected words, a file, an animation, a motion "
-            f"(frames, vertices, 3) or a style vector"
-        )
-    return _of_vertices(StyleFile(Path("style"), array), model, identity)
+    given = style_given(style, vertices=model.description.motion_space.is_vertices)
+    if isinstance(given, str):
+        return read_style(given, model, identity)
+    if isinstance(given, ParameterClip):
+        return _of_parameters(given, model, identity)
+    return _of_vertices(given, model, identity)
 
 
 def read_style(text: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:

@@ -97,6 +97,19 @@ def read_sound(file: IO[bytes], name: str, *, max_seconds: float | None = None) 
     return to_speech(samples, rate, name)
 
 
+def write_wav(path: Path, samples: npt.NDArray[Any], rate: int, bits: int = 16) -> None:
+    """Write samples (S,) or (S, channels) as a .wav; libsndfile itself would not say that the disk is full.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    import soundfile
+
+    sound = io.BytesIO()
+    soundfile.write(sound, samples, rate, format="WAV", subtype=f"PCM_{bits}")
+    path.write_bytes(sound.getvalue())
+
+
 def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.NDArray[np.float32]:
     """Samples (S,) or (S, channels), full scale 1, at any rate as (S',) float32 mono at 16 kHz."""
     import soxr

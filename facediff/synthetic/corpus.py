@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, speak
 from facediff.synthetic.face import build_face
 from facediff.synthetic.geometry import Array
@@ -256,10 +257,8 @@ def _write_clips(
 
 def _write_clip(folder: Path, clip: SyntheticClip, seed: int) -> int:
     """Write sound, motion and phonemes of a clip and return its number of frames."""
-    import soundfile
-
     samples, weights, phonemes = generate_clip(clip, seed)
-    soundfile.write(folder / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE, subtype="PCM_16")
+    write_wav(folder / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE)
     vertices = rig_of(clip.identity).pose(weights).astype(np.float32)
     np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
     table = [["start", "end", "ipa", "viseme"]]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
@@ -401,13 +402,10 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
 
 def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str], production: Production) -> int:
     """Write sound, motion and phonemes of a clip and return its number of frames."""
-    import soundfile
-
     spoken = speak_clip(clip, people)
     performance, another = perform_clip(clip, spoken, seed, production.frame_rate)
-    soundfile.write(
-        folder / "wav" / f"{clip.name}.wav", np.rint(spoken.samples * 32767.0).astype(np.int16), SAMPLE_RATE
-    )
+    whole = np.rint(spoken.samples * 32767.0).astype(np.int16)
+    write_wav(folder / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
     for name, track in (("weights", performance.weights), ("gaze", performance.gaze), ("head", performance.head)):
         np.save(folder / f"{name}_npy" / f"{clip.name}.npy", track.astype(np.float32))
     if clip.split.startswith("test") and not production.mask:  # those of the mask would take a gigabyte

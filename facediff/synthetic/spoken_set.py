@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError, choices
 from facediff.spaces.rigs import LinearRig
+from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.synthetic.geometry import Array
 from facediff.synthetic.head.parts import build_head
@@ -148,8 +149,6 @@ def _performed(text: str, number: int, voice: str) -> PerformedClip:
 
 def write_spoken_set(clips: Sequence[SpokenClip], folder: Path) -> None:
     """Write recordings, the times of their phonemes, and a table of what is said, for models that run elsewhere."""
-    import soundfile
-
     if folder.exists():
         raise FaceDiffError(f"{folder}: exists already; choose a new folder")
     with atomic_folder(folder) as temporary:
@@ -157,7 +156,7 @@ def write_spoken_set(clips: Sequence[SpokenClip], folder: Path) -> None:
             (temporary / name).mkdir()
         for clip in clips:
             whole = np.rint(clip.samples * 32767).astype(np.int16)
-            soundfile.write(temporary / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
+            write_wav(temporary / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
             rows = [[f"{p.start:.4f}", f"{p.end:.4f}", p.ipa] for p in clip.phonemes]
             write_table(temporary / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *rows])
         table = [[clip.name, clip.language, clip.voice, clip.text] for clip in clips]

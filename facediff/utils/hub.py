@@ -104,9 +104,14 @@ def is_audio2face(source: str | os.PathLike[str]) -> bool:
     return is_exported(source) and (Path(source) / "network_info.json").is_file()
 
 
+def is_graphs(source: str | os.PathLike[str]) -> bool:
+    """Whether a model is a folder of ``facediff export-model``, and not of others."""
+    return is_exported(source) and not is_audio2face(source)
+
+
 def may_have_weights(source: str | os.PathLike[str]) -> bool:
     """Whether a model's animations may be made of weights of face shapes, before it is read whole."""
-    if not is_exported(source) or is_audio2face(source):
+    if not is_graphs(source):
         return True
     from facediff.utils.plain_files import load_json
 

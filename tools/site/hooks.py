@@ -192,9 +192,14 @@ def loaded() -> griffe.Module:
     return module
 
 
+def module_of(package: griffe.Module, name: str) -> Any:  # noqa: ANN401 - griffe's own type for what it finds
+    """The module of a package by its whole name, such as ``facediff.models``."""
+    return package if name == package.name else package[name.partition(".")[2]]
+
+
 def api_page(name: str) -> str:
     """A page of the reference: the module's docstring, then each of its public names."""
-    package = loaded() if name == "facediff" else loaded()[name.removeprefix("facediff.")]
+    package = module_of(loaded(), name)
     parts = [
         f"# {name}",
         f"::: {name}\n    options: {{members: false, show_root_heading: false, show_root_toc_entry: false}}",
@@ -208,7 +213,7 @@ def api_index(names: list[str]) -> str:
     package = loaded()
     rows = []
     for name in names:
-        module = package if name == "facediff" else package[name.removeprefix("facediff.")]
+        module = module_of(package, name)
         summary = module.docstring.value.partition("\n\n")[0].replace("\n", " ") if module.docstring else ""
         rows.append(f"| [`{name}`]({name}.md) | {summary} |")
     return "# API reference\n\n| module | what it holds |\n|---|---|\n" + "\n".join(rows) + "\n"

@@ -21,7 +21,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(Path(__file__).parent))
-from hooks import public_names  # noqa: E402 - next to this file
+from hooks import module_of, public_names  # noqa: E402 - next to this file
 
 
 class _Config(yaml.SafeLoader):
@@ -41,13 +41,12 @@ def taken_away(old: griffe.Module, new: griffe.Module, modules: Sequence[str]) -
     """A line for each thing that the modules of ``old`` offer and ``new`` breaks."""
     offered = set()
     for name in modules:
-        module = old if name == "facediff" else old[name.removeprefix("facediff.")]
+        module, now = module_of(old, name), module_of(new, name)
         for public in public_names(module):
             if public not in module.members:  # loaded when it is asked for
                 continue
             member = module[public]
             offered.add(member.final_target.path if member.is_alias else member.path)
-            now = new if name == "facediff" else new[name.removeprefix("facediff.")]
             if public not in now.members:
                 yield f"{name}.{public}: is no more"
     for breakage in griffe.find_breaking_changes(old, new):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import EXACT
 from facediff.data.packed.reader import PackedCorpus
 from facediff.errors import FaceDiffError
+from facediff.speech.audio import write_wav
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import atomic_folder
 from facediff.utils.jobs import PerWorker, in_order, run_tasks
@@ -73,8 +73,6 @@ def _clip_writer(source: str, folder: Path) -> Any:  # noqa: ANN401 - a partial
 
 
 def _write_clip(packed: PackedCorpus, folder: Path, templates: dict[str, Any], name: str) -> None:
-    import soundfile
-
     clip, motion = packed.record.clips[name], packed.open(name)
     if clip.identity not in templates:
         raise FaceDiffError(f"{packed.source}: no template of {clip.identity}, needed by clip {name}; pack it again")
@@ -88,9 +86,7 @@ def _write_clip(packed: PackedCorpus, folder: Path, templates: dict[str, Any], n
     sound, path = clip.sound, folder / "wav" / f"{name}.wav"
     if sound.form == "flac":
         samples = packed.samples(name, 0, sound.samples) << (32 - sound.bits)
-        stream = io.BytesIO()  # since libsndfile does not say that a disk is full
-        soundfile.write(stream, samples, sound.rate, subtype=f"PCM_{sound.bits}", format="WAV")
-        path.write_bytes(stream.getvalue())
+        write_wav(path, samples, sound.rate, sound.bits)
     else:
         path.write_bytes(packed.recording(name))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import pickle  # noqa: S403 - writes a pickle, opens none
 import re
@@ -382,15 +381,11 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
 
     Reading it back gives ``round(32768 x) / 32768``: 16-bit speech at 16 kHz goes through unchanged.
     """
-    import soundfile
-
-    from facediff.speech.audio import SAMPLE_RATE
+    from facediff.speech.audio import SAMPLE_RATE, write_wav
 
     whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
-    sound = io.BytesIO()  # libsndfile does not say that a disk is full
-    soundfile.write(sound, whole, SAMPLE_RATE, format="WAV", subtype="PCM_16")
     with atomic(path) as temporary:
-        temporary.write_bytes(sound.getvalue())
+        write_wav(temporary, whole, SAMPLE_RATE)
 
 
 def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:

@@ -700,7 +700,7 @@ class DualPathDiffusion(AnimationModel):
         blend: Blend = unchanged,
         wanted: slice = slice(None),  # noqa: B008 - it cannot be changed
         progress: Progress | None = None,
-        first: int | None = None,
+        first: int = 0,
     ) -> Float[Tensor, "batch wanted points dims"]:
         """Run the sampler from noise to motion, in offsets from the template.
 
@@ -714,9 +714,9 @@ class DualPathDiffusion(AnimationModel):
             progress: wraps the iteration over steps.
             first: the old name of ``slice(first, None)``.
         """
-        if first is not None:
+        if first:
             warn_of_keyword("facediff.models.DualPathDiffusion.sample(first)")
-        frames = wanted if first is None else slice(first, None)
+        frames = slice(first, None) if first else wanted
         expressivity = self.expressivity
         whole = not isinstance(expressivity, Tensor)
         mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, frames)
