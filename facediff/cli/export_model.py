@@ -9,7 +9,7 @@ from facediff.cli.options import File, OutputFolder
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.hub import model_or_bundled
+from facediff.utils.hub import BUNDLED, bundled_by_name, model_or_bundled
 from facediff.utils.option import Option
 
 
@@ -45,7 +45,7 @@ def export_model(
     """
     if output.exists():
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
-    if model is None:
+    if model is None or bundled_by_name(model) is BUNDLED:
         changed: dict[str, object] = {"sampler": sampler, "steps": steps, "quick-steps": quick_steps, "speech": speech}
         changed |= {"identities": identities, "weights": None if weights == "float32" else weights}
         for name, value in changed.items():
@@ -55,7 +55,7 @@ def export_model(
                 )
         from facediff.runtime.folder import copy_exported
 
-        copied = copy_exported(model_or_bundled(None), output)
+        copied = copy_exported(model_or_bundled(model), output)
         tell(f"wrote {output}: {copied / 1e6:.1f} MB")
         return
     from facediff.pipelines.export_model import export_model as export

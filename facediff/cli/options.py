@@ -11,7 +11,7 @@ from facediff.animation.options import View as View
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
 from facediff.utils.files import valid_text
-from facediff.utils.hub import check_model_source, is_graphs
+from facediff.utils.hub import bundled_by_name, check_model_source, is_graphs
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def check_source(source: SourceOptions, animations: Sequence[Path]) -> None:
     for path in animations:
         if not path.is_file():
             raise FaceDiffError(f"{path}: no such file; expected an animation, .npz or .npy")
-    if source.checkpoint is not None and not is_graphs(source.checkpoint):
+    if source.checkpoint is not None and not is_graphs(bundled_by_name(source.checkpoint)):
         check_model_source(source.checkpoint, "--checkpoint")
     for option, file in (("mesh", source.mesh), ("speech", source.speech)):
         if file is not None and not Path(file).is_file():

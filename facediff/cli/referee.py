@@ -12,7 +12,7 @@ from facediff.cli.options import FrameRate, OutputFolder, named_folders
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices
 from facediff.utils import ranges
-from facediff.utils.hub import BUNDLED, check_animating_source
+from facediff.utils.hub import BUNDLED, check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -130,8 +130,7 @@ def candidates_of(
         name, equals, path = word.partition("=")
         if not equals or Path(word).exists():
             name, path = Path(word).stem if Path(word).suffix == ".ckpt" else Path(word).name, word
-        if path == BUNDLED.name and not Path(path).exists():
-            path = str(BUNDLED)
+        path = str(model_or_bundled(Path(path)))
         if Path(path).suffix in PLANS:
             candidates += read_models(Path(path))
             continue

@@ -26,7 +26,7 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.hub import EXPECTED, check_model_source, is_audio2face, is_exported, model_or_bundled
+from facediff.utils.hub import EXPECTED_TO_ANIMATE, check_animating_source, is_audio2face, is_exported, model_or_bundled
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import SAMPLE_RATES, check_number
 
@@ -57,7 +57,7 @@ def load(
     Args:
         source: a checkpoint (.ckpt), a model folder that ``facediff publish`` has written, ``user/name[@revision]`` of
             the Hugging Face hub, or a folder of ``facediff export-model`` or of Audio2Face-3D, which need no PyTorch;
-            the model that comes with facediff if None.
+            ``puppet`` or None for the model that comes with facediff.
         device: where it computes: cpu, cuda …; ``auto`` for a CUDA device where there is one.
         commercial_only: refuse a model whose licence labels do not allow commercial use.
         dtype: in which it multiplies, float32 or bfloat16.
@@ -71,22 +71,22 @@ def load(
         >>> model.animate("speech.wav", identity="F1").save("speech.mp4")  # doctest: +SKIP
         [PosixPath('speech.mp4')]
     """
-    source = model_or_bundled(None) if source is None else source
-    if not isinstance(source, str | Path):
-        raise FaceDiffError(f"source: is of the type {type(source).__name__}; {EXPECTED}")
-    if is_exported(source):
+    if source is not None and not isinstance(source, str | Path):
+        raise FaceDiffError(f"source: is of the type {type(source).__name__}; {EXPECTED_TO_ANIMATE}")
+    named: str | Path = model_or_bundled(source)
+    if is_exported(named):
         options = AnimationOptions(
-            checkpoint=source, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
+            checkpoint=named, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
         )
-        if is_audio2face(source):
+        if is_audio2face(named):
             return Audio2FaceAnimator.load(options)
         return ExportedAnimator.load(options)
-    check_model_source(source)  # before torch is imported
+    check_animating_source(named)  # before torch is imported
     from facediff.models import load_model
     from facediff.pipelines.trained import usable_device
 
-    module = load_model(source, usable_device(device), commercial_only=commercial_only)
-    return Animator(module, source, dtype=dtype)
+    module = load_model(named, usable_device(device), commercial_only=commercial_only)
+    return Animator(module, named, dtype=dtype)
 
 
 def import_checkpoint(

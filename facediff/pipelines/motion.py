@@ -19,7 +19,7 @@ from facediff.animation.files import AnimationFacts, complete, facts_of, read_an
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
-from facediff.utils.hub import is_graphs
+from facediff.utils.hub import bundled_by_name, is_graphs
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import SolveOptions, Weights
@@ -369,6 +369,7 @@ def _facts_of_model(source: Any, identity: str | None) -> AnimationFacts:  # noq
     from facediff.runtime.model import RuntimeModel
 
     is_file = isinstance(source, str | Path)
+    source = bundled_by_name(source) if is_file else source
     exported = RuntimeModel.open(Path(source)) if is_file and is_graphs(source) else getattr(source, "model", None)
     if isinstance(exported, RuntimeModel):
         return facts_of(exported.still(exported.stream(identity=identity)))
@@ -381,6 +382,7 @@ def _facts_of_model(source: Any, identity: str | None) -> AnimationFacts:  # noq
 
 def corpus_of_model(source: str | Path) -> str:
     """The corpus of a checkpoint or a folder, and whether it is synthetic, as it stands under a video."""
+    source = bundled_by_name(source)
     if is_graphs(source):
         from facediff.runtime.folder import read_folder
 

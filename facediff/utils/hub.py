@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.checksums import sha256
@@ -33,6 +33,12 @@ EXPECTED = (
     "expected a .ckpt file that `facediff fit` has written, a folder of `facediff publish`, or user/name[@revision] of "
     "the Hugging Face hub"
 )
+EXPECTED_TO_ANIMATE = (
+    f"expected {BUNDLED.name}, the model that comes with facediff; a .ckpt file that `facediff fit` has written; a "
+    f"folder of `facediff publish` or `export-model`; or user/name[@revision] of the Hugging Face hub"
+)
+
+Source = TypeVar("Source", bound="str | os.PathLike[str]")
 
 PATIENCE = 30.0
 """Seconds that the hub has for what it tells about a model; it is asked twice, since the cache may know more."""
@@ -77,21 +83,29 @@ def is_hub_name(text: str) -> bool:
     return match is not None and match["revision"] is None
 
 
-def check_model_source(source: str | os.PathLike[str], option: str = "") -> None:
+def bundled_by_name(source: Source) -> Source | Path:
+    """The folder of the model that comes with facediff, where its name is given and no file is called so."""
+    return BUNDLED if str(source) == BUNDLED.name and not os.path.lexists(source) else source
+
+
+def check_model_source(source: str | os.PathLike[str], option: str = "", expected: str = EXPECTED) -> None:
     """Refuse, before anything heavy is imported, what can be no trained model.
 
     Args:
         source: what the user gave.
         option: the option that names it, for messages.
+        expected: what it should be, for messages.
     """
     shown = f"{option} {source}".strip()
     source, _ = split_face(source)
+    if is_exported(bundled_by_name(source)):
+        raise FaceDiffError(f"{shown}: holds graphs, with which one can only animate; {EXPECTED}")
     if os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
         for name in (CONFIG, WEIGHTS, ASSETS):
             if not (Path(source) / name).is_file():
-                raise FaceDiffError(f"{shown}: this folder has no {name}, so it holds no model; {EXPECTED}")
+                raise FaceDiffError(f"{shown}: this folder has no {name}, so it holds no model; {expected}")
     elif not os.path.isfile(source) and hub_id(source) is None:  # noqa: PTH113
-        raise FaceDiffError(f"{shown}: no such checkpoint; {EXPECTED}")
+        raise FaceDiffError(f"{shown}: no such checkpoint; {expected}")
 
 
 def is_exported(source: str | os.PathLike[str]) -> bool:
@@ -128,19 +142,20 @@ def check_animating_source(source: str | os.PathLike[str]) -> None:
         FaceDiffError: as :func:`check_model_source`; a folder of ``facediff export-model`` is no error.
     """
     if not is_exported(source):
-        check_model_source(source)
+        check_model_source(source, expected=EXPECTED_TO_ANIMATE)
 
 
-def model_or_bundled(source: Path | None) -> Path:
-    """The model that somebody named, or the one that comes with facediff, which is said in a line.
+def model_or_bundled(source: Source | None) -> Source | Path:
+    """The model that somebody named, or the one that comes with facediff; that none was named is said in a line.
 
     Raises:
-        FaceDiffError: if none was named and this copy of facediff was installed without it.
+        FaceDiffError: if it is the latter, and this copy of facediff was installed without it.
     """
-    if source is not None:
-        return source
-    if not is_exported(BUNDLED):
+    named = BUNDLED if source is None else bundled_by_name(source)
+    if named is BUNDLED and not is_exported(BUNDLED):
         raise FaceDiffError(f"--checkpoint: missing, and this copy of facediff has no model at {BUNDLED}; {EXPECTED}")
+    if source is not None:
+        return named
     print(
         f"no --checkpoint: {BUNDLED.name}, the model that comes with facediff; its speech and faces are synthetic",
         file=sys.stderr,

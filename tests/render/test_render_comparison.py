@@ -9,6 +9,7 @@ import pytest
 
 from facediff.errors import FaceDiffError
 from facediff.render import Renderer, comparison, heat_colours
+from facediff.render.panels import heat_ramp
 
 # An octahedron.
 VERTICES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
@@ -37,6 +38,11 @@ def test_comparison_shows_truth_prediction_and_coloured_prediction(renderer: Ren
         np.testing.assert_array_equal(panels[:, 80:160], renderer.render(OFF[index]))
         # OpenCV's colour map and matplotlib's differ by rounding.
         np.testing.assert_allclose(panels[:, 160:].astype(int), renderer.render(OFF[index], colours=colours), atol=4)
+
+
+def test_the_ramp_is_cividis_throughout() -> None:
+    expected = 255 * matplotlib.colormaps["cividis"](np.arange(256))[:, :3]
+    assert np.abs(heat_ramp() - expected).max() < 12  # of 255, in the darkest blue, where cividis has a kink
 
 
 def test_comparison_key_shows_the_scale_and_stays_the_same(renderer: Renderer) -> None:

@@ -31,6 +31,22 @@ def test_a_recording_becomes_a_page_without_a_checkpoint_and_without_pytorch(tmp
     assert page.stat().st_size > 10_000
 
 
+def test_its_name_is_taken_unless_a_file_is_called_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert Path(facediff.load("puppet").source) == hub.BUNDLED
+    assert hub.model_or_bundled("./puppet") == "./puppet"
+    assert not capsys.readouterr().err  # it was named, so that nothing has to be said
+    with pytest.raises(FaceDiffError, match="--checkpoint puppet: holds graphs.*expected a .ckpt file"):
+        hub.check_model_source("puppet", "--checkpoint")
+    with pytest.raises(FaceDiffError, match="pupet: no such checkpoint; expected puppet, the model that comes"):
+        facediff.load("pupet")
+    (tmp_path / "puppet").mkdir()
+    with pytest.raises(FaceDiffError, match=r"this folder has no config.json"):
+        facediff.load("puppet")
+
+
 def test_it_is_small_and_knows_ten_people_and_their_moods() -> None:
     files = list(hub.BUNDLED.iterdir())
     assert sum(path.stat().st_size for path in files) < 16e6
