@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from facediff.animation.options import AnimationControls, ExportOptions, SourceOptions
 from facediff.cli.options import Animations, Output, check_source, with_different_names
 from facediff.cli.parsing import with_more_help
 from facediff.cli.process import tell
+from facediff.errors import FaceDiffError
+from facediff.utils.hub import bundled_by_name, may_have_weights
 
 
 def format_table() -> str:
@@ -40,9 +43,7 @@ def export(
     check_source(source, animations)
 
     from facediff.animation import Animation
-    from facediff.animation.files import has_values
     from facediff.editing.controls import check_controls
-    from facediff.editing.recorded_weights import SUFFIXES
     from facediff.export import FORMATS, check_export, check_used, write_animations
     from facediff.pipelines.motion import SourceReader
 
@@ -53,7 +54,8 @@ def export(
         footer = corpus_of_model(source.checkpoint)
     check_used(output.suffix, files.changed())
     options = replace(files, footer=footer, quiet=quiet)
-    weights = all(path.suffix.lower() in SUFFIXES or has_values(path) for path in animations)
+    lent = source.checkpoint is not None and may_have_weights(bundled_by_name(source.checkpoint))
+    weights = all(_may_have_weights(path, path.suffix == ".npy" and lent) for path in animations)
     check_export(output, options, len(animations), weights=weights)
     check_controls(controls)
     read = SourceReader(source).read
@@ -67,3 +69,19 @@ def export(
         counted = f"{len(inside)} files, " if written.is_dir() else ""
         tell(f"{written}: {counted}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
     tell(FORMATS[output.suffix].next_step)
+
+
+def _may_have_weights(path: Path, lent: bool) -> bool:
+    """Whether weights can be had of a file's motion before it is read whole; ``lent`` where a model completes it."""
+    from facediff.animation.files import has_values
+    from facediff.editing.blendshapes import is_built_in_face
+    from facediff.editing.recorded_weights import SUFFIXES
+    from facediff.utils.arrays import read_arrays
+
+    if lent or path.suffix.lower() in SUFFIXES or has_values(path):
+        return True
+    try:
+        arrays = read_arrays(path, ("faces", "template")) if path.suffix == ".npz" else {}
+    except FaceDiffError:  # whoever reads the file says what is wrong with it
+        return False
+    return {"faces", "template"} <= arrays.keys() and is_built_in_face(arrays["template"].size // 3, arrays["faces"])

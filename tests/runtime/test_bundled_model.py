@@ -47,6 +47,17 @@ def test_its_name_is_taken_unless_a_file_is_called_so(
         facediff.load("puppet")
 
 
+def test_its_motion_becomes_arkit_weights_without_shapes(tmp_path: Path) -> None:
+    facediff.load("puppet").animate(SPEECH).save(tmp_path / "take.npz")
+    np.save(tmp_path / "bare.npy", np.load(tmp_path / "take.npz")["vertices"])
+    main(["export", str(tmp_path / "take.npz"), "-o", str(tmp_path / "take.csv")])
+    main(["export", str(tmp_path / "bare.npy"), "--checkpoint", "puppet", "-o", str(tmp_path / "bare.csv")])
+    tables = [(tmp_path / name).read_text().splitlines() for name in ("take.csv", "bare.csv")]
+    assert "JawOpen" in tables[0][0]
+    assert len(tables[0]) == len(tables[1]) > 100
+    assert main(["export", str(tmp_path / "bare.npy"), "-o", str(tmp_path / "none.csv")]) == 2
+
+
 def test_it_is_small_and_knows_ten_people_and_their_moods() -> None:
     files = list(hub.BUNDLED.iterdir())
     assert sum(path.stat().st_size for path in files) < 16e6
