@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,10 @@ class Clip:
     def number(self) -> int:
         """The sentence's number: the last two characters, as in every project of the field; −1 if it has none."""
         return int(self.sentence[-2:]) if self.sentence[-2:].isdecimal() else -1
+
+    def fits(self, patterns: Mapping[str, str]) -> bool:
+        """Whether its attributes fit patterns such as ``{"voice": "flite:*"}``, all of them."""
+        return all(fnmatchcase(self.attributes.get(name, ""), pattern) for name, pattern in patterns.items())
 
     @property
     def words(self) -> str:

@@ -113,6 +113,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         augmentations: changes of training speech by name with their options, such as ``[voice:semitones=4, room,
             noise]``, in this order; see docs/voices.md.
         augmented_share: share of the training clips to which they are applied; the others stay as recorded.
+        augmented_clips: only those whose attribute fits a pattern are ever changed, such as ``{voice: "flite:*"}``;
+            attributes are the further columns of ``clips.csv``.
         people: folders of further speakers to train on, as ``facediff data import-person`` writes them; they come first
             in the order of the identity index.
         extra_identities: further identities of the corpus to train on, with those of their clips that belong to no
@@ -169,6 +171,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         predict_split: Split | None = None,
         augmentations: list[str] | None = None,
         augmented_share: Annotated[float, Range(0, 1)] = 1.0,
+        augmented_clips: dict[str, str] | None = None,
         people: list[str] | None = None,
         extra_identities: list[str] | None = None,
         train_identities: Annotated[list[str], Range(items=(1, 1_000_000))] | None = None,
@@ -193,6 +196,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.augmenter: Augmenter | None = None
         if augmentations:
             self.augmenter = Augmenter(read_augmentations(augmentations), augmented_share)
+        self.augmented_clips = augmented_clips or {}
         self.people = [Path(folder).expanduser() for folder in people or []]
         self.regions = {
             name: self.region_sources[name] if chosen is None else (chosen,)
@@ -444,6 +448,14 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         policy = self.reference_policy()
         if not training or self.reference != "self":
             policy.check(clips)
+        kept = (
+            [clip.name for clip in clips if not clip.fits(self.augmented_clips)] if training and self.augmenter else []
+        )
+        if clips and len(kept) == len(clips):
+            raise FaceDiffError(
+                f"data.augmented_clips: {self.augmented_clips} fits none of the {len(clips)} training clips, of which the "
+                f"first has the attributes {clips[0].attributes}; expected the name of one with a pattern such as flite:*"
+            )
         return MotionDataset(
             self.corpus,
             clips,
@@ -457,6 +469,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             context=self.window_context if training and self.window is not None else (0, 0),
             aligner=self.aligner if training and self.pair_sentences else None,
             augmenter=self.augmenter if training else None,
+            kept=frozenset(kept),
             mouth=self._mouth() if training and self.augmenter is not None else None,
             projection=self.projection if training and self.augmenter is None else ProjectionSlot(),
         )
