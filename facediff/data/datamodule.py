@@ -448,14 +448,14 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         policy = self.reference_policy()
         if not training or self.reference != "self":
             policy.check(clips)
-        kept = (
-            [clip.name for clip in clips if not clip.fits(self.augmented_clips)] if training and self.augmenter else []
-        )
-        if clips and len(kept) == len(clips):
-            raise FaceDiffError(
-                f"data.augmented_clips: {self.augmented_clips} fits none of the {len(clips)} training clips, of which the "
-                f"first has the attributes {clips[0].attributes}; expected the name of one with a pattern such as flite:*"
-            )
+        kept: set[str] = set()
+        if training and self.augmenter is not None:
+            kept = {clip.name for clip in clips if not clip.fits(self.augmented_clips)}
+            if len(kept) == len(clips) > 0:
+                raise FaceDiffError(
+                    f"data.augmented_clips: {self.augmented_clips} fits none of the {len(clips)} clips; expected "
+                    f"attributes with a pattern each, and the first clip's are {clips[0].attributes}"
+                )
         return MotionDataset(
             self.corpus,
             clips,

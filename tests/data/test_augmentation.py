@@ -162,6 +162,20 @@ def test_training_hears_changed_speech_and_tests_do_not(puppet_of_two: str) -> N
         data.dataset("train", training=True)
 
 
+def test_only_clips_that_fit_are_changed(puppet_of_two: str) -> None:
+    def heard(**options: object) -> list[np.ndarray]:
+        dataset = Puppet(root=puppet_of_two, **options).dataset("train", training=True)
+        return [dataset[index].audio.numpy() for index in range(2)]
+
+    plain = heard()
+    changes = {"augmentations": ["tilt:share=1"]}
+    for patterns, changed in (({"mood": "live*"}, [1]), ({"mood": "neutral", "subject": "F1"}, [0]), ({}, [0, 1])):
+        now = heard(**changes, augmented_clips=patterns)
+        assert [index for index in range(2) if not np.array_equal(now[index], plain[index])] == changed
+    with pytest.raises(FaceDiffError, match=r"augmented_clips: {'mood': 'sad'} fits none .* 'mood': 'neutral'"):
+        heard(**changes, augmented_clips={"mood": "sad"})
+
+
 @pytest.fixture(scope="module")
 def puppet_of_two(tmp_path_factory: pytest.TempPathFactory) -> str:
     pytest.importorskip("espeakng_loader")
