@@ -232,7 +232,7 @@ class LastCheckpoint(Callback):
             path, name = self.path(trainer), signal.Signals(number).name
             print(
                 f"facediff fit: stopped by {name}; {path} holds the state after step {self._saved_step}, continue with "
-                f"the same command and --ckpt_path last",
+                f"the same command, and with --ckpt_path last for `facediff fit`",
                 file=sys.stderr,
                 flush=True,
             )

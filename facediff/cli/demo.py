@@ -38,6 +38,7 @@ def demo(
     Makes the built-in synthetic corpus, trains the small dual-path model on it, distils its audio encoder for
     other voices and rooms, scores it on sentences that were not in training, writes videos of truth next to
     prediction, and compares it with the model that comes with facediff. About ten minutes on two CPU cores.
+    The same command continues a training that was stopped.
 
     Args:
         output: folder for all results
@@ -45,6 +46,7 @@ def demo(
         epochs: training epochs (default: the config's)
         data_root: where the corpus is kept (default: the user's cache folder)
     """
+    from facediff.callbacks.runs import LAST
     from facediff.cli.adapt import write_distilled
     from facediff.cli.lightning import run_cli
     from facediff.export import ExportOptions, check_export
@@ -67,8 +69,9 @@ def demo(
     briefly = "; --fast is far too short for the quality that the manual shows" if fast else ""
     report(f"training on the built-in synthetic corpus ({CONFIG}{briefly})")
     logger = [f"--trainer.logger.save_dir={output}", "--trainer.logger.name=training"]
-    fitted = run_cli("fit", ["--config", CONFIG, *logger, *options])
     checkpoint = output / "puppet.ckpt"
+    stopped = not checkpoint.exists() and any((output / "training").glob(f"*/{LAST}"))
+    fitted = run_cli("fit", ["--config", CONFIG, *logger, *options, *(("--ckpt_path", "last") if stopped else ())])
     # The name stands for the finished model: a demo that is killed while it adapts leaves no other under it.
     with scratch_folder(checkpoint) as hidden:
         trained = checkpoint if fast else hidden / checkpoint.name

@@ -12,6 +12,7 @@ import pytest
 
 from facediff.callbacks.outputs import METHOD_NAMES
 from facediff.cli.app import main
+from facediff.errors import FaceDiffError
 
 
 def run_demo(folder: Path, *words: str) -> dict[tuple[str, str], float]:
@@ -48,6 +49,23 @@ def test_the_demo_learns_to_speak(tmp_path: Path) -> None:
 def test_the_fast_demo_writes_the_same_files(tmp_path: Path) -> None:
     lve = run_demo(tmp_path, "--fast")
     assert lve["test_a", "model"] < lve["test_a", "still"]
+
+
+def test_a_demo_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[str]] = []
+
+    def train(name: str, arguments: list[str]) -> None:
+        asked.append([name, *arguments])
+        raise FaceDiffError("enough")
+
+    monkeypatch.setattr("facediff.cli.lightning.run_cli", train)
+    last = tmp_path / "training" / "version_0" / "checkpoints" / "last.ckpt"
+    for file in (None, last, tmp_path / "puppet.ckpt"):  # a new one, a stopped one, one that came to its end
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.touch()
+        assert main(["demo", "-o", str(tmp_path)]) == 2
+    assert [words[-2:] == ["--ckpt_path", "last"] for words in asked] == [False, True, False]
 
 
 def test_fast_and_epochs_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1123,7 +1123,7 @@ def read_whether_it_has_values(path: Path) -> object:
     return has_values(path)
 
 
-def read_whether_it_may_have_weights(path: Path) -> object:
+def read_whether_an_animation_may_have_weights(path: Path) -> object:
     """Whether weights can be had of an archive's motion."""
     from facediff.cli.export import _may_have_weights
 
@@ -1183,7 +1183,7 @@ READERS = {
     **{f"direction, {suffix}": Reader(f".{suffix}", direction, read_the_direction) for suffix in ("json", "csv")},
     "animation": Reader(".npz", animation, read_an_animation),
     "animation, its channels": Reader(".npz", animation, read_whether_it_has_values, 0.5),
-    "animation, its topology": Reader(".npz", animation, read_whether_it_may_have_weights, 0.5),
+    "animation, its topology": Reader(".npz", animation, read_whether_an_animation_may_have_weights, 0.5),
     "style, archive": Reader(".npz", animation, read_a_style),
     "style, array": Reader(".npy", vertices, read_a_style),
     "correspondence": Reader(".npz", correspondence, read_correspondence),
