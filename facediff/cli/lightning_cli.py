@@ -6,6 +6,7 @@ arguments have been checked.
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import sys
@@ -227,6 +228,9 @@ def explain(message: str) -> str:
         names = component_options(message)
         wrong = option if flag else f"{option}.{match[1]}"
         return f"--{wrong}: there is no such option; {choices(match[1], names) if names else see}"
+    if match := re.search(r"[Uu]nrecognized arguments: --trainer\.(\w+)", message):
+        names = list(inspect.signature(Trainer.__init__).parameters)[1:]
+        return f"--trainer.{match[1]}: there is no such option; {choices(match[1], names)}"
     if match := re.search(r"arguments? (?:is|are) required: (.*)", message):
         missing = [f"--{option}.{name}" if option else f"--{name.partition('.')[2]}" for name in match[1].split(", ")]
         return f"{' and '.join(missing)} must be given, as an option or in a file with --config; {see}"

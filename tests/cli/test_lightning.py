@@ -159,6 +159,7 @@ def test_training_resumes(fit: Fit, checkpoint: Path, tmp_path: Path) -> None:
         (["--model.audio_encoder=hubret"], 'did you mean "hubert"?'),
         (["--model=DualPathDifusion"], 'did you mean "DualPathDiffusion"?'),
         (["--data=Pupet"], 'did you mean "Puppet"?'),
+        (["--trainer.max_epoch=3"], '--trainer.max_epoch: there is no such option; did you mean "max_epochs"?'),
     ],
 )
 def test_a_wrong_name_lists_the_right_ones(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
