@@ -1,10 +1,11 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
-The recipe, where flite is installed and no voice of Festival but kal, on one core in about 50 minutes (with eight
-more of Festival's voices, four of them women's, lips closed at 0.42 instead of 0.66 of the closures of flite's slt):
+The recipe, where flite is installed and no voice of Festival but kal, on one core in about 50 minutes. flite's three
+voices, made from recordings of people, get other pitches and vocal tracts, since they are few and all men's:
 
     $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
-        --model.motion_space.eyelids_weight=20
+        --model.motion_space.eyelids_weight=20 --data.augmentations='["voice:share=1,semitones=8,formants=0.3"]' \
+        --data.augmented_share=0.7 --data.augmented_clips='{voice: "f*"}'
     $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 2400 \
         --augmentation voice:share=0.9,semitones=8,formants=0.3 --augmentation loudness:share=0.3 \
         --augmentation room:share=0.6,seconds=0.8,direct=-4 --augmentation tilt:share=0.6 \
