@@ -5,7 +5,7 @@ voices, made from recordings of people, get other pitches and vocal tracts, sinc
 
     $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
         --model.motion_space.eyelids_weight=20 --data.augmentations='["voice:share=1,semitones=8,formants=0.3"]' \
-        --data.augmented_share=0.7 --data.augmented_clips='{voice: "f*"}'
+        --data.augmented_share=0.5 --data.augmented_clips='{voice: "f*"}' --trainer.max_epochs=12
     $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 2400 \
         --augmentation voice:share=0.9,semitones=8,formants=0.3 --augmentation loudness:share=0.3 \
         --augmentation room:share=0.6,seconds=0.8,direct=-4 --augmentation tilt:share=0.6 \
