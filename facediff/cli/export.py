@@ -45,6 +45,7 @@ def export(
     from facediff.animation import Animation
     from facediff.editing.controls import check_controls
     from facediff.export import FORMATS, check_export, check_used, write_animations
+    from facediff.export.writing import seeks_weights
     from facediff.pipelines.motion import SourceReader
 
     footer = ""  # under a video: the corpus, and whether it is synthetic
@@ -55,7 +56,9 @@ def export(
     check_used(output.suffix, files.changed())
     options = replace(files, footer=footer, quiet=quiet)
     lent = source.checkpoint is not None and may_have_weights(bundled_by_name(source.checkpoint))
-    weights = all(_may_have_weights(path, path.suffix == ".npy" and lent) for path in animations)
+    weights = seeks_weights(output, options) and all(
+        _may_have_weights(path, path.suffix == ".npy" and lent) for path in animations
+    )
     check_export(output, options, len(animations), weights=weights)
     check_controls(controls)
     read = SourceReader(source).read

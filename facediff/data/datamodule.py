@@ -448,14 +448,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         policy = self.reference_policy()
         if not training or self.reference != "self":
             policy.check(clips)
-        kept: set[str] = set()
-        if training and self.augmenter is not None:
-            kept = {clip.name for clip in clips if not clip.fits(self.augmented_clips)}
-            if len(kept) == len(clips) > 0:
-                raise FaceDiffError(
-                    f"data.augmented_clips: {self.augmented_clips} fits none of the {len(clips)} clips; expected "
-                    f"attributes with a pattern each, and the first clip's are {clips[0].attributes}"
-                )
+        if training and self.augmenter and clips and not any(clip.fits(self.augmented_clips) for clip in clips):
+            raise FaceDiffError(
+                f"data.augmented_clips: {self.augmented_clips} fits none of the {len(clips)} clips; expected "
+                f"attributes with a pattern each, and the first clip's are {clips[0].attributes}"
+            )
         return MotionDataset(
             self.corpus,
             clips,
@@ -469,7 +466,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             context=self.window_context if training and self.window is not None else (0, 0),
             aligner=self.aligner if training and self.pair_sentences else None,
             augmenter=self.augmenter if training else None,
-            kept=frozenset(kept),
+            augmented_clips=self.augmented_clips,
             mouth=self._mouth() if training and self.augmenter is not None else None,
             projection=self.projection if training and self.augmenter is None else ProjectionSlot(),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
@@ -391,7 +391,7 @@ class MotionDataset(Dataset[Sample]):
         context: frames before and after a training window that are read with it.
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
         augmenter: changes training speech; None leaves it as it was recorded.
-        kept: names of the clips that the augmenter does not change.
+        augmented_clips: patterns of attributes, of which the augmenter changes only clips that fit them.
         mouth: which vertices speech moves (V,), 0 to 1; needed with an augmenter.
         projection: may make components (T, K) of motion (T, V, 3), which are kept in memory.
     """
@@ -409,7 +409,7 @@ class MotionDataset(Dataset[Sample]):
     context: tuple[int, int] = (0, 0)
     aligner: Aligner | None = None
     augmenter: Augmenter | None = None
-    kept: frozenset[str] = frozenset()
+    augmented_clips: Mapping[str, str] = field(default_factory=dict)
     mouth: npt.NDArray[np.float32] | None = None
     projection: ProjectionSlot = field(default_factory=ProjectionSlot)
     _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
@@ -435,7 +435,7 @@ class MotionDataset(Dataset[Sample]):
         first, last = self._with_context(clip, start, stop)
         audio = self.corpus.read_audio(clip, first, last)
         motion = self.projection.read(self.corpus, clip, first, last)
-        if self.augmenter is not None and clip.name not in self.kept:
+        if self.augmenter is not None and clip.fits(self.augmented_clips):
             audio, motion = self._augmented(self.augmenter, clip, audio, motion, pick.seed)
         return Sample(
             audio=audio,
