@@ -10,6 +10,16 @@ MANY = 40
 """Names that are no longer listed in full."""
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun, whose plural ends in s.
+
+    Example:
+        >>> counted(1, "clip"), counted(2, "clip")
+        ('1 clip', '2 clips')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def choices(name: str, candidates: Iterable[str]) -> str:
     """What follows "there is no …": the nearest of the known names, then all of them, unless they are very many."""
     names = list(candidates)

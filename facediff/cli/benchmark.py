@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.cli.options import OutputFolder, Scheduler, Seed, Workers
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, counted
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -92,7 +92,7 @@ def benchmark(
         results, _ = read_results(folder, outline)
         old = sum(1 for result in results if result.problem) - failed
         if old:
-            tell(f"{old} cells had failed before; --retry-failed tries them again")
+            tell(f"{counted(old, 'cell')} had failed before; --retry-failed runs what failed again")
         if all(result.problem for result in results):
             raise FaceDiffError(f"every cell failed, the first: {next(result.problem for result in results)}")
         write_and_tell(folder, None, RESAMPLES, 0.95, 0, None)
@@ -169,7 +169,7 @@ def announce(
     from facediff.utils.tables import format_table
 
     at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"
-    tell(f"{plan.title}: {len(cells)} cells, {len(cells) - len(left)} done, {len(left)} to run, {at_a_time}")
+    tell(f"{plan.title}: {counted(len(cells), 'cell')}, {len(cells) - len(left)} done, {len(left)} to run, {at_a_time}")
     if not left:
         return
     rows = [[str(cell), cell.kind, None if seconds[cell] is None else f"{seconds[cell]:.0f} s"] for cell in left]
@@ -179,7 +179,7 @@ def announce(
     if timed:
         # With one worker the times add up; several share them, and the longest cell is the least that it takes.
         total = max(sum(timed) / (workers or 1), max(timed))
-        unknown = f", and {missing} cells that were never timed" if missing else ""
+        unknown = f", and {counted(missing, 'cell')} without a timing" if missing else ""
         one = "" if workers else " on one worker"
         tell(f"about {total / 60:.0f} minutes{one} by the last timings{unknown}")
     else:

@@ -9,7 +9,7 @@ from facediff.animation.options import SourceOptions, Tracks
 from facediff.cli.options import Picture, check_picture_path, check_source
 from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -119,7 +119,7 @@ def blendshapes(
         from facediff.export.pictures import draw_worst_frame
 
         draw_worst_frame(show, own, found, weights)
-    tell(f"{output}: {len(weights.values)} frames, {len(weights.names)} shapes")
+    tell(f"{output}: {counted(len(weights.values), 'frame')}, {counted(len(weights.names), 'shape')}")
     tell(*found.notes, *remarks(weights, plain=plain))
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
 from facediff.cli.parsing import OptionGroup, Parameter, Parameters, parameters_of, parse
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, choices, printable
+from facediff.errors import FaceDiffError, choices, counted, printable
 from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
@@ -199,8 +199,8 @@ def describe(report: PreparationReport) -> list[str]:
     """The report as lines for the screen."""
     totals, manifest = report.totals, report.out / "manifest.json"
     lines = [
-        f"{report.out}: {totals['clips']} clips, {totals['frames']} frames, {totals['seconds'] / 60:.1f} min, "
-        f"{totals['bytes'] / 1e9:.2f} GB; {report.written} written now"
+        f"{report.out}: {counted(totals['clips'], 'clip')}, {counted(totals['frames'], 'frame')}, "
+        f"{totals['seconds'] / 60:.1f} min, {totals['bytes'] / 1e9:.2f} GB; {report.written} written now"
     ]
     for title, entries in (("missing", report.missing), ("failed", report.failed)):
         if entries:
@@ -281,8 +281,9 @@ def pack(
         )
     left_out = [f"note: left out, since it belongs to no clip: {name}" for name in report.left_out]
     tell(
-        f"{out}: {report.clips} clips, {report.seconds / 60:.1f} min, {report.after / 1e9:.3g} GB of "
-        f"{report.before / 1e9:.3g} GB, {report.gb_an_hour:.2f} GB an hour; {report.written} shards written now",
+        f"{out}: {counted(report.clips, 'clip')}, {report.seconds / 60:.1f} min, {report.after / 1e9:.3g} GB "
+        f"of {report.before / 1e9:.3g} GB, {report.gb_an_hour:.2f} GB an hour; "
+        f"{counted(report.written, 'shard')} written now",
         *shortened(left_out, "note: … and {} more"),
         f"Next: facediff data check {out}",
     )
@@ -301,7 +302,7 @@ def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions = USUAL_WORK) ->
     from facediff.data.packed.unpacking import unpack as unpack_folder
 
     clips = unpack_folder(packed, out, **vars(work))
-    tell(f"{out}: {clips} clips", f"Next: facediff data check {out}")
+    tell(f"{out}: {counted(clips, 'clip')}", f"Next: facediff data check {out}")
 
 
 # ``facediff data import-person``

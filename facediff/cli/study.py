@@ -21,7 +21,7 @@ from facediff.cli.options import (
 )
 from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import confirm_cost, tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.utils import ranges
 from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
@@ -141,8 +141,8 @@ def make(
     trials = study.trials_of(0)
     controls = sum(trial.kind != "pair" for trial in trials)
     tell(
-        f"{output}: {len(plan.videos)} videos ({drawn} drawn, {len(plan.videos) - drawn} up to date) of "
-        f"{len(plan.clips)} clips of {', '.join(study.conditions)}",
+        f"{output}: {counted(len(plan.videos), 'video')} ({drawn} drawn, {len(plan.videos) - drawn} up to date) of "
+        f"{counted(len(plan.clips), 'clip')} of {', '.join(study.conditions)}",
         f"a rater sees {len(trials)} videos, {controls} of them controls, in about {plan.minutes:.0f} minutes; sides "
         f"and orders are balanced over {len(study.schedules)} raters",
         f"hand out {output / 'page'}, or run  facediff study serve {output}",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from facediff.animation.options import SourceOptions
 from facediff.cli.options import Animations, File, Output, check_source, with_different_names
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -62,8 +62,8 @@ def view(
     page.save(output, max_mb=max_mb)
     shown = page.animations
     size = output.stat().st_size / 1e6
-    counted = "1 animation" if len(shown) == 1 else f"{len(shown)} animations"
-    tell(f"{output}: {len(shown[0].vertices)} frames of {counted}, {size:.1f} MB; open it in a browser")
+    frames, animations = counted(len(shown[0].vertices), "frame"), counted(len(shown), "animation")
+    tell(f"{output}: {frames} of {animations}, {size:.1f} MB; open it in a browser")
     if open:
         import webbrowser
 

@@ -151,15 +151,17 @@ def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
 
 @augmentation.register("voice")
 class Voice(SpeechAugmentation):
-    """Another speaker's pitch and formants, each by a random amount.
+    """Another speaker's pitch and formants, each by a random amount or both by the same.
 
     The pitch is shifted by a phase vocoder and resampling, the spectral envelope is warped along frequency (vocal-tract
-    length), so that the two are independent; the timing of sounds stays.
+    length), so that the two are independent; the timing of sounds stays. A shorter vocal tract mostly has a higher
+    voice, and a warped envelope sounds less like a person than resampled speech: ``together`` leaves the warping out.
 
     Args:
         share: of the augmented clips.
         semitones: largest change of the pitch, up or down.
         formants: largest change of the formants, up or down, as a share of their frequency.
+        together: share of the changes in which the formants move with the pitch, by up to ``semitones``.
     """
 
     def __init__(
@@ -168,12 +170,15 @@ class Voice(SpeechAugmentation):
         share: Share = 0.7,
         semitones: Annotated[float, Range(0, 24)] = 5.0,
         formants: Annotated[float, Range(0, 0.6)] = 0.2,
+        together: Share = 0.0,
     ) -> None:
         super().__init__(share=share)
-        self.semitones, self.formants = semitones, formants
+        self.semitones, self.formants, self.together = semitones, formants, together
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Shift pitch and formants."""
+        if self.together and random.random() < self.together:
+            return shifted(speech, 2.0 ** (random.uniform(-self.semitones, self.semitones) / 12))
         pitch = 2.0 ** (random.uniform(-self.semitones, self.semitones) / 12)
         warp = (1 + self.formants) ** random.uniform(-1, 1)
         if abs(pitch - 1) > 0.02:

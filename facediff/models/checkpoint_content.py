@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, counted
 from facediff.models.inference import Inference, Style
 from facediff.models.layers import frame_mask
 from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, plain
@@ -328,7 +328,7 @@ class PersonStyles(CheckpointContent):
                     vectors = torch.func.functional_call(encoder, named, (pad(parts), mask)).float()
                     total, frames = total + (vectors * lengths[:, None]).sum(0).cpu(), frames + int(lengths.sum())
                 if frames and total.numel():
-                    styles[name] = Style(f"all motion of {name} ({len(clips)} clips)", total / frames)
+                    styles[name] = Style(f"all motion of {name} ({counted(len(clips), 'clip')})", total / frames)
         for module, mode in modes:
             module.training = mode
         self.person_styles, self._styles_of_step = styles, step

@@ -90,7 +90,7 @@ def test_the_published_config_trains_and_animates(
         assert ((batch.partner_frames >= 0) & batch.window_mask).sum() > 40, "most of the frames have a partner"
     # The styles of all motion, of seen and unseen speakers; no clip that is evaluated is among them.
     assert model.person_styles.keys() == CLIPS.keys()
-    assert model.person_styles[VALIDATION].name.endswith("(1 clips)")
+    assert model.person_styles[VALIDATION].name.endswith("(1 clip)")
 
     best = next((tmp_path / "runs").rglob("best.ckpt"))
     loaded = load_model(best)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -106,6 +108,23 @@ def test_warping_moves_a_formant_and_not_the_pitch(ratio: float) -> None:
     assert spectrum[150:7000:100].max() < 0.02 * of_harmonics.max()  # nothing between the harmonics
     centre = (of_harmonics**2 * harmonics[: len(of_harmonics)]).sum() / (of_harmonics**2).sum()
     assert centre == pytest.approx(1500 * ratio, rel=0.05)
+
+
+def test_formants_move_with_the_pitch_where_both_are_changed_together() -> None:
+    time = np.arange(2 * RATE) / RATE
+    tones = {300: 1.0, 2000: 0.5}
+    speech = sum(size * np.sin(2 * np.pi * hertz * time) for hertz, size in tones.items()).astype(np.float32)
+    given, together = replace(example(), speech=speech), only("voice:share=1,semitones=5,formants=0,together=1")
+    ratios = []
+    for seed in range(8):
+        made = together(given, np.random.default_rng(seed)).speech
+        spectrum = np.abs(np.fft.rfft(made[4000:20_000] * np.hanning(16_000)))  # a hertz a bin
+        low, high = np.argmax(spectrum[:1000]), 1000 + np.argmax(spectrum[1000:])
+        assert high / low == pytest.approx(2000 / 300, rel=0.01)
+        assert spectrum[high] / spectrum[low] == pytest.approx(0.5, rel=0.15)
+        ratios.append(low / 300)
+    assert 2 ** (-5 / 12) < min(ratios) < 0.9
+    assert 1.1 < max(ratios) < 2 ** (5 / 12)
 
 
 @pytest.mark.parametrize("name", ["noise", "hum", "babble", "music"])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.live.receivers.json_lines import MOST_CLIENTS
 from facediff.spaces.arkit import ARKIT
 from tests.fakes.waiting import PATIENCE, free_port, wait_until
@@ -33,7 +33,7 @@ def test_a_file_has_the_performance_its_frames_and_the_end(opened: Opened, tmp_p
     receiver = opened(f"jsonl:{path}")
     for index in (0, 1, 4):
         receiver.send(frame(index, dropped=index // 2))
-        wait_for(receiver, f"{1 + min(index, 2)} frames")
+        wait_for(receiver, counted(1 + min(index, 2), "frame"))
     assert not path.exists()
     receiver.close()
     head, *frames, end = [json.loads(text) for text in path.read_text().splitlines()]
@@ -66,7 +66,7 @@ def test_several_clients_each_get_whole_lines_from_when_they_came(opened: Opened
         client = connect(port)
         streams.append(client.makefile("rb"))
         client.close()  # the stream goes on
-        wait_for(receiver, f"{len(streams)} clients")
+        wait_for(receiver, counted(len(streams), "client"))
         assert json.loads(streams[-1].readline())["type"] == "performance"
         for index in range(begin, begin + 10):
             receiver.send(frame(index))
@@ -98,7 +98,7 @@ def test_a_client_that_left_is_forgotten(opened: Opened) -> None:
     port = free_port()
     receiver = opened(f"jsonl:{port}")
     client = connect(port)
-    wait_for(receiver, "1 clients")
+    wait_for(receiver, "1 client")
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\0\0\0\0\0\0\0")
     client.close()
 

@@ -32,7 +32,7 @@ from facediff.data.person.fitting import (
 from facediff.data.person.motion import Array, FaceSequence, read_motion, scratch_array
 from facediff.data.prepare.motion import resample_frames, resampled_length
 from facediff.data.prepare.runner import MANIFEST, version, write_clip, write_templates
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
@@ -315,7 +315,11 @@ class ImportReport:
                 "sound and motion",
                 f"sound is {abs(self.mismatch):.2f} s {'longer' if self.mismatch >= 0 else 'shorter'}",
             ),
-            ("written", f"{self.clips} clips ({splits}), {self.frames_written} frames at {self.corpus_frame_rate:g}/s"),
+            (
+                "written",
+                f"{counted(self.clips, 'clip')} ({splits}), {self.frames_written} frames at "
+                f"{self.corpus_frame_rate:g}/s",
+            ),
         ]
         return [
             *(f"{title:<21}{text}" for title, text in rows),

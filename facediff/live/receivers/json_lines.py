@@ -23,7 +23,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiver
 from facediff.live.receivers.sending import Outbox, endpoint, listen, log
 from facediff.registry import receiver
@@ -275,5 +275,5 @@ class _Clients:
     def status(self, sent: int, dropped: int) -> str:
         with self._lock:
             missed = dropped + self._missed + sum(outbox.dropped for outbox in self._clients.values())
-            parts = [f"{sent} frames", f"{len(self._clients)} clients", f"{self.connected} so far"]
+            parts = [counted(sent, "frame"), counted(len(self._clients), "client"), f"{self.connected} so far"]
         return ", ".join(parts + ([f"{missed} frames missed by slow ones"] if missed else []))

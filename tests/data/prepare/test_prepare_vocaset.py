@@ -285,7 +285,7 @@ def test_mesh_masks_and_regions_are_copied_if_they_are_there(raw: Path, tmp_path
 def test_the_command_line(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = raw.parent / "out"
     assert run("data prepare", ["vocaset", str(raw), str(out), "--frame-rate", "60", "--workers", "1"]) == 0
-    assert "1 clips, 25 frames" in capsys.readouterr().out
+    assert "1 clip, 25 frames" in capsys.readouterr().out
     with pytest.raises(FaceDiffError, match="--frame-rate was 60 and is 30"):
         run("data prepare", ["vocaset", str(raw), str(out), "--workers", "1"])
 
