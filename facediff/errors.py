@@ -10,14 +10,24 @@ MANY = 40
 """Names that are no longer listed in full."""
 
 
-def counted(number: int, noun: str) -> str:
-    """A number with its noun, whose plural ends in s.
+def number(value: int) -> str:
+    """A whole number with spaces between thousands.
 
     Example:
-        >>> counted(1, "clip"), counted(2, "clip")
-        ('1 clip', '2 clips')
+        >>> number(23370)
+        '23 370'
     """
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    return f"{value:,}".replace(",", " ")
+
+
+def counted(value: int, one: str, many: str | None = None) -> str:
+    """A number and its noun.
+
+    Example:
+        >>> counted(1, "clip"), counted(3879, "frame"), counted(2, "vertex", "vertices")
+        ('1 clip', '3 879 frames', '2 vertices')
+    """
+    return f"{number(value)} {one if value == 1 else many or one + 's'}"
 
 
 def choices(name: str, candidates: Iterable[str]) -> str:

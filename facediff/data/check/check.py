@@ -26,7 +26,7 @@ from facediff.data.check.layouts import (
 )
 from facediff.data.check.packed import check_packed, examine_packed
 from facediff.data.check.recordings import check_recordings, parametric_module, refuse_layout
-from facediff.data.check.report import FEW, CheckReport, Findings, counted, few, number
+from facediff.data.check.report import FEW, CheckReport, Findings, few
 from facediff.data.check.shared import (
     check_account,
     check_areas,
@@ -40,7 +40,7 @@ from facediff.data.check.shared import (
 from facediff.data.check.truth import measure_truth
 from facediff.data.packed.stores import is_packed
 from facediff.data.storage import WEIGHTS_FOLDER
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted, number
 from facediff.utils.jobs import is_cluster, run_tasks
 from facediff.utils.workers import WorkerDied, processors
 

@@ -14,10 +14,10 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin, get_type_hints
 
-from facediff.data.check.report import CheckReport, Findings, few, number
+from facediff.data.check.report import CheckReport, Findings, few
 from facediff.data.manifest import load_manifest
 from facediff.data.storage import WEIGHTS_FOLDER, rig_path
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, number
 from facediff.utils.arrays import open_array, vertices_of
 
 if TYPE_CHECKING:

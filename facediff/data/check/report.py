@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from facediff.errors import FaceDiffError, MissingExtraError, printable
+from facediff.errors import FaceDiffError, MissingExtraError, counted, number, printable
 from facediff.utils.tables import format_table
 
 Severity = Literal["error", "warning", "note"]
@@ -123,24 +123,6 @@ def few(names: Iterable[object]) -> str:
     texts = [str(name) for name in names]
     more = f" and {number(len(texts) - FEW)} more" if len(texts) > FEW else ""
     return ", ".join(texts[:FEW]) + more
-
-
-def number(value: int) -> str:
-    """A whole number with spaces between thousands.
-
-    >>> number(23370)
-    '23 370'
-    """
-    return f"{value:,}".replace(",", " ")
-
-
-def counted(value: int, one: str, many: str | None = None) -> str:
-    """A number and its noun.
-
-    >>> counted(1, "clip"), counted(3879, "frame"), counted(2, "vertex", "vertices")
-    ('1 clip', '3 879 frames', '2 vertices')
-    """
-    return f"{number(value)} {one if value == 1 else many or one + 's'}"
 
 
 # The report as text.

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from facediff.data.check.clip import Array
 from facediff.data.check.layouts import MANIFEST, STATE, CorpusView
-from facediff.data.check.report import Findings, counted, few, number, relative
-from facediff.errors import FaceDiffError
+from facediff.data.check.report import Findings, few, relative
+from facediff.errors import FaceDiffError, counted, number
 from facediff.mesh.mesh import surface_area
 from facediff.utils.checksums import sha256
 

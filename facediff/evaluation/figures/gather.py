@@ -71,7 +71,7 @@ def gather(
         templates = corpus / "templates.pkl"
     if module is None and templates is None and not any(folder.glob("**/*.npy")):
         raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
-    n_vertices = module.n_vertices if module else count_vertices(None, templates, folder)
+    n_vertices = _vertices(module, manifest) if module else count_vertices(None, templates, folder)
     faces = {} if templates is None else read_templates(templates, n_vertices)
     found_mesh = _find_mesh(mesh, corpus or folder, module, n_vertices)
     rate, stride = _rates(frame_rate, truth_stride, manifest, module)
@@ -118,11 +118,17 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module
     if not folder.motions or isinstance(manifest.get("person"), str):
         return None
     module = recognise(folder, manifest.get("corpus"), folder.n_vertices())
-    return module if module is not None and module.n_vertices == folder.n_vertices() else None
+    return module if module is not None and _vertices(module, manifest) == folder.n_vertices() else None
+
+
+def _vertices(module: Module, manifest: dict[str, Any]) -> int:
+    """By the folder's manifest, since a data module may read several topologies; else the data module's."""
+    stated = manifest.get("vertices")
+    return stated if isinstance(stated, int) else module.n_vertices
 
 
 def _find_mesh(path: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
-    """The mesh given, else the one in the corpus folder, else that of the built-in corpus; None without one."""
+    """The mesh given, else the one in the corpus folder, else the first edition's; None without one."""
     if path is not None:
         mesh = read_mesh(path)
         if len(mesh.vertices) != n_vertices:
@@ -134,8 +140,8 @@ def _find_mesh(path: Path | None, root: Path, module: Module | None, n_vertices:
     for file in files:
         if file.is_file() and len((mesh := read_mesh(file)).vertices) == n_vertices:
             return mesh
-    if module is not None and module.corpus_name == "puppet":
-        return built_in_mesh()
+    if module is not None and module.corpus_name == "puppet" and len((first := built_in_mesh()).vertices) == n_vertices:
+        return first
     return None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +23,9 @@ from facediff.evaluation.figures import (
     pick_frames,
     read_pairs,
 )
+from facediff.evaluation.figures.gather import gather
+from facediff.synthetic.face import N_VERTICES
+from facediff.synthetic.second_edition import vertex_count
 from tests.fakes.tiny import VERTICES
 
 CLIPS = ["A_e06", "A_e07", "B_e06"]
@@ -86,3 +91,16 @@ def test_unknown_facts_name_the_option_that_gives_them(own_material: FigureData)
     np.testing.assert_array_equal(replace(own_material, templates={}).mesh(["A_e06"])[1], own_material.rest)
     assert own_material.scale == (1000.0, "mm")
     assert replace(own_material, unit="normalised (a long story)").scale == (1.0, "normalised")
+
+
+@pytest.mark.parametrize("vertices", [N_VERTICES, vertex_count()])
+def test_each_edition_of_the_built_in_corpus_is_known_with_its_unit(tmp_path: Path, vertices: int) -> None:
+    facts = {"corpus": "facediff-puppet", "vertices": vertices, "frame_rate": 25}
+    for folder in (tmp_path / "corpus/vertices_npy", tmp_path / "ours"):
+        folder.mkdir(parents=True)
+        np.save(folder / "F1_t01.npy", np.zeros((3, 3 * vertices), np.float32))
+    (tmp_path / "corpus/manifest.json").write_text(json.dumps(facts))
+    (tmp_path / "corpus/templates.pkl").write_bytes(pickle.dumps({"F1": np.zeros((vertices, 3), np.float32)}))
+    found = gather({"ours": tmp_path / "ours"}, tmp_path / "corpus")
+    assert (found.n_vertices, found.unit, found.frame_rate) == (vertices, "m", 25.0)
+    assert "synthetic" in found.remark

@@ -1,0 +1,184 @@
+"""Make the manual's pictures again, by the model that comes with facediff and by the built-in corpus.
+
+    export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)
+    python tools/pictures.py                      # all of them, in about ten minutes on two cores
+    python tools/pictures.py own_mesh viewer_overlay --scratch made
+
+Not made here: convergence.svg (docs/results/puppet_methods.md), export_blender.png, live_path.svg, notebook.png (by the
+commands next to them) and architecture.svg.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from facediff.animation import Animation, read_archive  # noqa: E402
+from facediff.data import Puppet  # noqa: E402
+from facediff.export import ExportOptions  # noqa: E402
+from facediff.export.video import drawn_frames  # noqa: E402
+from facediff.render import contact_sheet, save_image  # noqa: E402
+from tests.fakes.heads import FAMILY  # noqa: E402
+
+HELLO = ("facediff animate {root}/docs/examples/speech.wav -o hello.npz",)
+CLIPS = ("F1_t01", "F1_t02", "F1_t03", "F1_t04")
+TAKE = "facediff animate {speech} --identity F1 --style F1_neutral --suffix .npy"
+TAKES = tuple(
+    f"{TAKE} --expressivity {expressivity} -o {name}"
+    for name, expressivity in (("mean", 0), ("half", 0.5), ("sample", 1), ("more", 1.5))
+)
+"""Four sentences of a speaker by their mean, by half, one and one and a half of a sample's distance from it."""
+SAID = "{corpus}/wav/M5_t01.wav"
+TRUTH = (
+    f"facediff export {{corpus}}/vertices_npy/M5_t01.npy --checkpoint puppet --identity M5 --speech {SAID} "
+    "-o truth.npz",
+    f"facediff animate {SAID} --identity M5 --style M1_neutral -o facediff.npz",
+)
+PAGE = (*TRUTH, "facediff view facediff.npz --truth truth.npz -o page.html")
+BROWSER = "python {root}/tools/browser/"
+LIVELY = "--expressiveness upper_face=2.5,lips=1.4,all=1.3"
+ALIVE = "--blinks 26 --gaze 10 --sway 6 --controls-seed 55"
+STUDY = (*TAKES, "facediff study make sample=sample mean=mean --truth puppet --max-clips 4 -o study --yes")
+
+PICTURES: dict[str, tuple[str, ...]] = {
+    "animation_controls.png": (
+        *HELLO,
+        f"facediff animate {{root}}/docs/examples/speech.wav {LIVELY} -o expressive.npz",
+        f"facediff animate {{root}}/docs/examples/speech.wav {ALIVE} -o alive.npz",
+        "rows hello.npz expressive.npz alive.npz {picture}",
+    ),
+    "blendshapes.png": (*HELLO, "facediff blendshapes hello.npz -o weights.csv --shapes puppet --show {picture}"),
+    "browser.png": (BROWSER + "talking_page.py puppet {root}/docs/examples/speech.wav --picture {picture}",),
+    "demo.png": (*TRUTH, "panels truth.npz facediff.npz {picture}"),
+    "export_glb.png": (
+        *HELLO,
+        "facediff export hello.npz -o hello.glb",
+        "python {root}/tools/glb_sheet.py hello.glb {picture} --times 0 0.32 0.6 0.92 1.24 1.6",
+    ),
+    "expressivity.png": (
+        *TAKES,
+        "facediff figure heatmap 0=mean puppet --method 0.5=half --method 1=sample --method 1.5=more "
+        "--dpi 110 -o {picture}",
+    ),
+    "figure_frames.png": (
+        *TAKES,
+        "facediff figure frames sample=sample puppet --method mean=mean --clip F1_t01 --phonemes b m z oʊ p "
+        "--dpi 100 -o {picture}",
+    ),
+    "figure_lips.png": (
+        *TAKES,
+        "facediff figure lips sample=sample puppet --method mean=mean --clip F1_t01 --dpi 150 -o {picture}",
+    ),
+    "live_page.png": (BROWSER + "live_picture.py {picture}",),
+    "own_mesh.png": (
+        *HELLO,
+        "head avatar_head face.obj",
+        "facediff retarget hello.npz --target-mesh face.obj -o mine.glb --correspondence map.npz --show {picture}",
+    ),
+    "own_mesh_picking.png": (BROWSER + "picking_picture.py {picture}",),
+    "puppet_editions.webp": ("python {root}/tools/puppet_sheet.py {picture} --editions",),
+    "puppet_head.webp": ("python {root}/tools/puppet_sheet.py {picture}",),
+    "regions.png": ("facediff data regions {corpus} -o {picture}",),
+    "study_narrow.png": (*STUDY, BROWSER + "screenshot.py study/page/index.html {picture} --width 390 --height 844"),
+    "study_wide.png": (*STUDY, BROWSER + "screenshot.py study/page/index.html {picture} --width 1200 --height 760"),
+    "talking_face.webp": (
+        *TRUTH,
+        "facediff export truth.npz facediff.npz -o both.mp4",
+        "python {root}/tools/moving_picture.py both.mp4 {picture}",
+    ),
+    "viewer_direction.png": (
+        *HELLO,
+        "facediff view hello.npz -o hello.html",
+        BROWSER + "screenshot.py hello.html {picture} --width 1000 --height 760 --frame 22",
+    ),
+    "viewer_narrow_light.png": (
+        *PAGE,
+        BROWSER + "screenshot.py page.html {picture} --width 390 --height 844 --frame 46",
+    ),
+    "viewer_overlay.png": (
+        *HELLO,
+        f"facediff animate {{root}}/docs/examples/speech.wav {LIVELY} -o expressive.npz",
+        "facediff view expressive.npz hello.npz --labels expressive plain -o two.html",
+        BROWSER + "screenshot.py two.html {picture} --width 768 --height 700 --frame 20",
+    ),
+    "viewer_wide_dark.png": (
+        *PAGE,
+        BROWSER + "screenshot.py page.html {picture} --width 1000 --height 640 --frame 46 --dark "
+        '--script "facediff.heat(true)"',
+    ),
+}
+
+
+def main() -> None:
+    """Run the commands of the pictures that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="without its suffix; all of them if none is given")
+    parser.add_argument("--scratch", type=Path, help="keep what the pictures are made of in this folder")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs/images")
+    given = parser.parse_args()
+    known = {Path(name).stem: name for name in PICTURES}
+    if unknown := set(given.names) - set(known):
+        parser.error(f"{', '.join(unknown)}: there is no such picture; known are {', '.join(known)}")
+    data = Puppet()
+    data.prepare_data()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = given.scratch or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        speech = " ".join(f"{data.root}/wav/{clip}.wav" for clip in CLIPS)
+        done: set[str] = set()
+        for name in (known[each] for each in given.names or known):
+            began = time.monotonic()
+            for line in PICTURES[name]:
+                command = line.format(
+                    root=ROOT, corpus=data.root, speech=speech, picture=(given.output / name).resolve()
+                )
+                if command not in done:
+                    run(shlex.split(command), folder)
+                    done.add(command)
+            print(f"{name}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def run(words: list[str], folder: Path) -> None:
+    """Run a command in the folder."""
+    if words[0] in ("rows", "panels"):
+        *names, picture = words[1:]
+        draw = rows if words[0] == "rows" else panels
+        draw([replace(read_archive(folder / name), name=Path(name).stem) for name in names], Path(picture))
+    elif words[0] == "head":
+        head = FAMILY[words[1].replace("_", " ")]()
+        trimesh.Trimesh(head.vertices, head.faces, process=False).export(folder / words[2], include_normals=False)
+    else:
+        given = words[1:] if words[0] == "python" else ["-m", *words]
+        if subprocess.run([sys.executable, *given], cwd=folder, check=False, stdout=subprocess.DEVNULL).returncode:
+            raise SystemExit(f"failed: {shlex.join(words)}")
+
+
+def rows(animations: list[Animation], picture: Path) -> None:
+    """A row for each animation, at four moments."""
+    picks = [int(frame) for frame in np.linspace(0.2, 0.8, 4) * len(animations[0].vertices)]
+    frames = [frame for each in animations for frame in drawn_frames([each.part(picks)], ExportOptions(size=224))]
+    save_image(picture, contact_sheet(frames, len(picks)))
+
+
+def panels(animations: list[Animation], picture: Path) -> None:
+    """The animations next to each other, at twelve moments."""
+    picks = [int(frame) for frame in np.linspace(0.05, 0.95, 12) * len(animations[0].vertices)]
+    frames = drawn_frames([each.part(picks) for each in animations], ExportOptions(size=224))
+    times = [f"{pick / animations[0].frame_rate:.2f} s" for pick in picks]
+    save_image(picture, contact_sheet(list(frames), 4, labels=times))
+
+
+if __name__ == "__main__":
+    main()
