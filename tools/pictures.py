@@ -4,7 +4,7 @@
     python tools/pictures.py                      # all of them, in about ten minutes on two cores
     python tools/pictures.py own_mesh viewer_overlay --scratch made
 
-Not made here: convergence.svg (docs/results/puppet_methods.md), export_blender.png, live_path.svg, notebook.png (by the
+Not made here: convergence.svg (docs/results/puppet_methods.md), export_blender.png and live_path.svg (by the
 commands next to them) and architecture.svg.
 """
 
@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 from facediff.animation import Animation, read_archive  # noqa: E402
 from facediff.data import Puppet  # noqa: E402
+from facediff.editing.direction import Direction, Key  # noqa: E402
 from facediff.export import ExportOptions  # noqa: E402
 from facediff.export.video import drawn_frames  # noqa: E402
 from facediff.render import contact_sheet, save_image  # noqa: E402
@@ -51,6 +52,14 @@ BROWSER = "python {root}/tools/browser/"
 LIVELY = "--expressiveness upper_face=2.5,lips=1.4,all=1.3"
 ALIVE = "--blinks 26 --gaze 10 --sway 6 --controls-seed 55"
 STUDY = (*TAKES, "facediff study make sample=sample mean=mean --truth puppet --max-clips 4 -o study --yes")
+KEYS = [
+    Key(0.0, "expressiveness", 1.0),
+    Key(3.8, "expressiveness", 2.4),
+    Key(6.2, "expressiveness", 0.8),
+    Key(0.5, "head.yaw", -8.0),
+    Key(2.6, "head.yaw", 10.0, "step"),
+    Key(5.0, "head.yaw", 0.0),
+]
 
 PICTURES: dict[str, tuple[str, ...]] = {
     "animation_controls.png": (
@@ -60,7 +69,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
         "rows hello.npz expressive.npz alive.npz {picture}",
     ),
     "blendshapes.png": (*HELLO, "facediff blendshapes hello.npz -o weights.csv --shapes puppet --show {picture}"),
-    "browser.png": (BROWSER + "talking_page.py puppet {root}/docs/examples/speech.wav --picture {picture}",),
+    "browser.png": (BROWSER + "talking_page.py puppet {root}/docs/examples/speech.wav --picture {picture} --frame 96",),
     "demo.png": (*TRUTH, "panels truth.npz facediff.npz {picture}"),
     "export_glb.png": (
         *HELLO,
@@ -99,9 +108,11 @@ PICTURES: dict[str, tuple[str, ...]] = {
         "python {root}/tools/moving_picture.py both.mp4 {picture}",
     ),
     "viewer_direction.png": (
-        *HELLO,
-        "facediff view hello.npz -o hello.html",
-        BROWSER + "screenshot.py hello.html {picture} --width 1000 --height 760 --frame 22",
+        "keys keys.json",
+        "facediff animate {root}/docs/examples/speech.wav --direction keys.json -o directed.npz",
+        "facediff view directed.npz -o directed.html",
+        BROWSER + "screenshot.py directed.html {picture} --width 1000 --height 800 --frame 96 "
+        '--script "facediff.direct(true)"',
     ),
     "viewer_narrow_light.png": (
         *PAGE,
@@ -111,11 +122,12 @@ PICTURES: dict[str, tuple[str, ...]] = {
         *HELLO,
         f"facediff animate {{root}}/docs/examples/speech.wav {LIVELY} -o expressive.npz",
         "facediff view expressive.npz hello.npz --labels expressive plain -o two.html",
-        BROWSER + "screenshot.py two.html {picture} --width 768 --height 700 --frame 20",
+        BROWSER + "screenshot.py two.html {picture} --width 768 --height 700 --frame 96 "
+        """--script "facediff.compare('overlay')" """,
     ),
     "viewer_wide_dark.png": (
         *PAGE,
-        BROWSER + "screenshot.py page.html {picture} --width 1000 --height 640 --frame 46 --dark "
+        BROWSER + "screenshot.py page.html {picture} --width 1000 --height 800 --frame 46 --dark "
         '--script "facediff.heat(true)"',
     ),
 }
@@ -156,6 +168,8 @@ def run(words: list[str], folder: Path) -> None:
         *names, picture = words[1:]
         draw = rows if words[0] == "rows" else panels
         draw([replace(read_archive(folder / name), name=Path(name).stem) for name in names], Path(picture))
+    elif words[0] == "keys":
+        (folder / words[1]).write_text(Direction(KEYS).text(), encoding="utf-8")
     elif words[0] == "head":
         head = FAMILY[words[1].replace("_", " ")]()
         trimesh.Trimesh(head.vertices, head.faces, process=False).export(folder / words[2], include_normals=False)

@@ -17,6 +17,7 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
 
     $ python tools/voices.py demo/puppet.ckpt
     $ python tools/voices.py demo/puppet.ckpt --options voice_gate=off --only pauses
+    $ python tools/voices.py facediff/bundled/puppet --options voice_shift=-4 --only "kept out"
 """
 
 from __future__ import annotations
@@ -494,7 +495,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--data-root", help="folder of the corpus (default: the user's cache folder)")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)
-    options = dict(word.split("=", 1) for word in given.options)
+    options: dict[str, Any] = dict(word.split("=", 1) for word in given.options)
+    if "voice_shift" in options:
+        options["voice_shift"] = float(options["voice_shift"])
     scores = measured(given.checkpoint, options, given.clips, given.only, given.data_root)
     if given.json:
         with atomic(given.json) as temporary:

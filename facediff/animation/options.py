@@ -153,6 +153,8 @@ class RecordingOptions(CheckedOptions):
         samples: how many animations, with seeds one after another
         max_seconds: refuse speech that lasts longer
         denoise: take steady noise out of the recording before the model receives it (the file keeps the recording)
+        voice_shift: semitones by which the model receives pitch and formants shifted; -4 closes the lips better at p, b
+            and m of some high voices (the file keeps the recording)
         alignment: when which phoneme is spoken, .TextGrid or .csv (start, end, ipa): the lips touch at each p, b and m
         transcript: the English words that are spoken, from which these times are found
         closure_budget: mm that a vertex is moved by at most for that (default: 12)
@@ -161,6 +163,7 @@ class RecordingOptions(CheckedOptions):
     samples: Annotated[ranges.Samples, Option(metavar="N")] = 1
     max_seconds: Annotated[ranges.Duration | None, Option(metavar="S")] = None
     denoise: bool = False
+    voice_shift: Annotated[ranges.Semitones, Option(metavar="SEMITONES")] = 0.0
     alignment: Annotated[FilePath | None, Option(metavar="FILE", reads=True)] = None
     transcript: Annotated[str | None, Option(metavar="TEXT")] = None
     closure_budget: Annotated[ranges.Millimetres | None, Option(metavar="MM")] = None
@@ -482,6 +485,7 @@ class RecordingKeywords(StreamKeywords, ControlKeywords, total=False):
 
     max_seconds: float | None
     denoise: bool
+    voice_shift: float
     alignment: FilePath | None
     transcript: str | None
     closure_budget: float | None

@@ -395,6 +395,10 @@ class AnimationPipeline(ABC):
             from facediff.speech.denoising import denoised
 
             model_speech = denoised(speech)
+        if self.options.voice_shift:
+            from facediff.speech.pitch import shifted_by_pieces
+
+            model_speech = shifted_by_pieces(model_speech, 2 ** (self.options.voice_shift / 12))
         openness = None
         short = self.windows.in_one_pass(self.frames_of(len(speech)), self.frame_rate)
         writers = []
@@ -437,6 +441,8 @@ class AnimationPipeline(ABC):
             metadata["voice gate"] = self.gate
         if options.denoise:
             metadata["denoised"] = "yes"
+        if options.voice_shift:
+            metadata["voice shift"] = f"{options.voice_shift:+g} semitones"
         if self.direction is not None:
             metadata["direction"] = self.direction.text()
         if words := options.words():

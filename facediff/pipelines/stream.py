@@ -75,6 +75,7 @@ WHOLE = (
     "up",
     "samples",
     "denoise",
+    "voice_shift",
     "alignment",
     "transcript",
 )

@@ -65,6 +65,7 @@ def test_low_latency_is_described_by_its_figures() -> None:
         (RecordingOptions, {"alignment": "a.csv", "transcript": "hello"}, "alignment"),
         (RecordingOptions, {"closure_budget": 3.0}, "closure_budget"),
         (RecordingOptions, {"denoise": "yes"}, "denoise"),
+        (RecordingOptions, {"voice_shift": 13}, "voice_shift"),
         (TargetOptions, {"correspondence": "map.npz"}, "correspondence"),
         (AnimationControls, {"blinks": 1000}, "blinks"),
         (ExportOptions, {"view": "back"}, "view"),

@@ -10,6 +10,7 @@ import pytest
 import facediff
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
+from facediff.speech.pitch import shifted_by_pieces
 from facediff.speech.voice_activity import openness, read_gate
 
 
@@ -75,6 +76,16 @@ def test_denoising_changes_what_is_heard_and_not_what_is_kept(model: facediff.An
     quiet = slice(4000, 28_000)
     assert np.std(denoised(noisy)[quiet]) < 0.3 * np.std(noisy[quiet])
     assert not denoised(np.zeros(16_000, np.float32)).any()
+
+
+def test_a_shifted_voice_is_heard_and_the_recording_kept(model: facediff.Animator, speech: np.ndarray) -> None:
+    plain, lower = (model.animate(speech, 16_000, voice_shift=semitones) for semitones in (0, -4))
+    heard = model.animate(shifted_by_pieces(speech.astype(np.float32), 2 ** (-4 / 12)), 16_000)
+    assert not np.array_equal(plain.vertices, lower.vertices)
+    np.testing.assert_array_equal(heard.vertices, lower.vertices)
+    np.testing.assert_array_equal(plain.speech, lower.speech)
+    assert lower.metadata["voice shift"] == "-4 semitones"
+    assert "voice shift" not in plain.metadata
 
 
 def test_missing_extra_is_named(model: facediff.Animator, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from facediff.live import LiveFrame, Performance, Receiver, open_receiver
 from facediff.spaces.arkit import ARKIT
-from facediff.synthetic.arkit import puppet_shapes
-from facediff.synthetic.face import build_face
+from facediff.synthetic.known_faces import built_in_shapes
+from facediff.utils.hub import BUNDLED
 from tools.browser.chromium import Chromium, find_chromium
 
 FRAMES, FRAME_RATE, LAG = 60, 30.0, 0.12
@@ -36,7 +36,7 @@ def main(words: list[str] | None = None) -> None:
     program = find_chromium()
     if program is None:
         raise SystemExit("no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)")
-    neutral, faces, shapes = puppet_shapes(None)
+    neutral, faces, shapes = built_in_shapes("F1")
     receiver = open_receiver(f"browser:{args.port}")
     performance = Performance(
         FRAME_RATE,
@@ -44,7 +44,7 @@ def main(words: list[str] | None = None) -> None:
         faces.astype(np.int32),
         subject="Puppet",
         shapes=ARKIT,
-        colours=build_face().colours,
+        colours=np.load(BUNDLED / "arrays.npz")["colours"][0],
         speech=True,
     )
     receiver.open(performance)

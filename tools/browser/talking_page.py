@@ -73,6 +73,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("speech", type=Path)
     parser.add_argument("--runtime", help="npm's package of ONNX Runtime for browsers")
     parser.add_argument("--picture", type=Path, help=".png")
+    parser.add_argument("--frame", type=int, help="take the picture at this frame, and measure nothing")
     args = parser.parse_args(words)
     program = find_chromium()
     if program is None:
@@ -89,9 +90,11 @@ def main(words: list[str] | None = None) -> None:
                 choose(page, args.speech)
                 if args.picture and threads == 1:
                     page.evaluate("facediff.page.pause()")
-                    page.evaluate(f"facediff.page.seek({WIDEST})")
+                    page.evaluate(f"facediff.page.seek({WIDEST if args.frame is None else args.frame})")
                     time.sleep(0.5)  # a still picture is drawn sharper
                     page.screenshot(args.picture)
+                if args.frame is not None:
+                    return
                 own = "{...facediff.page.about.windows, above: 0}"
                 kinds = ("null", own, "facediff.page.delays[2]", "facediff.page.delays[1]", "facediff.page.delays[0]")
                 speeds = [f"{factor(page, f'({kind})'):.2f}" for kind in kinds]
