@@ -52,6 +52,11 @@ BROWSER = "python {root}/tools/browser/"
 LIVELY = "--expressiveness upper_face=2.5,lips=1.4,all=1.3"
 ALIVE = "--blinks 26 --gaze 10 --sway 6 --controls-seed 55"
 STUDY = (*TAKES, "facediff study make sample=sample mean=mean --truth puppet --max-clips 4 -o study --yes")
+RATING = (
+    BROWSER + "screenshot.py study/page/index.html {picture} --ready window.facediffStudy "
+    "--script \"document.getElementById('agree').click(), document.getElementById('start').click()\" "
+    "--until \"facediffStudy.current && [...document.querySelectorAll('video')].every((each) => each.readyState === 4)\""
+)
 KEYS = [
     Key(0.0, "expressiveness", 1.0),
     Key(3.8, "expressiveness", 2.4),
@@ -100,8 +105,8 @@ PICTURES: dict[str, tuple[str, ...]] = {
     "puppet_editions.webp": ("python {root}/tools/puppet_sheet.py {picture} --editions",),
     "puppet_head.webp": ("python {root}/tools/puppet_sheet.py {picture}",),
     "regions.png": ("facediff data regions {corpus} -o {picture}",),
-    "study_narrow.png": (*STUDY, BROWSER + "screenshot.py study/page/index.html {picture} --width 390 --height 844"),
-    "study_wide.png": (*STUDY, BROWSER + "screenshot.py study/page/index.html {picture} --width 1200 --height 760"),
+    "study_narrow.png": (*STUDY, f"{RATING} --width 390 --height 844"),
+    "study_wide.png": (*STUDY, f"{RATING} --width 1200 --height 760"),
     "talking_face.webp": (
         *TRUTH,
         "facediff export truth.npz facediff.npz -o both.mp4",
