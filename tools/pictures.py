@@ -55,7 +55,7 @@ STUDY = (*TAKES, "facediff study make sample=sample mean=mean --truth puppet --m
 RATING = (
     BROWSER + "screenshot.py study/page/index.html {picture} --ready window.facediffStudy "
     "--script \"document.getElementById('agree').click(), document.getElementById('start').click()\" "
-    "--until \"facediffStudy.current && [...document.querySelectorAll('video')].every((each) => each.readyState === 4)\""
+    "--until \"facediffStudy.current && [...document.querySelectorAll('video')].every((one) => one.readyState > 3)\""
 )
 KEYS = [
     Key(0.0, "expressiveness", 1.0),
