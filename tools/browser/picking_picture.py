@@ -20,7 +20,7 @@ import trimesh
 
 from facediff.animation import write_archive
 from facediff.editing.landmarks import NAMES
-from tests.fakes.heads import lower_face, lower_face_marks, talking_second
+from tests.fakes.heads import lower_face, lower_face_marks, talking
 from tools.browser.chromium import Chromium, Page, find_chromium
 
 
@@ -48,7 +48,7 @@ def main(words: list[str] | None = None) -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with tempfile.TemporaryDirectory() as name, Chromium(program) as browser:
         folder = Path(name)
-        write_archive(folder / "talking.npz", talking_second())
+        write_archive(folder / "talking.npz", talking())
         mask = trimesh.Trimesh(head.vertices, head.faces, process=False)
         mask.export(folder / "mask.obj", include_normals=False)
         subprocess.run([*command, "-o", "plain.npz"], cwd=folder, env=environment, check=False)
