@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import multiprocessing
+import unicodedata
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache
+from contextlib import suppress
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -309,8 +311,11 @@ def draw_text(picture: Frame, text: str, *, colour: tuple[int, int, int], scale:
 def _text_mask(text: str, points: int, max_width: int) -> npt.NDArray[np.float32]:
     """Opacity of a line of text (rows, columns); cached, since every frame of a video has the same label."""
     image, draw, fonts = _pillow("Image"), _pillow("ImageDraw"), _pillow("ImageFont")
+    wide = None if text.isascii() else _wide_font()
+    if wide is None:  # Pillow's own font has boxes for all but ASCII: an e is nearer to an é
+        text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     while True:
-        font = fonts.load_default(size=points)
+        font = fonts.load_default(size=points) if wide is None else fonts.truetype(wide, points)
         left, _, right, _ = font.getbbox(text)
         if right - left <= max_width or points <= 6:
             break
@@ -322,6 +327,18 @@ def _text_mask(text: str, points: int, max_width: int) -> npt.NDArray[np.float32
     mask = np.asarray(canvas, dtype=np.float32) / np.float32(255)
     mask.setflags(write=False)
     return mask
+
+
+@cache
+def _wide_font() -> str | None:
+    """A font with the letters of many languages, of matplotlib or of the system; None if there is none."""
+    library = importlib.util.find_spec("matplotlib")
+    own = [str(Path(library.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf")] if library and library.origin else []
+    for name in (*own, "DejaVuSans.ttf", "NotoSans-Regular.ttf", "Arial.ttf", "arial.ttf"):
+        with suppress(OSError):
+            _pillow("ImageFont").truetype(name, 12)
+            return name
+    return None
 
 
 def _pillow(module: str) -> Any:  # noqa: ANN401 - imported on first use

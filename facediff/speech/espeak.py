@@ -103,7 +103,7 @@ def _paths() -> tuple[str, str]:
     try:
         import espeakng_loader
     except ImportError as error:
-        raise MissingExtraError("espeakng_loader", "puppet", "the speech of the built-in corpus") from error
+        raise MissingExtraError("espeakng_loader", "puppet", "speech by espeak-ng (corpus, --transcript)") from error
     return str(espeakng_loader.get_library_path()), str(espeakng_loader.get_data_path())
 
 

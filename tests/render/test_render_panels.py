@@ -10,6 +10,7 @@ from PIL import Image
 
 from facediff.errors import FaceDiffError
 from facediff.render import Renderer, contact_sheet, save_image, side_by_side
+from facediff.render.panels import _text_mask, _wide_font
 
 MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
 
@@ -116,3 +117,14 @@ def test_save_image_round_trip_and_refusals(tmp_path: Path) -> None:
         save_image(tmp_path / "a.jpg", picture)
     with pytest.raises(ValueError, match="uint8"):
         save_image(tmp_path / "a.png", picture[..., 0])
+
+
+def test_letters_with_accents_are_drawn_and_no_boxes(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    def label(text: str) -> bytes:
+        _text_mask.cache_clear()
+        return next(iter(side_by_side(renderer, [MOTION[:1]], [text]))).tobytes()
+
+    if _wide_font() is not None:
+        assert len({label(text) for text in ("Zoe", "Zoë", "Zoü", "Zoж")}) == 4  # a box would make two of them alike
+    monkeypatch.setattr("facediff.render.panels._wide_font", lambda: None)
+    assert label("Zoë") == label("Zoe")
