@@ -33,7 +33,9 @@ from facediff.export.video import drawn_frames  # noqa: E402
 from facediff.render import contact_sheet, save_image  # noqa: E402
 from tests.fakes.heads import FAMILY  # noqa: E402
 
-HELLO = ("facediff animate {root}/docs/examples/speech.wav -o hello.npz",)
+SPEECH = "facediff animate {root}/docs/examples/speech.wav"
+HELLO = (f"{SPEECH} -o hello.npz",)
+EXPRESSIVE = f"{SPEECH} --expressiveness upper_face=2.5,lips=1.4,all=1.3 -o expressive.npz"
 CLIPS = ("F1_t01", "F1_t02", "F1_t03", "F1_t04")
 TAKE = "facediff animate {speech} --identity F1 --style F1_neutral --suffix .npy"
 TAKES = tuple(
@@ -49,8 +51,6 @@ TRUTH = (
 )
 PAGE = (*TRUTH, "facediff view facediff.npz --truth truth.npz -o page.html")
 BROWSER = "python {root}/tools/browser/"
-LIVELY = "--expressiveness upper_face=2.5,lips=1.4,all=1.3"
-ALIVE = "--blinks 26 --gaze 10 --sway 6 --controls-seed 55"
 STUDY = (*TAKES, "facediff study make sample=sample mean=mean --truth puppet --max-clips 4 -o study --yes")
 RATING = (
     BROWSER + "screenshot.py study/page/index.html {picture} --ready window.facediffStudy "
@@ -69,8 +69,8 @@ KEYS = [
 PICTURES: dict[str, tuple[str, ...]] = {
     "animation_controls.png": (
         *HELLO,
-        f"facediff animate {{root}}/docs/examples/speech.wav {LIVELY} -o expressive.npz",
-        f"facediff animate {{root}}/docs/examples/speech.wav {ALIVE} -o alive.npz",
+        EXPRESSIVE,
+        f"{SPEECH} --blinks 26 --gaze 10 --sway 6 --controls-seed 55 -o alive.npz",
         "rows hello.npz expressive.npz alive.npz {picture}",
     ),
     "blendshapes.png": (*HELLO, "facediff blendshapes hello.npz -o weights.csv --shapes puppet --show {picture}"),
@@ -114,7 +114,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
     ),
     "viewer_direction.png": (
         "keys keys.json",
-        "facediff animate {root}/docs/examples/speech.wav --direction keys.json -o directed.npz",
+        f"{SPEECH} --direction keys.json -o directed.npz",
         "facediff view directed.npz -o directed.html",
         BROWSER + "screenshot.py directed.html {picture} --width 1000 --height 800 --frame 96 "
         '--script "facediff.direct(true)"',
@@ -125,7 +125,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
     ),
     "viewer_overlay.png": (
         *HELLO,
-        f"facediff animate {{root}}/docs/examples/speech.wav {LIVELY} -o expressive.npz",
+        EXPRESSIVE,
         "facediff view expressive.npz hello.npz --labels expressive plain -o two.html",
         BROWSER + "screenshot.py two.html {picture} --width 768 --height 700 --frame 96 "
         """--script "facediff.compare('overlay')" """,

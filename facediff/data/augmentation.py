@@ -26,12 +26,9 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, augmentation, checks_arguments
 from facediff.speech.audio import fit_length
-from facediff.speech.pitch import SIZE, shifted, signal, spectra, stretched
+from facediff.speech.pitch import SIZE, Wave, shifted, signal, spectra, stretched
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
-
-Wave = npt.NDArray[np.float32]
-"""Speech (S,) at 16 kHz."""
 
 Share = Annotated[float, Range(0, 1)]
 Decibels = Annotated[float, Range(0, 60)]

@@ -11,6 +11,7 @@ from typing import ClassVar, Unpack
 import torch
 from torch import Tensor
 
+from facediff.errors import counted
 from facediff.metrics.base import ExactMetric, Inferred, ProcessOptions, functional
 from facediff.registry import metric
 
@@ -108,8 +109,7 @@ def device_name(device: torch.device | str) -> str:
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
         named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
         processor = next(named, processor)
-    threads = torch.get_num_threads()
-    return f"{processor}, {threads} thread{'s' if threads != 1 else ''}"
+    return f"{processor}, {counted(torch.get_num_threads(), 'thread')}"
 
 
 def _wait_for_gpus() -> None:
