@@ -62,8 +62,8 @@ def view(
     page.save(output, max_mb=max_mb)
     shown = page.animations
     size = output.stat().st_size / 1e6
-    frames, animations = counted(len(shown[0].vertices), "frame"), counted(len(shown), "animation")
-    tell(f"{output}: {frames} of {animations}, {size:.1f} MB; open it in a browser")
+    length = f"{counted(len(shown[0].vertices), 'frame')} of {counted(len(shown), 'animation')}"
+    tell(f"{output}: {length}, {size:.1f} MB; open it in a browser")
     if open:
         import webbrowser
 
