@@ -1,7 +1,7 @@
 """What a model does with voices, rooms and noise that it was not trained on, and in pauses, as tables.
 
 The test sentences of the built-in corpus are changed by means that training does not use (facediff/data/augmentation.py
-has those): pitch by overlapping pieces of the waveform, formants by linear prediction, a room by mirrored sources,
+has those): pitch by a phase vocoder, formants by linear prediction, a room by mirrored sources,
 noise and hum by filters in time. The truth stays what it was, so that scores can be taken.
 
 - *closures*: of the p, b and m at which the truth's lips close, the share at which the model's lips close too. A mouth
@@ -41,6 +41,7 @@ import facediff
 from facediff.data import Puppet, Sample
 from facediff.speech.audio import fit_length
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
+from facediff.speech.pitch import HOP, SIZE, signal, spectra
 from facediff.synthetic.cast import KEPT_OUT_PEOPLE
 from facediff.synthetic.sentences import TEST
 from facediff.synthetic.voices import Flite, installed_voices, open_voice
@@ -61,29 +62,26 @@ AFTER, BEFORE, ONSET = 0.3, 0.2, 0.2
 # Other voices, by means that training does not use.
 
 
-def pasted(speech: Array, ratio: float) -> Array:
-    """Speech that lasts ``ratio`` times as long at the same pitch, by waveform similarity (WSOLA, Verhelst 1993)."""
-    size, reach = 480, 160
-    hop = size // 2
-    window = np.hanning(size + 1)[:-1]
-    padded = np.pad(speech, (reach + size, 2 * size + reach))
-    count = int(len(speech) * ratio / hop) + 1
-    out = np.zeros((count + 2) * hop)
-    place = reach + size
-    for index in range(count):
-        out[index * hop : index * hop + size] += window * padded[place : place + size]
-        wanted = padded[place + hop : place + hop + size]
-        middle = min(reach + size + round((index + 1) * hop / ratio), len(padded) - size - reach)
-        around = padded[middle - reach : middle + reach + size]
-        place = middle - reach + int(np.argmax(np.correlate(around, wanted, "valid")))
-        place = min(place, len(padded) - 2 * size)
-    return out[: round(len(speech) * ratio)]
+def vocoded(speech: Array, ratio: float) -> Array:
+    """Speech that lasts ``ratio`` times as long at the same pitch, by a phase vocoder (Flanagan and Golden 1966)."""
+    spectrum, length = spectra(speech), round(len(speech) * ratio)
+    places = np.arange(int(np.ceil(length / HOP)) + 1) / ratio
+    low = np.clip(np.floor(places).astype(int), 0, len(spectrum) - 2)
+    share = np.clip(places - low, 0, 1)[:, None]
+    sizes = (1 - share) * np.abs(spectrum)[low] + share * np.abs(spectrum)[low + 1]
+    # Each bin's phase advances by its centre frequency and the deviation between neighbouring spectra, wrapped to
+    # (-pi, pi].
+    advance = 2 * np.pi * HOP / SIZE * np.arange(spectrum.shape[1])
+    turn = np.diff(np.angle(spectrum), axis=0) - advance
+    turn += advance - 2 * np.pi * np.round(turn / (2 * np.pi))
+    phase = np.cumsum(np.concatenate([np.angle(spectrum[:1]), turn[low[:-1]]]), axis=0)
+    return signal(sizes * np.exp(1j * phase), length)
 
 
 def pitched(speech: Array, semitones: float) -> Array:
     """Every frequency higher by so many semitones, formants too, at the same speed."""
     ratio = 2 ** (semitones / 12)
-    return fit_length(soxr.resample(pasted(speech, ratio), ratio * 1000, 1000, quality="HQ"), len(speech))
+    return fit_length(soxr.resample(vocoded(speech, ratio), ratio * 1000, 1000, quality="HQ"), len(speech))
 
 
 def formants(speech: Array, ratio: float) -> Array:

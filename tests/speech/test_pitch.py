@@ -24,6 +24,27 @@ def test_pitch_is_shifted_and_stretching_keeps_it(ratio: float) -> None:
     assert pitch(longer) == pytest.approx(440, abs=2)
 
 
+def test_speech_of_the_same_length_is_the_speech_itself() -> None:
+    random = np.random.default_rng(0)
+    speech = (random.standard_normal(RATE) * np.linspace(0, 1, RATE) ** 2).astype(np.float32)
+    speech[6000:9000] = 0
+    np.testing.assert_allclose(stretched(speech, 1.0), speech, atol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.6, 1.6])
+def test_onsets_come_at_their_time_and_stay_sharp(ratio: float) -> None:
+    speech = np.zeros(RATE, np.float32)
+    starts = np.arange(2000, RATE - 2000, 3000)
+    for start in starts:
+        speech[start : start + 1500] = np.sin(2 * np.pi * 150 * np.arange(1500) / RATE)
+    longer = np.abs(stretched(speech, ratio))
+    for start in starts:
+        near = longer[int(start * ratio) - 700 : int(start * ratio) + 700]
+        loud = np.flatnonzero(near > 0.5)
+        assert abs(loud[0] - 700) < 300  # the search goes 160 samples from its place, plus half a piece of 480
+        assert loud[0] - np.flatnonzero(near > 0.02)[0] < 240  # no more than one fade
+
+
 def test_pieces_are_a_shifted_whole_without_gaps() -> None:
     tone = np.sin(2 * np.pi * 440 * np.arange(4 * RATE + 77) / RATE).astype(np.float32)
     made = shifted_by_pieces(tone, 0.75, seconds=0.5)
