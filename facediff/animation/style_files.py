@@ -142,7 +142,10 @@ def style_given(style: object, *, vertices: bool) -> str | ParameterClip | Style
     from facediff.spaces.files import ParameterClip
 
     if isinstance(style, Mapping):
-        return ",".join(f"{name}:{float(weight)!r}" for name, weight in style.items())
+        try:
+            return ",".join(f"{name}:{float(weight)!r}" for name, weight in style.items())
+        except (TypeError, ValueError) as error:
+            raise OptionError.naming(f"{{style}} {style}: expected a number as the weight of each style") from error
     if isinstance(style, str | Path):
         return str(style)
     if isinstance(style, ParameterClip):

@@ -196,6 +196,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.augmenter: Augmenter | None = None
         if augmentations:
             self.augmenter = Augmenter(read_augmentations(augmentations), augmented_share)
+        elif augmented_clips:
+            raise ArgumentError(
+                {"augmented_clips": augmented_clips}, "changes nothing without augmentations; name some"
+            )
         self.augmented_clips = augmented_clips or {}
         self.people = [Path(folder).expanduser() for folder in people or []]
         self.regions = {

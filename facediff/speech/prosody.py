@@ -11,13 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from facediff.speech.voice_activity import HOP, EnergyGate, VoiceGate
+from facediff.speech.voice_activity import HOP, EnergyGate, VoiceGate, Wave
 from facediff.utils import SAMPLE_RATE
-
-Wave = npt.NDArray[np.floating]
-"""Speech (S,) at 16 kHz."""
 
 LOWEST, HIGHEST = 65.0, 500.0
 """Hertz between which voices are looked for."""

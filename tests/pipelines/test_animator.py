@@ -122,6 +122,7 @@ TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
         (["tone.wav"], {"identity": "Zoe"}, '"Zoe"'),
         (["tone.wav"], {"style": "F1_e99"}, "style F1_e99"),
         (["tone.wav"], {"style": {"F1_e03": 0.0, "M2_e05": 0.0}}, "style F1_e03"),
+        (["tone.wav"], {"style": {"F1_e03": "much"}}, "expected a number as the weight"),
         (["tone.wav"], {"style": np.zeros((4, 9, 3), np.float32)}, "style"),
         (["tone.wav"], {"style": np.zeros(3, np.float32)}, "style"),
         (["tone.wav"], {"style": 3}, "style"),
