@@ -175,8 +175,8 @@ VARIANTS: dict[str, dict[str, object]] = {
 }
 
 
-# Those that go another way through the loader, the loop or the optimiser; the others are combinations of the same.
-QUICK = ("accumulated gradients", "windows")
+# The one that goes another way through the loader; the others change the loop or the optimiser.
+QUICK = ("windows",)
 STOPS = {"accumulated gradients": (5,), "windows": (2, 5)}
 
 

@@ -207,6 +207,7 @@ def test_preview_clips_and_noise_are_the_same_in_every_epoch(
     assert not np.array_equal(panels[4], panels[0])
 
 
+@pytest.mark.slow
 def test_preview_is_drawn_when_it_is_due(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:

@@ -343,6 +343,7 @@ def test_sub_configs_and_interpolation_with_a_flag_over_a_file(
     assert hparams["warmup_steps"] == 2
 
 
+@pytest.mark.slow
 def test_wandb_offline_asks_nothing(fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("wandb")
     monkeypatch.chdir(tmp_path)

@@ -28,8 +28,6 @@ Fit = Callable[..., int]
 
 QUICK = [
     (["--model.dim=33"], "--model.dim 33"),
-    (["--model.learning_rate=.inf"], "--model.learning_rate"),
-    (["--trainer.strategy=nope"], "--trainer.strategy nope"),
     (["--trainer.logger.save_dir=/dev/null/x"], "/dev/null/x"),
     (
         ["--trainer.callbacks=facediff.callbacks.SamplingPreview", "--trainer.callbacks.clips=0"],
@@ -37,6 +35,8 @@ QUICK = [
     ),
 ]
 SLOW = [
+    (["--model.learning_rate=.inf"], "--model.learning_rate"),
+    (["--trainer.strategy=nope"], "--trainer.strategy nope"),
     (["--model.sampler.steps=100000"], "--model.sampler.steps 100000"),
     (["--data.num_workers=-1"], "--data.num_workers -1"),
     (["--name=../elsewhere"], "--name ../elsewhere"),

@@ -58,15 +58,9 @@ def run(path: Path, kernel: KernelManager, folder: Path) -> NotebookNode:
         runner.kc.stop_channels()  # the client of a kernel that is used on leaves them open
 
 
-QUICK = ("score_anybodys_files",)
-"""The others repeat their steps with a component and with formats that have tests of their own."""
-
-
+@pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.slow) for path in NOTEBOOKS],
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_notebook_runs(path: Path, kernel: KernelManager, tmp_path: Path) -> None:
     shown = run(path, kernel, tmp_path)
     text = "\n".join(

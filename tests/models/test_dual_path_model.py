@@ -175,7 +175,7 @@ def test_a_tiny_model_overfits_one_clip(make_model: Make, tiny: Tiny) -> None:
         sampler=partial(registry.sampler.ddim, steps=10),
     )
     model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    batch = collate([tiny.dataset("val")[0]] * 4)
+    batch = collate([tiny.dataset("val")[0]] * 2)
     optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
     torch.manual_seed(0)
     for _ in range(140):

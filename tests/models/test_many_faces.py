@@ -187,6 +187,7 @@ def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> Non
     assert str(tmp_path.parent) not in (tmp_path / "folder" / "config.json").read_text()
 
 
+@pytest.mark.slow
 def test_a_resumed_training_equals_a_whole_one(
     roots: dict[str, Path], make_trainer: MakeTrainer, tmp_path: Path
 ) -> None:

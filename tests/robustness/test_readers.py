@@ -89,7 +89,7 @@ def decoding_functions() -> set[str]:
     return found - NOT_FROM_ELSEWHERE.keys()
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", READERS)
 def test_a_damaged_file_is_read_or_refused_in_one_sentence(name: str, count: int, tmp_path: Path) -> None:
     law = run(name, count, 1, tmp_path)

@@ -105,6 +105,8 @@ def test_shapes_are_those_of_arkit(mesh: QuadMesh) -> None:
 
 
 FURTHER_WEIGHTS: list[dict[str, float]] = [
+    {"eyeBlink": 1.0},
+    {"mouthPucker": 1.0, "jawOpen": 0.1},
     {"eyeBlink": 0.5},
     {"jawOpen": 0.6},
     {"mouthSmile": 1.0, "cheekSquint": 0.6},
@@ -118,9 +120,7 @@ FURTHER_WEIGHTS: list[dict[str, float]] = [
     "weights",
     [
         {},
-        {"eyeBlink": 1.0},
         {"jawOpen": 0.4, "mouthClose": 0.4, "mouthPress": 0.5},
-        {"mouthPucker": 1.0, "jawOpen": 0.1},
         *(pytest.param(weights, marks=pytest.mark.slow) for weights in FURTHER_WEIGHTS),
     ],
     ids=lambda weights: "+".join(weights) or "rest",

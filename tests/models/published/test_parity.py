@@ -35,8 +35,11 @@ def test_faceformer(dataset: str, steps: int, loop: str, tmp_path: Path) -> None
         torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
 
 
+FURTHER = [pytest.param(*case, marks=pytest.mark.slow) for case in (("vocaset", 40), ("biwi", 41))]
+
+
 @pytest.mark.parametrize("space", ["once", "every_step"])
-@pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 40), ("vocaset", 41), ("biwi", 41), ("biwi", 58)])
+@pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 41), ("biwi", 58), *FURTHER])
 def test_facediffuser(dataset: str, steps: int, space: str, tmp_path: Path) -> None:
     state = published.facediffuser_state(6)
     model = imported(state, tmp_path, dataset, encode_speech=space)
