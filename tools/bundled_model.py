@@ -1,13 +1,14 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
-The recipe, where flite is installed and no voice of Festival but kal, on one core in about 50 minutes. flite's three
+The recipe, where flite is installed and no voice of Festival but kal, on one core in about an hour. flite's three
 voices, made from recordings of people, get other pitches and vocal tracts, since they are few and all men's:
 
     $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
-        --model.motion_space.eyelids_weight=20 --data.augmentations='["voice:share=1,semitones=8,formants=0.3"]' \
-        --data.augmented_share=0.5 --data.augmented_clips='{voice: "f*"}' --trainer.max_epochs=12
-    $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 2400 \
-        --augmentation voice:share=0.9,semitones=8,formants=0.3 --augmentation loudness:share=0.3 \
+        --model.motion_space.eyelids_weight=20 --trainer.max_epochs=12 \
+        --data.augmentations='["voice:share=1,semitones=8,formants=0.3,together=0.6"]' \
+        --data.augmented_share=0.7 --data.augmented_clips='{voice: "f*"}'
+    $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 4800 \
+        --augmentation voice:share=0.9,semitones=8,formants=0.3,together=0.6 --augmentation loudness:share=0.3 \
         --augmentation room:share=0.6,seconds=0.8,direct=-4 --augmentation tilt:share=0.6 \
         --augmentation band:share=0.25 --augmentation codec:share=0.1 --augmentation noise:share=0.7 \
         --augmentation hum:share=0.1 --augmentation babble --augmentation music -o puppet.ckpt

@@ -9,7 +9,8 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
   share with the closures moved to every other time of the clip. *Within 1 mm* and *gap*: how far the lips' pairs are
   apart at their nearest in a closure, compared with the neutral face, in mm.
 - *kept out*: the clips of test C, whose voices nobody is trained with, by voice.
-- *people kept out*: all test sentences by voices of people that nobody is trained with, as far as they are installed.
+- *people kept out*: all test sentences by voices of people that nobody is trained with, as far as they are installed;
+  ``--people`` names others.
 - *pauses*: two sentences with 1 s of silence before, between and after them. How far the lips are open in the pauses,
   from 0.3 s after speech to 0.2 s before it, how far a lip vertex moves from a frame to the next, and the lip vertex
   error of the first 0.2 s of speech, which a gate that opens late would raise.
@@ -448,7 +449,12 @@ def _installed(voice: str) -> bool:
 
 
 def measured(
-    checkpoint: Path, options: dict[str, Any], clips: int | None = None, only: str = "", root: str | None = None
+    checkpoint: Path,
+    options: dict[str, Any],
+    clips: int | None = None,
+    only: str = "",
+    root: str | None = None,
+    people: Sequence[str] = KEPT_OUT_PEOPLE,
 ) -> dict[str, Any]:
     """All tables, which are printed as they are ready.
 
@@ -458,6 +464,7 @@ def measured(
         clips: most clips of a split.
         only: measure tables and rows whose name contains this.
         root: folder of the corpus; the user's cache folder if None.
+        people: voices of people that nobody is trained with.
     """
     bench = Bench(checkpoint, options, clips, root)
     strangers = dict.fromkeys(clip.attributes["voice"] for clip in bench.data.clips("test_c"))
@@ -465,7 +472,7 @@ def measured(
     tables: tuple[tuple[str, dict[str, Any], Callable[[Any], dict[str, float]]], ...] = (
         ("voices", VOICES, bench.voice),
         ("kept out", {voice: voice for voice in strangers}, bench.kept_out),
-        ("people kept out", {voice: voice for voice in KEPT_OUT_PEOPLE if _installed(voice)}, bench.person),
+        ("people kept out", {voice: voice for voice in people if _installed(voice)}, bench.person),
         ("pauses, mm", PAUSES, bench.pause),
         ("nobody speaks, mm", NOTHING, bench.nothing),
     )
@@ -490,13 +497,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--options", nargs="*", default=[], metavar="NAME=VALUE", help="keywords of Animator.animate")
     parser.add_argument("--clips", type=int, help="most clips of a split")
     parser.add_argument("--only", default="", metavar="WORDS", help="tables and rows whose name contains this")
+    parser.add_argument("--people", nargs="*", default=KEPT_OUT_PEOPLE, metavar="VOICE", help="such as flite:slt")
     parser.add_argument("--data-root", help="folder of the corpus (default: the user's cache folder)")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)
     options: dict[str, Any] = dict(word.split("=", 1) for word in given.options)
     if "voice_shift" in options:
         options["voice_shift"] = float(options["voice_shift"])
-    scores = measured(given.checkpoint, options, given.clips, given.only, given.data_root)
+    scores = measured(given.checkpoint, options, given.clips, given.only, given.data_root, given.people)
     if given.json:
         with atomic(given.json) as temporary:
             temporary.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
