@@ -15,6 +15,10 @@ Wave = npt.NDArray[np.float32]
 
 SIZE, HOP = 512, 128
 """Samples of a spectrum, and from one to the next: 32 ms and 8 ms, in which a voice hardly changes."""
+PIECE, STEP, REACH = 480, 240, 160
+"""Samples of a piece, from one to the next, and within which the next one is looked for: 30, 15 and 10 ms."""
+_WINDOW, _FADE = (np.hanning(size + 1)[:-1].astype(np.float32) for size in (SIZE, PIECE))
+_DISTANCE = 1e-6 * np.abs(np.arange(-REACH, REACH + 1))  # of equally good pieces, as in silence, the nearest
 
 
 def spectra(speech: npt.NDArray[np.floating], hop: int = HOP) -> npt.NDArray[np.complexfloating]:
@@ -36,9 +40,6 @@ def signal(spectrum: npt.NDArray[np.complexfloating], length: int) -> npt.NDArra
         out[part * HOP : part * HOP + len(some)] += some
     out = out[SIZE // 2 : SIZE // 2 + length] / 1.5  # the sum of squared Hann windows a quarter apart
     return out if len(out) == length else np.pad(out, (0, length - len(out)))
-
-
-_WINDOW = np.hanning(SIZE + 1)[:-1].astype(np.float32)
 
 
 def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
@@ -66,12 +67,6 @@ def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
             place = first + int(np.argmax(alike / norms[first : middle + REACH + 1] - _DISTANCE))
         out[number * STEP : number * STEP + PIECE] += _FADE * padded[place : place + PIECE]
     return out[PIECE // 2 : PIECE // 2 + length]
-
-
-PIECE, STEP, REACH = 480, 240, 160
-"""Samples of a piece, from one to the next, and within which the next one is looked for: 30, 15 and 10 ms."""
-_FADE = np.hanning(PIECE + 1)[:-1].astype(np.float32)
-_DISTANCE = 1e-6 * np.abs(np.arange(-REACH, REACH + 1))  # of equally good pieces, as in silence, the nearest
 
 
 def shifted(speech: Wave, ratio: float) -> Wave:
