@@ -182,7 +182,7 @@ def read_style(
     folder comes with that folder's templates and frame rate. A model that has styles by name takes only those.
 
     Args:
-        style: the file, or the name of a clip, or of a style that the model has.
+        style: the file, or the name of a clip, of an identity (its usual style), or of a style that the model has.
         identity: whose face is animated.
         model: the trained model.
         template: neutral face of the speaker whose motion an array holds, or ``median``.
@@ -201,6 +201,8 @@ def read_style(
         return own[style]
     is_file = style.endswith(FILES)
     if not is_file:
+        if style in model.styled_identities():  # as the styles of an exported folder are named
+            return model.default_style(style)
         for reference in model.assets.references.values():
             if reference.clip == style:
                 return reference

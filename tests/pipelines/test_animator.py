@@ -90,6 +90,15 @@ def test_speech_is_the_same_however_it_is_given(give: Callable[[Path], tuple[obj
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7)
 
 
+def test_an_identitys_name_is_its_usual_style(model: facediff.Animator) -> None:
+    usual, named, other = (
+        model.animate(TONE, 16_000, identity="F1", seed=4, style=style) for style in (None, "F1", "M2")
+    )
+    np.testing.assert_array_equal(named.vertices, usual.vertices)
+    assert named.metadata["style"] == usual.metadata["style"]
+    assert not np.array_equal(other.vertices, usual.vertices)
+
+
 def test_tensor_without_a_rate_has_16_khz_and_bytes_their_silence_at_128() -> None:
     tone = 0.3 * torch.sin(torch.arange(8000) / 7)
     np.testing.assert_array_equal(speech_of(tone)[0], tone.numpy())

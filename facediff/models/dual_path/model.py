@@ -607,7 +607,7 @@ class DualPathDiffusion(AnimationModel):
         if speech_style is not None and speech_style.ready and identity not in self.person_styles:
             index = self.assets.identity_index(identity)
             if index >= 0 and (usual := speech_style.usual(index)) is not None:
-                return Style("speech", torch.cat([usual, usual.new_ones(1)]).cpu())
+                return Style(identity, torch.cat([usual, usual.new_ones(1)]).cpu())
             style = super().default_style(identity)
             if isinstance(style, Style):
                 return replace(style, vector=torch.cat([style.vector[:-1], style.vector.new_ones(1)]))
@@ -617,7 +617,7 @@ class DualPathDiffusion(AnimationModel):
             return Style(style.clip, torch.cat([vector[0, :-1], vector.new_ones(1)]).cpu())
         if learnt is None or identity not in self.assets.identities or identity in self.person_styles:
             return super().default_style(identity)
-        return Style("speech", nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))))
+        return Style(identity, nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))))
 
     @torch.no_grad()
     def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:
