@@ -212,7 +212,7 @@ class Speed(Augmentation):
         motion = (1 - share) * example.motion[low] + share * example.motion[low + 1]
         length = round(after * SAMPLE_RATE / example.frame_rate)
         speech = stretched(example.speech, length / max(1, len(example.speech)))
-        return replace(example, motion=motion, speech=fit_length(speech.astype(np.float32), length))
+        return replace(example, motion=motion, speech=fit_length(speech, length))
 
 
 # Level and spectrum.

@@ -42,7 +42,7 @@ def signal(spectrum: npt.NDArray[np.complexfloating], length: int) -> npt.NDArra
     return out if len(out) == length else np.pad(out, (0, length - len(out)))
 
 
-def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
+def stretched(speech: Wave, ratio: float) -> Wave:
     """Speech that lasts ``ratio`` times as long and has the same pitch, by pieces of it that fade into one another.
 
     Each piece continues the one before as well as any within 10 ms of its place does (WSOLA: Verhelst and Roelands,
@@ -52,8 +52,9 @@ def stretched(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
     length = round(len(speech) * ratio)
     count = -(-length // STEP) + 1
     middles = np.round(np.arange(count) * (STEP / ratio)).astype(int) + REACH
-    padded = np.pad(np.asarray(speech, np.float32), PIECE // 2 + REACH)
-    padded = np.pad(padded, (0, max(0, middles[-1] + REACH + STEP + PIECE - len(padded))))
+    before = PIECE // 2 + REACH
+    behind = middles[-1] + REACH + STEP + PIECE - before - len(speech)
+    padded = np.pad(np.asarray(speech, np.float32), (before, behind))
     # The norms of all pieces, so that the likest is not merely the loudest: at a ratio of 1 speech stays what it is.
     sums = np.concatenate([[0.0], np.cumsum(np.square(padded, dtype=np.float64))])
     norms = np.sqrt(np.maximum(sums[PIECE:] - sums[:-PIECE], 0)) + 1e-6
@@ -73,8 +74,7 @@ def shifted(speech: Wave, ratio: float) -> Wave:
     """Speech (S,) of the same length with every frequency times ``ratio``."""
     import soxr
 
-    longer = stretched(speech, ratio)
-    resampled: Wave = soxr.resample(longer.astype(np.float32), 1000 * ratio, 1000, quality="LQ")
+    resampled: Wave = soxr.resample(stretched(speech, ratio), 1000 * ratio, 1000, quality="LQ")
     return fit_length(resampled, len(speech))
 
 
