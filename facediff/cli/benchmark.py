@@ -312,9 +312,9 @@ def check_checkpoint(
             f"method's key `corpora` those that it is of"
         )
     corpus_root = options.get("root")
-    if corpus_root is None and module.__name__ != "Puppet":
+    if corpus_root is None and not module.makes_itself:
         raise FaceDiffError(f"{path}: names no folder of its corpus; give it with --root {cell.corpus}=FOLDER")
-    if corpus_root is not None and module.__name__ != "Puppet" and not Path(str(corpus_root)).expanduser().is_dir():
+    if corpus_root is not None and not module.makes_itself and not Path(str(corpus_root)).expanduser().is_dir():
         raise FaceDiffError(f"{path}: its corpus {corpus_root} is not there; give it with --root {cell.corpus}=FOLDER")
 
 
@@ -339,19 +339,19 @@ def data_class(class_path: str) -> type[SpeechMotionDataModule]:
 def data_of(
     modules: dict[str, SpeechMotionDataModule], class_path: str, arguments: Mapping[str, Any], *, make: bool
 ) -> SpeechMotionDataModule:
-    """The data module of a config, each once; the built-in corpus is made, any other must be there."""
+    """The data module of a config, each once; a built-in corpus is made, any other must be there."""
     mark = f"{class_path} {sorted((key, str(value)) for key, value in arguments.items())}"
     if mark in modules:
         return modules[mark]
     module = data_class(class_path)
-    if "root" not in arguments and module.__name__ != "Puppet":
+    if "root" not in arguments and not module.makes_itself:
         raise FaceDiffError(
             f"the corpus {module.corpus_name} has no folder; give it with --root {module.corpus_name}=FOLDER"
         )
     data = module(**dict(arguments))
     if make:
         data.prepare_data()
-    if not data.root.is_dir() and (make or module.__name__ != "Puppet"):
+    if not data.root.is_dir() and (make or not module.makes_itself):
         raise FaceDiffError(
             f"{data.root}: no such folder; expected the corpus {module.corpus_name}. {data.obtain}".strip()
         )

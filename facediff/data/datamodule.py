@@ -87,6 +87,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         commercial_use: whether these terms allow it: ``allowed``, ``forbidden`` or ``unknown``.
         licence_source: where the terms stand, without ``https://``.
         obtain: how to obtain the corpus.
+        makes_itself: whether ``prepare_data`` makes the corpus where it is missing.
         languages: codes of the languages that are spoken in it.
         former_options: values of options that came later, for checkpoints that were trained before these.
 
@@ -153,6 +154,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     commercial_use: ClassVar[Commercial] = "unknown"
     licence_source: ClassVar[str] = ""
     obtain: ClassVar[str] = ""
+    makes_itself: ClassVar[bool] = False
     languages: ClassVar[tuple[str, ...]] = ()
     former_options: ClassVar[dict[str, Any]] = {}
 

@@ -228,6 +228,7 @@ class Puppet(SpeechMotionDataModule):
 
     corpus_name: ClassVar[str] = "puppet"
     synthetic: ClassVar[bool] = True
+    makes_itself: ClassVar[bool] = True
     unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(puppet.FRAME_RATE)
     n_vertices = puppet.N_VERTICES
@@ -355,6 +356,7 @@ class PuppetMask(SpeechMotionDataModule):
 
     corpus_name: ClassVar[str] = "puppet_mask"
     synthetic: ClassVar[bool] = True
+    makes_itself: ClassVar[bool] = True
     unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(second_edition.MASK.frame_rate)
     n_vertices = second_edition.vertex_count(second_edition.MASK)

@@ -55,3 +55,17 @@ def test_a_checkpoint_of_another_corpus_or_of_none_is_refused(
     assert not more
     assert ("row_1" in line) == bool(named)
     assert not (folder / "out").exists()
+
+
+def test_a_built_in_corpus_that_was_never_made_is_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    for corpus in ("puppet", "puppet_mask"):
+        (tmp_path / "plan.yaml").write_text(
+            f"corpora: {{{corpus}: {{data: configs/data/{corpus}.yaml}}}}\n"
+            "methods: {voca: {config: configs/experiment/puppet_voca.yaml}}\nseeds: [0]\n"
+        )
+        assert main(["benchmark", str(tmp_path / "plan.yaml"), "-o", str(tmp_path / "out"), "--dry-run"]) == 0
+        assert f"voca on {corpus}, seed 0" in capsys.readouterr().out
+    assert not (tmp_path / "cache").exists()
