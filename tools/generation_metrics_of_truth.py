@@ -6,6 +6,10 @@ below is reached by drawing from the right distribution, and some of them are no
 single clips, for instance, cannot vanish, since the clip that was recorded is one of many.
 
     $ python tools/generation_metrics_of_truth.py
+
+writes them as motion files instead, a folder for each seed, which ``facediff evaluate`` scores as it does a method's:
+
+    $ python tools/generation_metrics_of_truth.py --write truths --samples 5 --drawn-speakers 42
 """
 
 from __future__ import annotations
@@ -101,6 +105,19 @@ def measured(root: Path | None = None, samples: int = 10, most_clips: int | None
     return measure({"another truth": load}, data, sampling=sampling, most_clips=most_clips)
 
 
+def write_motion(folder: Path, data: Puppet, seeds: Sequence[int]) -> None:
+    """Write other truths of all test clips, absolute vertices (frames, V, 3) as ``folder/seedN/CLIP.npy``."""
+    data.prepare_data()
+    data.setup("test")
+    for seed in seeds:
+        place = folder / f"seed{seed}"
+        place.mkdir(parents=True, exist_ok=True)
+        for clip in (clip for split in data.test_splits for clip in data.clips(split)):
+            rest = np.asarray(data.corpus.templates[clip.identity], np.float32)
+            with atomic(place / f"{clip.name}.npy") as partial, partial.open("wb") as file:
+                np.save(file, rest + other_truth(clip.name, seed).numpy())
+
+
 def table(scores: GenerationScores) -> str:
     """Markdown: a row for each metric, a column for each split."""
     lines = ["| metric | " + " | ".join(scores.values) + " |", "|---|" + "---|" * len(scores.values)]
@@ -120,7 +137,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--samples", type=int, default=10, help="other truths of each clip (default: 10)")
     parser.add_argument("--clips", type=int, help="clips of a split (default: all)")
     parser.add_argument("--output", type=Path, help="also write the table to this file")
+    parser.add_argument("--write", type=Path, metavar="FOLDER", help="write the motion of seeds 1 to --samples instead")
+    parser.add_argument("--drawn-speakers", type=int, default=0, help="of the corpus whose clips are written")
     options = parser.parse_args(arguments)
+    if options.write is not None:
+        data = Puppet(root=options.data_root, drawn_speakers=options.drawn_speakers, edition=2)
+        write_motion(options.write, data, range(1, options.samples + 1))
+        return
     text = table(measured(options.data_root, options.samples, options.clips))
     print(text)
     if options.output is not None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pickle
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import pytest
 pytest.importorskip("espeakng_loader")
 
 from facediff.synthetic.second_edition import generate_second
-from tools.generation_metrics_of_truth import OtherTruths, other_truth
+from tools.generation_metrics_of_truth import OtherTruths, other_truth, write_motion
 
 
 def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_path: Path) -> None:
@@ -35,3 +37,15 @@ def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_p
 
     assert share(lips) < 0.05 < 0.5 < share(upper)
     assert OtherTruths.samples
+
+    clip = SimpleNamespace(name="F1_t03", identity="F1")
+    data: Any = SimpleNamespace(
+        prepare_data=lambda: None,
+        setup=lambda stage: None,
+        test_splits=("test_a",),
+        clips=lambda split: [clip],
+        corpus=SimpleNamespace(templates={"F1": template}),
+    )
+    write_motion(tmp_path / "truths", data, (3,))
+    written = np.load(tmp_path / "truths" / "seed3" / "F1_t03.npy")
+    np.testing.assert_allclose(written, template + other, atol=1e-6)
