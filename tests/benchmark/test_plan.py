@@ -9,7 +9,10 @@ import pytest
 
 from facediff.benchmark import cells_of, read_plan
 from facediff.benchmark.plan import check_scores, find_plan
+from facediff.benchmark.running import fit_options, option_words
 from facediff.cli.benchmark import corpus_folders
+from facediff.cli.lightning import parse_fit
+from facediff.cli.lightning_cli import ParsedCLI
 from facediff.errors import FaceDiffError
 from facediff.utils.files import config_dir
 
@@ -111,3 +114,18 @@ def test_a_plan_of_the_package_is_found_from_any_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert find_plan(Path(name)).samefile(config_dir() / "benchmark" / "quick.yaml")
+
+
+def test_rows_of_the_small_ablation_without_a_part_are_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
+
+    def build(cli: ParsedCLI) -> None:
+        built.append(cli.parser.instantiate_classes(cli.config)["model"])
+
+    monkeypatch.setattr(ParsedCLI, "instantiate_classes", build)
+    cells = cells_of(read_plan(config_dir() / "benchmark" / "puppet_table3.yaml"))
+    for cell in cells:
+        (training,) = cell.trainings
+        if cell.seed == 0 and "none" in training.options.values():
+            parse_fit(["--config", str(training.config), *option_words(fit_options(training, {}, cell))])
+    assert [type(model).__name__ for model in built] == ["DualPathDiffusion"] * 2

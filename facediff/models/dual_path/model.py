@@ -243,7 +243,9 @@ class DualPathDiffusion(AnimationModel):
             speech_style=SpeechStyle(dim, sum(style.token_dims), len(self.identities)) if style_from_speech else None,
         )
         if style_from_speech and not style.token_dims:
-            raise ArgumentError({"style_from_speech": True}, "there is no dynamic style; choose a style_encoder")
+            raise ArgumentError(
+                {"style_from_speech": True}, "there is no dynamic style; choose a style_encoder, or set this to false"
+            )
         for name, weight in self.style_weights.items():
             if weight and not style.token_dims:
                 raise ArgumentError({f"{name}_weight": weight}, "there is no dynamic style; choose a style_encoder")
