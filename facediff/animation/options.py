@@ -130,7 +130,7 @@ class WindowOptions(CheckedOptions):
     """Windows (of long speech and of streams).
 
     Attributes:
-        window: seconds of a window (default: 4)
+        window: seconds of a window (default: 4); speech of up to 10 s is animated in one pass
         overlap: seconds that neighbouring windows share (default: 1)
         low_latency: windows of one frame, 0.08 s of look-ahead and two denoising steps, for immediate answers
     """

@@ -99,6 +99,8 @@ def animate(
         raise FaceDiffError(
             f"--stream: reads standard input; give - in place of {speech[0]} (a file needs no --stream)"
         )
+    if not streamed and not several and not speech[0].exists():
+        raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     if streamed and not stream:
         raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
     if stream:
@@ -110,8 +112,6 @@ def animate(
         refuse_idle("is for one recording", **{name: getattr(recording, name) is not None for name in one})
     else:
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
-    if not streamed and not several and not speech[0].exists():
-        raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     checkpoint = model_or_bundled(checkpoint)
     check_animating_source(checkpoint)
     from facediff.export import check_export, check_used

@@ -243,7 +243,7 @@ def pack(
     codec: Literal["zstd", "lz4"] = "zstd",
     work: WorkOptions = USUAL_WORK,
 ) -> None:
-    """Pack a corpus into one Zarr store, about a sixth of its size, that can also be read from an address.
+    """Pack a corpus into one Zarr store, at most a fifth of its size, that can also be read from an address.
 
     Every data module reads it: --data.root=OUT.zarr, or the address that it was copied to. A run that was stopped is
     continued by the same command.
@@ -255,8 +255,8 @@ def pack(
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
         exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
-        unit: the corpus's unit of length, m, cm, mm or a number of metres (default: that of its manifest.json, or the
-            corpus's own)
+        unit: the corpus's unit of length, m, cm, mm, in, or a number of metres (default: that of its manifest.json, or
+            the corpus's own)
         chunk_seconds: motion is read in pieces of this length
         codec: how motion is compressed; lz4 is read faster and takes an eighth more room
         work: where the work is done

@@ -16,6 +16,7 @@ import urllib.request
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from traceback import walk_tb
@@ -39,6 +40,7 @@ from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, 
 from facediff.cli.configs import guard_configs
 from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
+from facediff.data.packed.stores import address_of
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
@@ -311,10 +313,11 @@ class FaceDiffCLI(LightningCLI):
             parser.link_arguments(f"data.{name}", f"model.init_args.{name}", plain, apply_on="instantiate")
 
     def before_instantiate_classes(self) -> None:
-        """Check the experiment's name, and decide whether wandb uploads before anything starts it.
+        """Check the experiment's name and the corpus, and decide whether wandb uploads before anything starts it.
 
         Raises:
             ArgumentError: if the name is not that of a folder below that of all runs.
+            FaceDiffError: if the corpus is not there.
             MissingExtraError: if a logger's package is not installed.
         """
         name = self._get(self.config, "name")
@@ -324,6 +327,7 @@ class FaceDiffCLI(LightningCLI):
         if logger_options(trainer, "TensorBoardLogger") is not None and not find_spec("tensorboard"):
             raise MissingExtraError("tensorboard", "tensorboard", "logging to TensorBoard")
         settle_wandb_mode(trainer)
+        refuse_missing_corpus(self.config[str(self.subcommand)].data)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
         """Make the trainer; a callback of the config replaces the built-in one of its class."""
@@ -389,6 +393,18 @@ class FaceDiffCLI(LightningCLI):
 
     def _parse_ckpt_path(self) -> None:
         """Do nothing: upstream would let a checkpoint override the flags; ``words_of_checkpoint`` does the opposite."""
+
+
+def refuse_missing_corpus(data: Mapping[str, Any]) -> None:
+    """Refuse a mistyped folder before the model is built, which may fetch an audio encoder's weights for minutes."""
+    module, _, name = str(data["class_path"]).rpartition(".")
+    kind = getattr(import_module(module), name)
+    root = (data.get("init_args") or {}).get("root")
+    # A corpus that says how it is obtained is there before a run; others may be made by their data module.
+    if root is not None and getattr(kind, "obtain", "") and not address_of(str(root)):
+        folder = Path(str(root)).expanduser()
+        if not folder.exists():
+            raise FaceDiffError(f"{folder}: no such folder; set data.root to your copy. {kind.obtain}")
 
 
 class ParsedCLI(FaceDiffCLI):

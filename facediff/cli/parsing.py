@@ -206,9 +206,9 @@ def flat(parameters: Parameters) -> list[Parameter]:
 
 
 def plain_text(text: str) -> str:
-    """A docstring's text for a terminal: no double backquotes, no roles, one space between words."""
+    """A docstring's text for a terminal: no double backquotes, no escapes, no roles, one space between words."""
     text = re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text)
-    return " ".join(text.replace("``", "").split())
+    return " ".join(text.replace("``", "").replace("\\|", "|").split())
 
 
 def summary_of(documented: object) -> tuple[str, str]:

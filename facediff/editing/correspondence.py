@@ -310,6 +310,27 @@ def refuse_other_mesh(
     )
 
 
+OTHER_FACE = (
+    1e-3  # Half of another face's vertices lie further off than this share of its extent; a sculpted nose's do not
+)
+
+
+def refuse_other_face(
+    name: str, vertices: npt.NDArray[np.floating], expected_vertices: npt.NDArray[np.floating]
+) -> None:
+    """Require the rest positions that a correspondence was made for, but for what was sculpted since.
+
+    Raises:
+        FaceDiffError: calling the mesh ``name``, if it is another face of the same topology.
+    """
+    away = float(np.median(np.linalg.norm(vertices - expected_vertices, axis=1)))
+    if away > OTHER_FACE * float(np.ptp(expected_vertices, axis=0).max()):
+        raise FaceDiffError(
+            f"{name}: has the triangles of the correspondence's mesh and is another face (its vertices lie {away:.2g} "
+            f"off in the median); give the mesh that it was made for, or make a new correspondence"
+        )
+
+
 # Step 2: separate pieces of a mesh (teeth, eyes, skin), and which piece of the other mesh each one is.
 
 MOST = 32  # So many of the largest pieces are paired; hair may consist of thousands

@@ -223,7 +223,10 @@ class Direction:
                     "needs the model, and the animation is finished; give the keys to `facediff animate --direction`"
                 )
                 if exported:
-                    reason = "changes within a recording with a checkpoint only; leave these keys out, or give one"
+                    reason = (
+                        "changes within a recording with a training's checkpoint (.ckpt) only, and this model is an "
+                        "exported one; leave these keys out, or give such a checkpoint"
+                    )
                 raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
 
     def without_model_channels(self) -> Direction | None:

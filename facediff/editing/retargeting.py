@@ -20,6 +20,7 @@ from facediff.editing.correspondence import (
     averaging,
     correspond,
     placed,
+    refuse_other_face,
     refuse_other_mesh,
     run_alike,
 )
@@ -92,6 +93,7 @@ def retarget(
         refuse_other_mesh(
             str(mesh_path), mesh.vertices, mesh.faces, correspondence.target_vertices, correspondence.target_faces
         )
+        refuse_other_face(str(mesh_path), mesh.vertices, correspondence.target_vertices)
         return judged(correspondence)
     if correspondence_path is not None:
         if correspondence_path.suffix != ".npz":

@@ -14,6 +14,9 @@ from facediff.utils import SAMPLE_RATE
 RATE = 100.0
 """Steps a second of the alignment."""
 
+OTHER_PACE = 2.5
+"""A text that espeak-ng speaks so many times faster or slower than it was recorded is another recording's."""
+
 LONGEST = 2000
 """Characters of a transcript; a longer recording is better aligned by a program made for it."""
 
@@ -42,6 +45,12 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPh
     first, last = int(spoken[0]), int(spoken[-1]) + 1
     recorded = speech[round(first / RATE * SAMPLE_RATE) : round(last / RATE * SAMPLE_RATE)]
     begin, end = voiced[0].start, voiced[-1].end
+    pace = (end - begin) * RATE / len(spoken)  # pauses aside, nobody speaks so much faster or slower
+    if not 1 / OTHER_PACE < pace < OTHER_PACE:
+        raise OptionError.naming(
+            f"{{transcript}}: takes {end - begin:.1f} s to say, and the recording has {len(spoken) / RATE:.1f} s of "
+            f"speech; expected all words of this recording"
+        )
     synthetic = synthetic[round(begin * SAMPLE_RATE) : round(end * SAMPLE_RATE)]
     path = align_features(
         *(cepstra(wave, max(2, int(len(wave) / SAMPLE_RATE * RATE)), RATE) for wave in (synthetic, recorded))

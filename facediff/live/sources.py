@@ -193,8 +193,8 @@ def sound_library(feature: str) -> Any:  # noqa: ANN401 - a module without types
         raise MissingExtraError("sounddevice", "live", feature) from error
     except OSError as error:  # its package for Linux comes without PortAudio
         raise FaceDiffError(
-            f"{feature} needs PortAudio, which is not installed; install it (apt-get install libportaudio2), or give a "
-            f"recording, or samples on standard input"
+            f"{feature} needs PortAudio, which is not installed; install it (apt-get install libportaudio2), or "
+            f"do without: a recording or samples on standard input need none with --sound off"
         ) from error
     return sounddevice
 

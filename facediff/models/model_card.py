@@ -184,8 +184,8 @@ def introduction(model: CheckpointContent, facts: Facts) -> str:
     if assets.synthetic:
         lines += [
             "",
-            "> **Synthetic data.** A program made the faces and their motion. The scores below compare models on this "
-            "corpus; they say nothing about real people.",
+            "> **Synthetic data.** A program made the faces and their motion. Scores on this corpus compare models; "
+            "they say nothing about real people.",
         ]
     rows = [
         ("vertices", f"{model.n_vertices}, in {text(assets.unit)}"),

@@ -365,6 +365,7 @@ class AnimationPipeline(ABC):
         """Seconds of speech, at most, that must arrive after an instant before its frame of a stream is certain."""
         return max(
             self.windows.look_ahead,
+            self.windows.in_frames(self.frame_rate).look_ahead / self.frame_rate,  # a frame may be longer than planned
             0.0 if self.acting is None else self.acting.look_ahead,
             0.0 if self.rest is None else self.rest.openness().look_ahead,
         )

@@ -150,6 +150,8 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
     Raises:
         FaceDiffError: if the file is neither, or holds no phonemes.
     """
+    if not path.is_file():
+        raise FaceDiffError(f"{path}: no such file; expected a .TextGrid, or a .csv with the columns start, end, ipa")
     if path.suffix.lower() == ".textgrid":
         phonemes = [TimedPhoneme(start, end, label) for start, end, label in phones_in(path)]
     else:

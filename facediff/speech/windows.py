@@ -236,6 +236,11 @@ class FramePlan:
     ahead: int = 0
 
     @property
+    def look_ahead(self) -> int:
+        """As :attr:`WindowPlan.look_ahead`, in whole frames."""
+        return self.frames + self.after
+
+    @property
     def hop(self) -> int:
         """Frames from the start of a window to that of the next, and how many are given out at a time."""
         return self.frames - self.overlap

@@ -102,6 +102,11 @@ def test_bad_speech(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_missing_folder_is_named_before_its_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert animate(tmp_path / "recordings", "--suffix", ".glb", "-o", tmp_path / "out") == 2
+    assert "recordings: no such sound file or folder" in capsys.readouterr().err
+
+
 def bad_reference(folder: Path) -> Path:
     np.save(folder / "other.npy", np.zeros((9, 31, 3), np.float32))
     return folder / "other.npy"

@@ -20,6 +20,7 @@ import torch
 
 from facediff.cli.app import main
 from facediff.cli.lightning import refuse_repeated
+from facediff.cli.lightning_cli import refuse_missing_corpus
 from facediff.cli.trainer_options import RANGES, check_trainer
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
@@ -202,3 +203,11 @@ def test_an_accelerator_that_is_not_there_is_named_by_adapt(
     words = ["--person", "C", "-o", str(tmp_path / "c.ckpt"), "--epochs", "1", "--quiet"]
     assert main(["adapt", "--checkpoint", str(checkpoint), *words, "--accelerator", "nope"]) == 2
     assert "--accelerator nope" in capsys.readouterr().err
+
+
+def test_a_corpus_that_is_not_there_is_refused_before_the_model_is_built(tmp_path: Path) -> None:
+    missing = str(tmp_path / "BIWI")
+    with pytest.raises(FaceDiffError, match="BIWI: no such folder"):
+        refuse_missing_corpus({"class_path": "facediff.data.Biwi", "init_args": {"root": missing}})
+    refuse_missing_corpus({"class_path": "facediff.data.Biwi", "init_args": {"root": "s3://bucket/biwi.zarr"}})
+    refuse_missing_corpus({"class_path": "facediff.data.Puppet", "init_args": {"root": missing}})

@@ -18,6 +18,7 @@ from facediff.cli.parsing import (
     flat,
     make_parser,
     parameters_of,
+    plain_text,
     with_more_help,
 )
 from facediff.errors import FaceDiffError
@@ -188,6 +189,10 @@ def test_a_positional_argument_with_a_default_may_be_missing() -> None:
     assert arguments_of(optional, "x", ["a", "--json"]) == {"kind": "a", "json": True}
     with pytest.raises(FaceDiffError, match="b: one argument too many"):
         arguments_of(optional, "x", ["a", "b"])
+
+
+def test_docstrings_lose_what_only_web_pages_read() -> None:
+    assert plain_text(r"``a`` of :class:`~x.y.B`, \|c\|") == "a of B, |c|"
 
 
 def test_help_shows_groups_defaults_and_plain_text(capsys: pytest.CaptureFixture[str]) -> None:

@@ -154,8 +154,9 @@ def test_low_latency_takes_few_steps_and_is_forgotten(model: DualPathDiffusion) 
 @pytest.mark.parametrize("rate", [12.0, 15.0, 24.0, 25.0, 29.97, 30.0, 48.0, 60.0, 120.0])
 def test_low_latency_waits_less_than_the_goal_at_every_rate(rate: float) -> None:
     plan = LOW_LATENCY.in_frames(rate)
-    waited = (plan.frames + plan.after) / rate
+    waited = plan.look_ahead / rate
     assert plan.overlap == 0
+    assert plan.look_ahead == plan.frames + plan.after
     assert 0.08 < waited < (0.13 if rate >= 24 else 0.17)
     gate = read_gate(QUICK_GATE)
     assert gate is not None

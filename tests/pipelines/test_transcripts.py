@@ -32,6 +32,9 @@ def test_times_of_a_transcript_are_those_of_the_corpus(puppet_corpus: Path) -> N
         align_transcript(" ? ", speech)
     with pytest.raises(FaceDiffError, match="transcript"):
         align_transcript(SENTENCE, np.zeros(16_000, np.float32))
+    for text in ("Bob", 4 * f"{SENTENCE} "):
+        with pytest.raises(FaceDiffError, match="transcript.*speech"):
+            align_transcript(text, said)
 
 
 def test_animation_closes_its_lips_by_alignment_and_by_transcript(
@@ -59,7 +62,7 @@ def test_animation_closes_its_lips_by_alignment_and_by_transcript(
     [
         ({"alignment": "a.csv", "transcript": "hello"}, "alignment.*transcript"),
         ({"closure_budget": 3}, "closure_budget"),
-        ({"alignment": "none.TextGrid"}, "none.TextGrid"),
+        ({"alignment": "none.TextGrid"}, "none.TextGrid: no such file"),
     ],
 )
 def test_impossible_options_are_named(model: facediff.Animator, options: dict[str, object], named: str) -> None:

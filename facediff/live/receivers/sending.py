@@ -78,7 +78,7 @@ class Datagrams:
     def __init__(self, address: Address, host: str, port: int) -> None:
         self.address = address
         self.sent = self.refused = self.lost = 0
-        self._listened, self._closed = True, False
+        self._warned = self._closed = False
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
@@ -111,12 +111,10 @@ class Datagrams:
         self.refused += refused
         self.lost += lost
         self.sent += not (refused or lost)
-        self._report(listened=not refused)
-
-    def _report(self, *, listened: bool) -> None:
-        if self._listened and not listened:
+        # Once: not every datagram is refused, so that each refusal would look like a program that left.
+        if refused and not self._warned:
+            self._warned = True
             log.warning("%s: no program listens there; frames are sent all the same", self.address.text)
-        self._listened = listened
 
     def status(self) -> str:
         """Numbers of frames that were sent, refused and lost."""

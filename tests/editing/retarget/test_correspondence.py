@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from facediff.editing.correspondence import Correspondence, correspond
+from facediff.editing.correspondence import Correspondence, correspond, refuse_other_face
 from facediff.editing.landmarks import read_landmarks
 from facediff.editing.retargeting import load_correspondence, save_correspondence
 from facediff.errors import FaceDiffError
@@ -82,3 +82,12 @@ def test_wrong_landmarks(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(FaceDiffError, match=says):
         read_landmarks(tmp_path / "a.csv")
+
+
+def test_a_correspondence_of_another_face_is_refused_and_a_sculpted_one_kept() -> None:
+    own = np.random.default_rng(0).uniform(-1, 1, (100, 3))
+    nose = own.copy()
+    nose[:30] += 0.2
+    refuse_other_face("mesh.obj", nose, own)
+    with pytest.raises(FaceDiffError, match=r"mesh\.obj: .*another face"):
+        refuse_other_face("mesh.obj", 1.02 * own, own)
