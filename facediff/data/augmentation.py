@@ -148,7 +148,7 @@ def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
 class Voice(SpeechAugmentation):
     """Another speaker's pitch and formants, each by a random amount or both by the same.
 
-    The pitch is shifted by overlapping pieces of the waveform and resampling, the spectral envelope is warped along
+    The pitch is shifted by overlapping grains of the waveform and resampling, the spectral envelope is warped along
     frequency (vocal-tract length), so that the two are independent; the timing of sounds stays. A shorter vocal tract
     mostly has a higher voice, and a warped envelope sounds less like a person than resampled speech: ``together``
     leaves the warping out.

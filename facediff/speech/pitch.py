@@ -1,4 +1,4 @@
-"""Pitch and speed of speech, changed by overlapping pieces of the waveform, and its short-time spectra."""
+"""Pitch and speed of speech, changed by overlapping grains of the waveform, and its short-time spectra."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Wave = npt.NDArray[np.float32]
 
 SIZE, HOP = 512, 128
 """Samples of a spectrum, and from one to the next: 32 ms and 8 ms, in which a voice hardly changes."""
-PIECE, STEP, REACH = 480, 240, 160
-"""Samples of a piece, from one to the next, and within which the next one is looked for: 30, 15 and 10 ms."""
-_WINDOW, _FADE = (np.hanning(size + 1)[:-1].astype(np.float32) for size in (SIZE, PIECE))
-_DISTANCE = 1e-6 * np.abs(np.arange(-REACH, REACH + 1))  # of equally good pieces, as in silence, the nearest
+GRAIN, STEP, REACH = 480, 240, 160
+"""Samples of a grain, from one to the next, and within which the next one is looked for: 30, 15 and 10 ms."""
+_WINDOW, _FADE = (np.hanning(size + 1)[:-1].astype(np.float32) for size in (SIZE, GRAIN))
+_DISTANCE = 1e-6 * np.abs(np.arange(-REACH, REACH + 1))  # of equally good grains, as in silence, the nearest
 
 
 def spectra(speech: npt.NDArray[np.floating], hop: int = HOP) -> npt.NDArray[np.complexfloating]:
@@ -43,31 +43,31 @@ def signal(spectrum: npt.NDArray[np.complexfloating], length: int) -> npt.NDArra
 
 
 def stretched(speech: Wave, ratio: float) -> Wave:
-    """Speech that lasts ``ratio`` times as long and has the same pitch, by pieces of it that fade into one another.
+    """Speech that lasts ``ratio`` times as long and has the same pitch, by grains of it that fade into one another.
 
-    Each piece continues the one before as well as any within 10 ms of its place does (WSOLA: Verhelst and Roelands,
+    Each grain continues the one before as well as any within 10 ms of its place does (WSOLA: Verhelst and Roelands,
     "An overlap-add technique based on waveform similarity", ICASSP 1993). Onsets stay as sharp as they were, which a
     phase vocoder blurs.
     """
     length = round(len(speech) * ratio)
     count = -(-length // STEP) + 1
     middles = np.round(np.arange(count) * (STEP / ratio)).astype(int) + REACH
-    before = PIECE // 2 + REACH
-    behind = middles[-1] + REACH + STEP + PIECE - before - len(speech)
+    before = GRAIN // 2 + REACH
+    behind = middles[-1] + REACH + STEP + GRAIN - before - len(speech)
     padded = np.pad(np.asarray(speech, np.float32), (before, behind))
-    # The norms of all pieces, so that the likest is not merely the loudest: at a ratio of 1 speech stays what it is.
+    # The norms of all grains, so that the likest is not merely the loudest: at a ratio of 1 speech stays what it is.
     sums = np.concatenate([[0.0], np.cumsum(np.square(padded, dtype=np.float64))])
-    norms = np.sqrt(np.maximum(sums[PIECE:] - sums[:-PIECE], 0)) + 1e-6
+    norms = np.sqrt(np.maximum(sums[GRAIN:] - sums[:-GRAIN], 0)) + 1e-6
     out = np.zeros((count + 1) * STEP, np.float32)
     place = REACH
     for number, middle in enumerate(middles):
         if number:
-            following = padded[place + STEP : place + STEP + PIECE]
+            following = padded[place + STEP : place + STEP + GRAIN]
             first = middle - REACH
-            alike = np.correlate(padded[first : middle + REACH + PIECE], following, "valid")
+            alike = np.correlate(padded[first : middle + REACH + GRAIN], following, "valid")
             place = first + int(np.argmax(alike / norms[first : middle + REACH + 1] - _DISTANCE))
-        out[number * STEP : number * STEP + PIECE] += _FADE * padded[place : place + PIECE]
-    return out[PIECE // 2 : PIECE // 2 + length]
+        out[number * STEP : number * STEP + GRAIN] += _FADE * padded[place : place + GRAIN]
+    return out[GRAIN // 2 : GRAIN // 2 + length]
 
 
 def shifted(speech: Wave, ratio: float) -> Wave:

@@ -41,7 +41,7 @@ def test_onsets_come_at_their_time_and_stay_sharp(ratio: float) -> None:
     for start in starts:
         near = longer[int(start * ratio) - 700 : int(start * ratio) + 700]
         loud = np.flatnonzero(near > 0.5)
-        assert abs(loud[0] - 700) < 300  # the search goes 160 samples from its place, plus half a piece of 480
+        assert abs(loud[0] - 700) < 300  # the search goes 160 samples from its place, plus half a grain of 480
         assert loud[0] - np.flatnonzero(near > 0.02)[0] < 240  # no more than one fade
 
 
