@@ -39,6 +39,8 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import butter, fftconvolve, lfilter, sosfilt
 
 import facediff
+from facediff.animation.options import GROUPS
+from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
 from facediff.speech.audio import fit_length
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
@@ -501,9 +503,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--data-root", help="folder of the corpus (default: the user's cache folder)")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)
-    options: dict[str, Any] = dict(word.split("=", 1) for word in given.options)
-    if "voice_shift" in options:
-        options["voice_shift"] = float(options["voice_shift"])
+    parameters = {name: option for group in GROUPS for name, option in parameters_of(group).items()}
+    options = {name: parameters[name].read(text) for name, _, text in (word.partition("=") for word in given.options)}
     scores = measured(given.checkpoint, options, given.clips, given.only, given.data_root, given.people)
     if given.json:
         with atomic(given.json) as temporary:
