@@ -26,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from facediff.animation import Animation, read_archive  # noqa: E402
+from facediff.cli.demo import write_sheet  # noqa: E402
 from facediff.data import Puppet  # noqa: E402
 from facediff.editing.direction import Direction, Key  # noqa: E402
 from facediff.export import ExportOptions  # noqa: E402
@@ -75,7 +76,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
     ),
     "blendshapes.png": (*HELLO, "facediff blendshapes hello.npz -o weights.csv --shapes puppet --show {picture}"),
     "browser.png": (BROWSER + "talking_page.py puppet {root}/docs/examples/speech.wav --picture {picture} --frame 96",),
-    "demo.png": (*TRUTH, "panels truth.npz facediff.npz {picture}"),
+    "demo.png": (*TRUTH, "sheet truth.npz facediff.npz {picture}"),
     "export_glb.png": (
         *HELLO,
         "facediff export hello.npz -o hello.glb",
@@ -169,10 +170,13 @@ def main() -> None:
 
 def run(words: list[str], folder: Path) -> None:
     """Run a command in the folder."""
-    if words[0] in ("rows", "panels"):
+    if words[0] in ("rows", "sheet"):
         *names, picture = words[1:]
-        draw = rows if words[0] == "rows" else panels
-        draw([replace(read_archive(folder / name), name=Path(name).stem) for name in names], Path(picture))
+        animations = [replace(read_archive(folder / name), name=Path(name).stem) for name in names]
+        if words[0] == "rows":
+            rows(animations, Path(picture))
+        else:
+            write_sheet(Path(picture), animations)
     elif words[0] == "keys":
         (folder / words[1]).write_text(Direction(KEYS).text(), encoding="utf-8")
     elif words[0] == "head":
@@ -189,14 +193,6 @@ def rows(animations: list[Animation], picture: Path) -> None:
     picks = [int(frame) for frame in np.linspace(0.2, 0.8, 4) * len(animations[0].vertices)]
     frames = [frame for each in animations for frame in drawn_frames([each.part(picks)], ExportOptions(size=224))]
     save_image(picture, contact_sheet(frames, len(picks)))
-
-
-def panels(animations: list[Animation], picture: Path) -> None:
-    """The animations next to each other, at twelve moments."""
-    picks = [int(frame) for frame in np.linspace(0.05, 0.95, 12) * len(animations[0].vertices)]
-    frames = drawn_frames([each.part(picks) for each in animations], ExportOptions(size=224))
-    times = [f"{pick / animations[0].frame_rate:.2f} s" for pick in picks]
-    save_image(picture, contact_sheet(list(frames), 4, labels=times))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from facediff.utils import ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
+    from facediff.animation import Animation
     from facediff.data import SpeechMotionDataModule
     from facediff.models import AnimationModel
 
@@ -100,9 +102,7 @@ def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModu
     from facediff.animation import Animation
     from facediff.data import collate
     from facediff.export import ExportOptions, write_animations
-    from facediff.export.video import drawn_frames
     from facediff.pipelines.trained import facts_of
-    from facediff.render import contact_sheet, save_image
 
     written = []
     for split in data.test_splits:
@@ -118,13 +118,23 @@ def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModu
         path = folder / f"truth_and_prediction_{split}.mp4"
         footer = f"{model.assets.corpus}: synthetic corpus"
         write_animations(path, animations, ExportOptions(footer=footer, quiet=False))
-        picks = [round(i * (len(motion) - 1) / (SHEET + 1)) for i in range(1, SHEET + 1)]
-        few = [animation.part(picks) for animation in animations]
-        frames = drawn_frames(few, ExportOptions(footer=footer, size=224))
-        times = [f"{pick / model.frame_rate:.2f} s" for pick in picks]
-        save_image(path.with_suffix(".png"), contact_sheet(list(frames), 4, labels=times))
+        write_sheet(path.with_suffix(".png"), animations, footer)
         written += [path, path.with_suffix(".png")]
     return written
+
+
+def write_sheet(path: Path, animations: Sequence[Animation], footer: str = "") -> None:
+    """A picture of animations of one length next to each other, at moments from beginning to end."""
+    from facediff.export import ExportOptions
+    from facediff.export.video import drawn_frames
+    from facediff.render import contact_sheet, save_image
+
+    last = len(animations[0].vertices) - 1
+    picks = [round(i * last / (SHEET + 1)) for i in range(1, SHEET + 1)]
+    few = [animation.part(picks) for animation in animations]
+    frames = drawn_frames(few, ExportOptions(footer=footer, size=224))
+    times = [f"{pick / animations[0].frame_rate:.2f} s" for pick in picks]
+    save_image(path, contact_sheet(list(frames), 4, labels=times))
 
 
 def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list[str]:
