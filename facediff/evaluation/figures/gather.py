@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.check.layouts import by_name, list_folder, recognise
+from facediff.data.check.layouts import by_name, instance, list_folder, recognise
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.data.puppet import SecondEdition, built_in_mesh, cache_root, made_root
 from facediff.errors import FaceDiffError
@@ -23,8 +23,6 @@ from facediff.mesh.mesh import Mesh
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
 from facediff.utils import ranges
-
-Module = type[SpeechMotionDataModule]
 
 
 @ranges.checked
@@ -71,7 +69,7 @@ def gather(
         templates = corpus / "templates.pkl"
     if module is None and templates is None and not any(folder.glob("**/*.npy")):
         raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
-    n_vertices = _vertices(module, manifest) if module else count_vertices(None, templates, folder)
+    n_vertices = module.n_vertices if module else count_vertices(None, templates, folder)
     faces = {} if templates is None else read_templates(templates, n_vertices)
     found_mesh = _find_mesh(mesh, corpus or folder, module, n_vertices)
     rate, stride = _rates(frame_rate, truth_stride, manifest, module)
@@ -108,26 +106,21 @@ def phonemes_of(material: FigureData, clip: str, file: Path | None = None) -> li
     return read_phonemes(path) if path else []
 
 
-def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Module | None:
-    """The data module whose topology this is; None if it is not recognised."""
+def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> SpeechMotionDataModule | None:
+    """The data module whose topology this is; None if it is not recognised. Which of several the folder decides."""
     folder = list_folder(root, MOTION_FOLDERS)
     if name is not None:
         if "." in name:
             sys.path.append(os.getcwd())  # a data module of the user's own may be in the working folder
-        return by_name(name, folder.n_vertices())
+        return instance(by_name(name, folder.n_vertices()), root, None)
     if not folder.motions or isinstance(manifest.get("person"), str):
         return None
-    module = recognise(folder, manifest.get("corpus"), folder.n_vertices())
-    return module if module is not None and _vertices(module, manifest) == folder.n_vertices() else None
+    kind = recognise(folder, manifest.get("corpus"), folder.n_vertices())
+    module = None if kind is None else instance(kind, root, None)
+    return module if module is not None and module.n_vertices == folder.n_vertices() else None
 
 
-def _vertices(module: Module, manifest: dict[str, Any]) -> int:
-    """By the folder's manifest, since a data module may read several topologies; else the data module's."""
-    stated = manifest.get("vertices")
-    return stated if isinstance(stated, int) else module.n_vertices
-
-
-def _find_mesh(path: Path | None, root: Path, module: Module | None, n_vertices: int) -> Mesh | None:
+def _find_mesh(path: Path | None, root: Path, module: SpeechMotionDataModule | None, n_vertices: int) -> Mesh | None:
     """The mesh given, else the one in the corpus folder, else the first edition's; None without one."""
     if path is not None:
         mesh = read_mesh(path)
@@ -146,7 +139,7 @@ def _find_mesh(path: Path | None, root: Path, module: Module | None, n_vertices:
 
 
 def _rates(
-    frame_rate: float | None, truth_stride: int | None, manifest: dict[str, Any], module: Module | None
+    frame_rate: float | None, truth_stride: int | None, manifest: dict[str, Any], module: SpeechMotionDataModule | None
 ) -> tuple[float | None, int]:
     """Frames a second of the predictions, and the step between the frames of the truth that belong to them."""
     stated = manifest.get("frame_rate") or (module and (module.stored_frame_rate or module.frame_rate))

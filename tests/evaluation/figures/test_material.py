@@ -93,9 +93,11 @@ def test_unknown_facts_name_the_option_that_gives_them(own_material: FigureData)
     assert replace(own_material, unit="normalised (a long story)").scale == (1.0, "normalised")
 
 
-@pytest.mark.parametrize("vertices", [N_VERTICES, vertex_count()])
-def test_each_edition_of_the_built_in_corpus_is_known_with_its_unit(tmp_path: Path, vertices: int) -> None:
-    facts = {"corpus": "facediff-puppet", "vertices": vertices, "frame_rate": 25}
+@pytest.mark.parametrize(("generator", "vertices"), [("1.1", N_VERTICES), ("2.2", vertex_count())])
+def test_each_edition_of_the_built_in_corpus_is_known_with_its_unit(
+    tmp_path: Path, generator: str, vertices: int
+) -> None:
+    facts = {"corpus": "facediff-puppet", "generator": generator, "vertices": vertices, "frame_rate": 25}
     for folder in (tmp_path / "corpus/vertices_npy", tmp_path / "ours"):
         folder.mkdir(parents=True)
         np.save(folder / "F1_t01.npy", np.zeros((3, 3 * vertices), np.float32))
