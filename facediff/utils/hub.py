@@ -179,10 +179,7 @@ def model_path(source: str | os.PathLike[str]) -> Path:
     Raises:
         FaceDiffError: if there is none, or it cannot be fetched.
     """
-    check_model_source(source)
-    source, _ = split_face(source)
-    named = hub_id(source)
-    return Path(source) if named is None else fetch(*named)
+    return _located(source)[0]
 
 
 def local_model(source: str | os.PathLike[str]) -> Path:
@@ -191,8 +188,15 @@ def local_model(source: str | os.PathLike[str]) -> Path:
     Raises:
         FaceDiffError: as :func:`model_path`.
     """
-    path, face = model_path(source), split_face(source)[1]
+    path, face = _located(source)
     return path if face is None else path.with_name(f"{path.name}:{face}")
+
+
+def _located(source: str | os.PathLike[str]) -> tuple[Path, str | None]:
+    check_model_source(source)
+    model, face = split_face(source)
+    named = hub_id(model)
+    return Path(model) if named is None else fetch(*named), face
 
 
 def model_files(source: str | os.PathLike[str]) -> list[Path]:
