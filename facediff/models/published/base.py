@@ -10,6 +10,7 @@ import math
 import zlib
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -36,6 +37,7 @@ from facediff.models.graphs import (
 )
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
+from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.registry import component_class
 from facediff.speech.windows import FrameClock, Rule
 from facediff.utils.plain_options import fits, parameters
@@ -46,6 +48,9 @@ frames a second, or ``interpolated`` to the frames, as they do on VOCASET at 30;
 
 LongSpeech = Literal["refuse", "windows", "extend"]
 """What is done with speech beyond the tables of the published code."""
+
+TRAINED_NETWORK = partial(Wav2Vec2Encoder, spec_augment=True, layer_drop=0.1, edges=False)
+"""A pretrained speech network as most of the methods train it: all but its convolutions, with masks and layer drop."""
 
 NO_STYLE = Style("none", torch.zeros(0))
 """The style of a model that takes none."""

@@ -26,10 +26,9 @@ from facediff.models.base import AnimationModel
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
 from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_mask
 from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
-from facediff.models.published.base import SpeakerTable, masked_mean
+from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, masked_mean
 from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
 from facediff.models.published.squared_errors import mean_squared_error
-from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
 
 Stage = Literal["prior", "predictor"]
@@ -90,14 +89,9 @@ class CodeTalker(AutoregressiveModel):
 
     network: Predictor
 
-    # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.
+    # wav2vec 2.0 base as transformers had it in 2021.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder,
-        source="facebook/wav2vec2-base-960h",
-        spec_augment=True,
-        layer_drop=0.1,
-        epsilon=1e-5,
-        edges=False,
+        TRAINED_NETWORK, source="facebook/wav2vec2-base-960h", epsilon=1e-5
     )
 
     def __init__(

@@ -112,12 +112,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     options = convert_prior(weights, "autoencoder." if inside else "")
     dim, _ = weights.shape("audio_feature_map.weight")
     period = read_period(weights, "PPE.pe", facts)
-    encoder = weights.backbone(
-        "audio_encoder.",
-        kind="wav2vec2",
-        facts=facts,
-        **CodeTalker.encoder_settings(),
-    )
+    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", facts=facts, **CodeTalker.encoder_settings())
     for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("feat_map", "out")):
         weights.move_all(f"{old}.", f"network.{new}.")
     weights.move("learnable_style_emb.weight", "network.style.weight")

@@ -33,7 +33,7 @@ from facediff.models.published.autoregressive import (
     periodic_positions,
     read_period,
 )
-from facediff.models.published.base import LongSpeech, SpeakerTable, whole_model, zeros
+from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
@@ -45,7 +45,6 @@ from facediff.models.published.diffusion import (
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.published.squared_errors import squared_errors
-from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
@@ -90,12 +89,7 @@ class DiffSpeaker(DiffusionModel):
     samplers: ClassVar[tuple[str, ...]] = ("ddim",)
     table_frames: ClassVar[int | None] = 3000
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder,
-        source="facebook/hubert-base-ls960",
-        spec_augment=True,
-        layer_drop=0.1,
-        epsilon=1e-7,
-        edges=False,
+        TRAINED_NETWORK, source="facebook/hubert-base-ls960", epsilon=1e-7
     )
 
     def __init__(

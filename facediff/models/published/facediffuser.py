@@ -24,7 +24,7 @@ from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpac
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states, frame_mask
-from facediff.models.published.base import SpeakerTable, whole_model, zeros
+from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
@@ -35,7 +35,6 @@ from facediff.models.published.diffusion import (
 )
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.samplers import cosine_betas
-from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import FrameClock, Rule
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
@@ -63,13 +62,7 @@ class FaceDiffuser(DiffusionModel):
 
     # HuBERT base as the project's copy of transformers has it; the two lowest layers are frozen.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder,
-        source="facebook/hubert-base-ls960",
-        frozen_layers=2,
-        spec_augment=True,
-        layer_drop=0.1,
-        epsilon=1e-5,
-        edges=False,
+        TRAINED_NETWORK, source="facebook/hubert-base-ls960", frozen_layers=2, epsilon=1e-5
     )
 
     def __init__(

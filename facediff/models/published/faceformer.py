@@ -21,10 +21,9 @@ from facediff.models.published.autoregressive import (
     decoder_sizes,
     read_period,
 )
-from facediff.models.published.base import SpeakerTable
+from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.published.squared_errors import mean_squared_error
-from facediff.models.speech_networks import Wav2Vec2Encoder
 
 
 @registry.model.register("FaceFormer")
@@ -36,14 +35,9 @@ class FaceFormer(OffsetModel):
             :class:`~facediff.models.published.autoregressive.AutoregressiveModel`, and of every model.
     """
 
-    # wav2vec 2.0 base as transformers had it in 2021; all but the convolutions is trained, with masks and layer drop.
+    # wav2vec 2.0 base as transformers had it in 2021.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder,
-        source="facebook/wav2vec2-base-960h",
-        spec_augment=True,
-        layer_drop=0.1,
-        epsilon=1e-5,
-        edges=False,
+        TRAINED_NETWORK, source="facebook/wav2vec2-base-960h", epsilon=1e-5
     )
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
@@ -84,12 +78,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """FaceFormer's tensors under the names of this file, and its options."""
     dim, _ = weights.shape("audio_feature_map.weight")
     period = read_period(weights, "PPE.pe", facts)
-    encoder = weights.backbone(
-        "audio_encoder.",
-        kind="wav2vec2",
-        facts=facts,
-        **FaceFormer.encoder_settings(),
-    )
+    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", facts=facts, **FaceFormer.encoder_settings())
     for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("vertice_map_r", "motion_out")):
         weights.move_all(f"{old}.", f"network.{new}.")
     weights.renamed["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()

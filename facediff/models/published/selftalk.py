@@ -33,10 +33,9 @@ from facediff.models.evaluation import IdentityPolicy
 from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
-from facediff.models.published.base import DirectModel, masked_mean
+from facediff.models.published.base import TRAINED_NETWORK, DirectModel, masked_mean
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, backbone_config, register
 from facediff.models.published.squared_errors import squared_errors
-from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
@@ -77,12 +76,7 @@ class SelfTalk(DirectModel):
 
     checkpoint_options = ("text_config",)  # without it, a file could have weights fetched from anywhere
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder,
-        source="jonatasgrosman/wav2vec2-large-xlsr-53-english",
-        spec_augment=True,
-        layer_drop=0.1,
-        epsilon=1e-7,
-        edges=False,
+        TRAINED_NETWORK, source="jonatasgrosman/wav2vec2-large-xlsr-53-english", epsilon=1e-7
     )
 
     def __init__(

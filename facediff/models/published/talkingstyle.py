@@ -25,11 +25,10 @@ from facediff.models.published.autoregressive import (
     decoder_sizes,
     read_period,
 )
-from facediff.models.published.base import SpeakerTable
+from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
 from facediff.models.published.squared_errors import mean_squared_error
-from facediff.models.speech_networks import Wav2Vec2Encoder
 
 StyleAttention = Literal["one_key", "components"]
 """What an attention over a speaker's row attends to: each component to itself alone, or to all of them."""
@@ -55,14 +54,8 @@ class TalkingStyle(OffsetModel):
             :class:`~facediff.models.published.autoregressive.AutoregressiveModel`, and of every model.
     """
 
-    # HuBERT large; all but the convolutions is trained, with masks and layer drop.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
-        Wav2Vec2Encoder,
-        source="facebook/hubert-large-ls960-ft",
-        spec_augment=True,
-        layer_drop=0.1,
-        epsilon=1e-7,
-        edges=False,
+        TRAINED_NETWORK, source="facebook/hubert-large-ls960-ft", epsilon=1e-7
     )
 
     def __init__(
