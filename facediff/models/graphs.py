@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -205,7 +205,22 @@ class GraphedModel(Protocol):
         ...
 
 
-class SpeechGraph(nn.Module):
+ModelType = TypeVar("ModelType")
+
+
+class ModelPart(nn.Module, Generic[ModelType]):
+    """A part of a model as a module by itself, to become a graph.
+
+    Args:
+        model: whose parameters are used.
+    """
+
+    def __init__(self, model: ModelType) -> None:
+        super().__init__()
+        self.model = model
+
+
+class SpeechGraph(ModelPart[GraphedModel]):
     """Speech to one feature per frame of motion.
 
     Args:
@@ -215,8 +230,7 @@ class SpeechGraph(nn.Module):
     """
 
     def __init__(self, model: GraphedModel, hear: Hear, steps_of: Callable[[int], int]) -> None:
-        super().__init__()
-        self.model = model
+        super().__init__(model)
         self.hear = hear
         self.steps_of = steps_of
 
@@ -270,12 +284,8 @@ def speech_graph(model: GraphedModel, hear: Hear, steps_of: Callable[[int], int]
     )
 
 
-class StyleGraph(nn.Module):
+class StyleGraph(ModelPart[GraphedModel]):
     """Reference motion to a style vector."""
-
-    def __init__(self, model: GraphedModel) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]

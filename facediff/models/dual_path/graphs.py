@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.network import Conditions, DualPathNetwork
@@ -18,6 +18,7 @@ from facediff.models.graphs import (
     Graph,
     GraphedModel,
     Graphs,
+    ModelPart,
     SamplingLoop,
     results_of,
     speech_graph,
@@ -59,12 +60,8 @@ class DualPathModel(GraphedModel, Protocol):
         ...
 
 
-class StepGraph(nn.Module):
+class StepGraph(ModelPart[DualPathModel]):
     """Noisy motion to clean motion at one step, under speech, identity and style."""
-
-    def __init__(self, model: DualPathModel) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self,
@@ -103,12 +100,11 @@ class StepGraph(nn.Module):
         return denoiser.denoise(state, step), kept[0]
 
 
-class SampleGraph(nn.Module):
+class SampleGraph(ModelPart[DualPathModel]):
     """The end of sampling to offsets from the template."""
 
     def __init__(self, model: DualPathModel, decoded: Literal["sample", "kept"]) -> None:
-        super().__init__()
-        self.model = model
+        super().__init__(model)
         self.decoded = decoded
 
     def forward(self, sample: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames points dims"]:

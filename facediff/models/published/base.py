@@ -28,6 +28,7 @@ from facediff.models.graphs import (
     FRAMES,
     Graph,
     Graphs,
+    ModelPart,
     SamplingLoop,
     Speech,
     Spoken,
@@ -300,12 +301,8 @@ def whole_model(model: PublishedModel, parts: list[Graph], sampling: SamplingLoo
     )
 
 
-class DirectMotion(nn.Module):
+class DirectMotion(ModelPart[DirectModel]):
     """Features of speech to offsets from the template."""
-
-    def __init__(self, model: DirectModel) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self, features: Float[Tensor, "batch frames *width"], identity: Int[Tensor, " batch"]

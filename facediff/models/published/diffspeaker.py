@@ -22,7 +22,7 @@ from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
 from facediff.models.published.autoregressive import (
@@ -487,17 +487,13 @@ def mutual_bias(
 # The method as graphs, without PyTorch; see facediff.models.graphs.
 
 
-class SpeakerStep(nn.Module):
+class SpeakerStep(ModelPart[DiffSpeaker]):
     """Noisy motion to clean motion at one step.
 
     In the folded space, the result is a sum of maps of what the network gave, of a bias and of the first noise, each
     with a factor that the sampler makes. So a frame of the state is: noisy motion as the network sees it, the sum of
     the network's features, the bias's factor, the first noise's factor.
     """
-
-    def __init__(self, model: DiffSpeaker) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self,
@@ -516,12 +512,8 @@ class SpeakerStep(nn.Module):
         return torch.cat([space.clean(hidden), hidden, ones, torch.zeros_like(ones)], -1), hidden
 
 
-class SpeakerStart(nn.Module):
+class SpeakerStart(ModelPart[DiffSpeaker]):
     """Unit noise on the vertices to the folded state that sampling starts from."""
-
-    def __init__(self, model: DiffSpeaker) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
         """Noise alone: of features and bias there is nothing yet."""
@@ -530,12 +522,8 @@ class SpeakerStart(nn.Module):
         return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
 
 
-class SpeakerMotion(nn.Module):
+class SpeakerMotion(ModelPart[DiffSpeaker]):
     """The end of sampling to offsets from the template, smoothed where the model does so."""
-
-    def __init__(self, model: DiffSpeaker) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self,

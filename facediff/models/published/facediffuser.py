@@ -21,7 +21,7 @@ from facediff.data import Batch
 from facediff.errors import ArgumentError, FaceDiffError, OptionError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, SamplingLoop, Spoken, results_of
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states, frame_mask
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, whole_model, zeros
@@ -309,12 +309,8 @@ class FaceDiffuserNetwork(nn.Module):
 # The method as graphs, without PyTorch; see facediff.models.graphs.
 
 
-class DiffuserStep(nn.Module):
+class DiffuserStep(ModelPart[FaceDiffuser]):
     """Noisy motion to clean motion at one step, and the features that the last map makes motion of."""
-
-    def __init__(self, model: FaceDiffuser) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self,
@@ -331,12 +327,11 @@ class DiffuserStep(nn.Module):
         return space.clean(hidden), hidden
 
 
-class DiffuserStart(nn.Module):
+class DiffuserStart(ModelPart[FaceDiffuser]):
     """Unit noise to the motion that sampling starts from where its first steps are skipped."""
 
     def __init__(self, model: FaceDiffuser, step: int) -> None:
-        super().__init__()
-        self.model = model
+        super().__init__(model)
         self.share = model.posterior.noise_share(step)
 
     def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
@@ -345,12 +340,8 @@ class DiffuserStart(nn.Module):
         return space.noise(noise) * self.share
 
 
-class LastMap(nn.Module):
+class LastMap(ModelPart[FaceDiffuser]):
     """The network's last features to offsets from the template."""
-
-    def __init__(self, model: FaceDiffuser) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""

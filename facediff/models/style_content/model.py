@@ -21,7 +21,7 @@ from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel, Decay
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, results_of, speech_graph, style_graphs
+from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, results_of, speech_graph, style_graphs
 from facediff.models.inference import Progress
 from facediff.models.layers import Heads, Weight, Width, frame_mask
 from facediff.models.losses import style_contrast
@@ -400,12 +400,8 @@ class StyleContentDisentanglement(AnimationModel):
 # The model as computation graphs.
 
 
-class ContentMotionGraph(nn.Module):
+class ContentMotionGraph(ModelPart[StyleContentDisentanglement]):
     """Content and style to offsets from the template."""
-
-    def __init__(self, model: StyleContentDisentanglement) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self,
