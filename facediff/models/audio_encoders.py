@@ -160,6 +160,30 @@ class AudioEncoder(nn.Module, ABC):
         """
 
 
+class FrozenEncoder(AudioEncoder):
+    """Base of encoders whose frozen part always gives features that can be kept on disk."""
+
+    out: nn.Linear | None
+
+    def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
+        """What is made of the frozen part's features before the map to the model's width; here nothing."""
+        return features, lengths
+
+    def forward(
+        self,
+        audio: Waves,
+        audio_lengths: Lengths,
+        frame_lengths: Lengths,
+        features: Features | None = None,
+        feature_lengths: Lengths | None = None,
+    ) -> Frames:
+        """Encode; see :class:`AudioEncoder`."""
+        if features is None or feature_lengths is None:
+            features, feature_lengths = self.frozen_features(audio, audio_lengths)
+        hidden, steps = self.trained(features, feature_lengths)
+        return interpolate_frames(hidden if self.out is None else self.out(hidden), steps, frame_lengths)
+
+
 class AudioEncoderFactory(Protocol):
     """Makes an audio encoder once the model's width is known."""
 
@@ -483,7 +507,7 @@ def fingerprint(layers: int, config: dict[str, Any], parts: dict[str, nn.Module]
 
 
 @audio_encoder.register("ctc")
-class CtcEncoder(AudioEncoder):
+class CtcEncoder(FrozenEncoder):
     """Logits of a frozen speech recogniser: a pretrained HuBERT, wav2vec 2.0 or WavLM with its CTC head.
 
     Logits over letters hold little of the speaker's voice, so they suit a model that takes
@@ -533,19 +557,6 @@ class CtcEncoder(AudioEncoder):
         return by_length(
             self.standardise(audio, audio_lengths), audio_lengths, lambda wave: self.recogniser(with_edges(wave)).logits
         )
-
-    def forward(
-        self,
-        audio: Waves,
-        audio_lengths: Lengths,
-        frame_lengths: Lengths,
-        features: Features | None = None,
-        feature_lengths: Lengths | None = None,
-    ) -> Frames:
-        """Encode; see :class:`AudioEncoder`."""
-        if features is None or feature_lengths is None:
-            features, feature_lengths = self.frozen_features(audio, audio_lengths)
-        return interpolate_frames(self.out(features), feature_lengths, frame_lengths)
 
 
 # Pretrained networks: from a directory, from the hub, or from a plain configuration whose weights a checkpoint has.

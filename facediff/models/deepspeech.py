@@ -19,14 +19,12 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.models.audio_encoders import AudioEncoder, Features, Lengths, Waves, by_length, fingerprint, fourier
+from facediff.models.audio_encoders import Features, FrozenEncoder, Lengths, Waves, by_length, fingerprint, fourier
 from facediff.models.layers import (
-    Frames,
     Width,
     all_states,
     exporting,
     frame_mask,
-    interpolate_frames,
     longest,
     sliding,
 )
@@ -265,7 +263,7 @@ def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
 
 
 @audio_encoder.register("deepspeech")
-class DeepSpeechEncoder(AudioEncoder):
+class DeepSpeechEncoder(FrozenEncoder):
     """Logits of the frozen DeepSpeech 0.1.0, the speech features of VOCA.
 
     Its steps are 50 a second. Models that take frames get them interpolated to the motion's frames; VOCA itself takes
@@ -318,19 +316,6 @@ class DeepSpeechEncoder(AudioEncoder):
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
         """The logits, at 50 steps a second."""
         return by_length(audio, audio_lengths, lambda wave: self.network(network_input(wave, self.context)))
-
-    def forward(
-        self,
-        audio: Waves,
-        audio_lengths: Lengths,
-        frame_lengths: Lengths,
-        features: Features | None = None,
-        feature_lengths: Lengths | None = None,
-    ) -> Frames:
-        """Encode; see :class:`AudioEncoder`."""
-        if features is None or feature_lengths is None:
-            features, feature_lengths = self.frozen_features(audio, audio_lengths)
-        return interpolate_frames(features if self.out is None else self.out(features), feature_lengths, frame_lengths)
 
     def at_rate(
         self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rate: float, *cached: Tensor

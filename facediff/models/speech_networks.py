@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import (
-    AudioEncoder,
     Features,
+    FrozenEncoder,
     Lengths,
     StepRule,
     Waves,
@@ -26,7 +26,7 @@ from facediff.models.audio_encoders import (
     load_typed,
     with_edges,
 )
-from facediff.models.layers import Frames, Share, Width, exporting, interpolate_ends, interpolate_frames, longest
+from facediff.models.layers import Share, Width, exporting, interpolate_ends, longest
 from facediff.registry import audio_encoder
 from facediff.utils.ranges import Range
 
@@ -38,7 +38,7 @@ NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
 
 
 @audio_encoder.register("wav2vec2")
-class Wav2Vec2Encoder(AudioEncoder):
+class Wav2Vec2Encoder(FrozenEncoder):
     """Pretrained wav2vec 2.0, HuBERT or WavLM, base or large; all but its convolutions is fine-tuned.
 
     The published methods that facediff has (FaceFormer and others) encode speech by it; a model of facediff's own
@@ -136,19 +136,9 @@ class Wav2Vec2Encoder(AudioEncoder):
         features: Tensor = self.network.feature_extractor(heard).transpose(1, 2)
         return features
 
-    def forward(
-        self,
-        audio: Waves,
-        audio_lengths: Lengths,
-        frame_lengths: Lengths,
-        features: Features | None = None,
-        feature_lengths: Lengths | None = None,
-    ) -> Frames:
-        """Encode; see :class:`AudioEncoder`."""
-        if features is None or feature_lengths is None:
-            features, feature_lengths = self.frozen_features(audio, audio_lengths)
-        hidden, steps = by_length(features, feature_lengths, self.hidden_states)
-        return interpolate_frames(hidden if self.out is None else self.out(hidden), steps, frame_lengths)
+    def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
+        """The hidden states."""
+        return by_length(features, lengths, self.hidden_states)
 
     def at_steps(
         self, audio: Waves, audio_lengths: Lengths, steps: Lengths, rule: StepRule, *cached: Tensor
