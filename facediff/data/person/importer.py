@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -114,7 +114,7 @@ def import_person(
             length = resampled_length(len(frames), frame_rate, target.frame_rate)
             resampled = scratch_array(scratch / "rate.npy", (length, *frames.shape[1:]))
             frames = resample_frames(frames, frame_rate, target.frame_rate, out=resampled)
-        clips = _cut(name, speech, len(frames), target.frame_rate, clip_seconds)
+        clips = cut(name, speech, len(frames), target.frame_rate, clip_seconds)
         mismatch = len(speech) / SAMPLE_RATE - len(read.frames) / frame_rate
         report = _report(name, read, target, fitted, clips, frame_rate, stable, mismatch, warnings)
         entry = scratch / output.name
@@ -217,7 +217,7 @@ class EntryClip:
     stop: int
 
 
-def _cut(name: str, speech: Speech, frames: int, frame_rate: float, clip_seconds: float) -> list[EntryClip]:
+def cut(name: str, speech: Speech, frames: int, frame_rate: float, clip_seconds: float) -> list[EntryClip]:
     """Cut what both speech and motion cover into clips."""
     covered = min(frames, max(1, round(len(speech) / SAMPLE_RATE * frame_rate)))
     cuts = cut_points(loudness(speech, covered, frame_rate), clip_seconds * frame_rate)
@@ -393,18 +393,18 @@ def _write_entry(
         part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
         write_clip(folder, clip.name, frames[clip.start : clip.stop], part)
     write_templates(folder / "templates.pkl", {report.name: template.astype(np.float32)})
+    facts = {"frame_rate": target.frame_rate, "n_vertices": target.n_vertices, "unit": target.unit}
+    write_record(folder, report.name, clips, facts, asdict(report))
+
+
+def write_record(
+    folder: Path, name: str, clips: Sequence[EntryClip], facts: Mapping[str, object], report: Mapping[str, object]
+) -> None:
+    """Write the table of an entry's clips and, when all other files are there, its manifest."""
     rows = [
-        {"clip": clip.name, "subject": report.name, "sentence": clip.name.rpartition("_")[2], "split": clip.split}
+        {"clip": clip.name, "subject": name, "sentence": clip.name.rpartition("_")[2], "split": clip.split}
         for clip in clips
     ]
     write_rows(folder / "clips.csv", rows, line_end="\n")
-    facts = {"frame_rate": target.frame_rate, "n_vertices": target.n_vertices, "unit": target.unit}
-    about = {
-        "facediff": version(),
-        "format": FORMAT,
-        "corpus": "person",
-        "person": report.name,
-        **facts,
-        "report": asdict(report),
-    }
+    about = {"facediff": version(), "format": FORMAT, "corpus": "person", "person": name, **facts, "report": report}
     write_json(folder / MANIFEST, {**about, "files": describe_files(folder, workers=2)})

@@ -8,19 +8,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.manifest import FORMAT
 from facediff.data.person.fitting import loudness
-from facediff.data.person.importer import MIN_SECONDS, NAME, SILENCE, EntryClip, check_output, cut_points, splits
-from facediff.data.prepare.runner import MANIFEST, version, write_speech
+from facediff.data.person.importer import MIN_SECONDS, NAME, SILENCE, EntryClip, check_output, cut, write_record
+from facediff.data.prepare.runner import write_speech
 from facediff.errors import FaceDiffError
 from facediff.spaces.files import ParameterClip, even, read_parameters
 from facediff.spaces.files.tables import write_live_link
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech
 from facediff.utils import ranges
-from facediff.utils.checksums import describe_files
 from facediff.utils.files import put_in_place, scratch_folder
 from facediff.utils.lags import correlations, lagged_correlation, peak
-from facediff.utils.plain_files import write_json, write_rows
 
 Array = npt.NDArray[np.float64]
 Speech = npt.NDArray[np.float32]
@@ -169,12 +166,7 @@ def import_take(
         warnings.append(f"weights above 1, kept as recorded: {names}")
     if not clip.values[:, list(clip.space.head)].any():
         warnings.append("the head does not move: head rotation was probably switched off in the app")
-    cuts = cut_points(loudness(speech, len(clip.values), clip.frame_rate), clip_seconds * clip.frame_rate)
-    width = max(2, len(str(len(cuts))))
-    entries = [
-        EntryClip(f"{name}_s{i:0{width}d}", split, *cut)
-        for i, (cut, split) in enumerate(zip(cuts, splits(len(cuts)), strict=True), start=1)
-    ]
+    entries = cut(name, speech, len(clip.values), clip.frame_rate, clip_seconds)
     seconds = len(clip.values) / clip.frame_rate
     report = TakeReport(
         name, clip.frame_rate, len(clip.values), recorded.dropped, best, len(entries), seconds, tuple(warnings)
@@ -205,17 +197,4 @@ def _write(folder: Path, clip: ParameterClip, speech: Speech, entries: list[Entr
         write_live_link(folder / FOLDER / f"{entry.name}.csv", part)
         first, stop = (round(frame / clip.frame_rate * SAMPLE_RATE) for frame in (entry.start, entry.stop))
         write_speech(folder / "wav" / f"{entry.name}.wav", speech[first:stop])
-    rows = [
-        {"clip": entry.name, "subject": report.name, "sentence": entry.name.rpartition("_")[2], "split": entry.split}
-        for entry in entries
-    ]
-    write_rows(folder / "clips.csv", rows, line_end="\n")
-    about = {
-        "facediff": version(),
-        "format": FORMAT,
-        "corpus": "person",
-        "person": report.name,
-        "layout": "live_link",
-        "report": asdict(report),
-    }
-    write_json(folder / MANIFEST, {**about, "files": describe_files(folder, workers=2)})
+    write_record(folder, report.name, entries, {"layout": "live_link"}, asdict(report))
