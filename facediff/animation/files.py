@@ -173,14 +173,6 @@ def read_archive(path: Path) -> Animation:
     return animation
 
 
-def has_values(path: Path) -> bool:
-    """Whether a file is an archive with the channels that its vertices were made of."""
-    try:
-        return path.suffix == ".npz" and "values" in read_arrays(path, ("values",))
-    except FaceDiffError:  # whoever reads the file says what is wrong with it
-        return False
-
-
 class _Entries:
     """The names of an archive's entries."""
 

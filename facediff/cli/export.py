@@ -76,15 +76,16 @@ def export(
 
 def _may_have_weights(path: Path, lent: bool) -> bool:
     """Whether weights can be had of a file's motion before it is read whole; ``lent`` where a model completes it."""
-    from facediff.animation.files import has_values
     from facediff.editing.blendshapes import is_built_in_face
     from facediff.editing.recorded_weights import SUFFIXES
     from facediff.utils.arrays import read_arrays
 
-    if lent or path.suffix.lower() in SUFFIXES or has_values(path):
+    if lent or path.suffix.lower() in SUFFIXES:
         return True
     try:
-        arrays = read_arrays(path, ("faces", "template")) if path.suffix == ".npz" else {}
+        arrays = read_arrays(path, ("values", "faces", "template")) if path.suffix == ".npz" else {}
     except FaceDiffError:  # whoever reads the file says what is wrong with it
         return False
-    return {"faces", "template"} <= arrays.keys() and is_built_in_face(arrays["template"].size // 3, arrays["faces"])
+    if "values" in arrays or not {"faces", "template"} <= arrays.keys():
+        return "values" in arrays
+    return is_built_in_face(arrays["template"].size // 3, arrays["faces"])

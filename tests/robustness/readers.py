@@ -1116,13 +1116,6 @@ def read_whether_it_may_have_weights(path: Path) -> object:
     return may_have_weights(path.parent)
 
 
-def read_whether_it_has_values(path: Path) -> object:
-    """Whether an archive has channels."""
-    from facediff.animation.files import has_values
-
-    return has_values(path)
-
-
 def read_whether_an_animation_may_have_weights(path: Path) -> object:
     """Whether weights can be had of an archive's motion."""
     from facediff.cli.export import _may_have_weights
@@ -1182,8 +1175,7 @@ READERS = {
     "eyes, arrays": Reader(".npz", eyes_arrays, read_the_eyes),
     **{f"direction, {suffix}": Reader(f".{suffix}", direction, read_the_direction) for suffix in ("json", "csv")},
     "animation": Reader(".npz", animation, read_an_animation),
-    "animation, its channels": Reader(".npz", animation, read_whether_it_has_values, 0.5),
-    "animation, its topology": Reader(".npz", animation, read_whether_an_animation_may_have_weights, 0.5),
+    "animation, its weights": Reader(".npz", animation, read_whether_an_animation_may_have_weights),
     "style, archive": Reader(".npz", animation, read_a_style),
     "style, array": Reader(".npy", vertices, read_a_style),
     "correspondence": Reader(".npz", correspondence, read_correspondence),
