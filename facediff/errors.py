@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 MANY = 40
 """Names that are no longer listed in full."""
@@ -138,14 +139,11 @@ class OptionError(FaceDiffError):
         subject = "" if self._is_sentence else f"{spelled(self.option)}{value}: "
         return self.place + subject + _OPTION_NAME.sub(lambda match: spelled(match[1]), self.problem)
 
-    def __reduce__(self) -> tuple[Callable[..., OptionError], tuple[str, str, str | None, str]]:
+    def __reduce__(self) -> tuple[Callable[..., OptionError], tuple[str, str, str | None]]:
         """Pickling, by which worker processes hand errors over."""
         value = None if self.value is None else str(self.value)
-        return _option_error, ("" if self._is_sentence else self.option, self.problem, value, self.place)
-
-
-def _option_error(option: str, problem: str, value: str | None, place: str) -> OptionError:
-    return OptionError(option, problem, value, place=place)
+        option = "" if self._is_sentence else self.option
+        return partial(OptionError, place=self.place), (option, self.problem, value)
 
 
 class ArgumentError(FaceDiffError, ValueError):
@@ -180,17 +178,14 @@ class ArgumentError(FaceDiffError, ValueError):
         """The same error with a path in place of each name."""
         return type(self)({path(name): value for name, value in self.values.items()}, self.problem, located=True)
 
-    def __reduce__(self) -> tuple[Callable[..., ArgumentError], tuple[Mapping[str, object], str, bool]]:
+    def __reduce__(self) -> tuple[Callable[..., ArgumentError], tuple[Mapping[str, object], str]]:
         """Pickling, by which worker processes hand errors over."""
-        return _argument_error, ({name: str(value) for name, value in self.values.items()}, self.problem, self.located)
+        values = {name: str(value) for name, value in self.values.items()}
+        return partial(ArgumentError, located=self.located), (values, self.problem)
 
 
 class NotFiniteError(FaceDiffError, ValueError):
     """Numbers that are about to be scored are NaN or infinite."""
-
-
-def _argument_error(values: Mapping[str, object], problem: str, located: bool) -> ArgumentError:
-    return ArgumentError(values, problem, located=located)
 
 
 class MissingExtraError(FaceDiffError):
