@@ -106,11 +106,30 @@ def shown_tables(
         frames: that were scored.
         sequences: that were scored.
     """
+
+    def disagreement(table: Published) -> str:
+        """Why a paper's figures cannot stand next to ours; empty if they can."""
+        if table.corpus != corpus:
+            origin = ", which a program made" if synthetic else ""
+            return f"its corpus is {table.corpus}, and this is {corpus}{origin}"
+        if table.split != split:
+            return f"it scores {table.split}, and this is {split}"
+        if table.doubt:
+            return table.doubt
+        for what, theirs, ours in (
+            ("follows the protocol", table.protocol, protocol),
+            ("has lip vertices", table.lips, lips.get("count")),
+            ("scores sequences", table.sequences, sequences),
+            ("scores frames", table.frames, frames),
+        ):
+            if theirs is not None and theirs != ours:
+                return f"it {what} {theirs}, and this {ours}"
+        return ""
+
     scores: dict[str, dict[str, float]] = {}
     sources, reasons = [], []
     for table in find_published(names):
-        reason = _disagreement(table, corpus, synthetic, split, protocol, lips, frames, sequences)
-        if reason:
+        if reason := disagreement(table):
             reasons.append(f"{table.source}: not shown, since {reason}")
             continue
         sources.append(table.source)
@@ -118,32 +137,3 @@ def shown_tables(
             if name in table.rows:
                 scores.setdefault(row, {}).update(table.rows[name])
     return Shown(scores, tuple(sources), tuple(reasons))
-
-
-def _disagreement(
-    table: Published,
-    corpus: str,
-    synthetic: bool,
-    split: str,
-    protocol: str,
-    lips: Mapping[str, Any],
-    frames: int,
-    sequences: int,
-) -> str:
-    """Why a paper's figures cannot stand next to ours; empty if they can."""
-    if table.corpus != corpus:
-        origin = ", which a program made" if synthetic else ""
-        return f"its corpus is {table.corpus}, and this is {corpus}{origin}"
-    if table.split != split:
-        return f"it scores {table.split}, and this is {split}"
-    if table.doubt:
-        return table.doubt
-    for what, theirs, ours in (
-        ("follows the protocol", table.protocol, protocol),
-        ("has lip vertices", table.lips, lips.get("count")),
-        ("scores sequences", table.sequences, sequences),
-        ("scores frames", table.frames, frames),
-    ):
-        if theirs is not None and theirs != ours:
-            return f"it {what} {theirs}, and this {ours}"
-    return ""
