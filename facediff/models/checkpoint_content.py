@@ -286,16 +286,10 @@ class PersonStyles(CheckpointContent):
         return replace(batch, style=style, reference_names=names)
 
     def on_validation_epoch_start(self) -> None:
-        """Encode the speakers with the weights that are validated; weight averaging has put its own in."""
+        """Encode the speakers with the weights that are used now; weight averaging has put its own in."""
         self.encode_people()
 
-    def on_test_epoch_start(self) -> None:
-        """Encode the speakers that are tested."""
-        self.encode_people()
-
-    def on_predict_epoch_start(self) -> None:
-        """Encode the speakers that are predicted."""
-        self.encode_people()
+    on_test_epoch_start = on_predict_epoch_start = on_validation_epoch_start
 
     def encode_people(self, weights: Mapping[str, Tensor] | None = None) -> None:
         """Encode every speaker's style from all of their motion, if ``style_source`` is ``person``.

@@ -31,7 +31,7 @@ from facediff.registry import audio_encoder
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
-    from transformers import PreTrainedModel
+    pass
 
 NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
 """Types of networks that are built alike, and how their classes' names begin."""
@@ -81,7 +81,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
         config: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.network: Any = load_network(source, config)
+        self.network: Any = load_typed(source, config, NETWORKS, "Model", "network", encoder="wav2vec2")
         settings = self.network.config
         settings.apply_spec_augment, settings.layerdrop = spec_augment, layer_drop
         self.epsilon, self.edges, self.do_normalize = epsilon, edges, do_normalize
@@ -219,8 +219,3 @@ def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[
         rows = [row for row, pair in enumerate(pairs) if pair == (length, count)]
         parts.update(zip(rows, encode(padded[rows, :length], count), strict=True))
     return nn.utils.rnn.pad_sequence([parts[row] for row in range(len(padded))], batch_first=True)
-
-
-def load_network(source: str, config: dict[str, Any] | None) -> PreTrainedModel:
-    """A wav2vec 2.0, HuBERT or WavLM from a directory, from the hub, or from a plain configuration without weights."""
-    return load_typed(source, config, NETWORKS, "Model", "network", encoder="wav2vec2")

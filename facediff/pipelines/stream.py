@@ -47,8 +47,7 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
         report(
             f"ready; look-ahead {pipeline.look_ahead:.2f} s and the time that a window takes; "
             f"{pipeline.windows.in_frames(pipeline.frame_rate).hop} frames at a time, {pipeline.frame_rate:g} a "
-            f"second, "
-            f"{len(template)} vertices; reading {rate} Hz, 16 bit"
+            f"second, {len(template)} vertices; reading {rate} Hz, 16 bit"
         )
         for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
