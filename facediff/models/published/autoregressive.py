@@ -213,8 +213,8 @@ class ProjectedAttention(nn.Module):
         return x.view(*x.shape[:-1], self.num_heads, -1).transpose(1, 2)
 
 
-class DecoderLayer(nn.Module):
-    """Self-attention, attention to the speech, feed-forward; each is added, and normalised afterwards.
+class SpokenLayer(nn.Module):
+    """The parts of a layer of a decoder: self-attention, attention to the speech, feed-forward.
 
     Args:
         dim: channels.
@@ -230,6 +230,10 @@ class DecoderLayer(nn.Module):
         self.first, self.second = nn.Linear(dim, hidden_dim), nn.Linear(hidden_dim, dim)
         self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(3))
         self.dropout = nn.Dropout(dropout)
+
+
+class DecoderLayer(SpokenLayer):
+    """Each part's result is added to the frames, which are normalised afterwards."""
 
     def forward(self, x: Tensor, speech: ProjectedKeysValues, past: ProjectedKeysValues, bias: Tensor | None) -> Tensor:
         """Frames ``x`` (B, T, dim) that see the positions of ``past`` as the ``bias`` (heads, T, P) lets them.

@@ -8,6 +8,7 @@ checkpoints. docs/methods.md says what of the published code is an option here.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -27,8 +28,8 @@ from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
 from facediff.models.published.autoregressive import (
     Period,
-    ProjectedAttention,
     ProjectedKeysValues,
+    SpokenLayer,
     decoder_sizes,
     periodic_positions,
     read_period,
@@ -300,45 +301,28 @@ def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
     return torch.cat([motion[:, :1], torch.where(inner, mean, motion[:, 1:-1]), motion[:, -1:]], 1)
 
 
+@dataclass(frozen=True, eq=False)
 class SpeakerConditions:
     """What a clip's motion is conditioned on, and what is constant over the denoising steps.
 
-    Args:
+    Attributes:
         style: the speaker's tokens of all layers, side by side.
         speech: keys and values of the speech for each layer.
         positions: of the frames.
         bias: of the attention between frames, with two columns of zeros for the tokens; −∞ where there is padding.
     """
 
-    def __init__(
-        self,
-        style: Tensor,
-        speech: list[ProjectedKeysValues],
-        positions: Tensor,
-        bias: Float[Tensor, "... frames keys"],
-    ) -> None:
-        self.style, self.speech, self.positions, self.bias = style, speech, positions, bias
+    style: Tensor
+    speech: list[ProjectedKeysValues]
+    positions: Tensor
+    bias: Float[Tensor, "... frames keys"]
 
 
-class AdaptedLayer(nn.Module):
-    """Self-attention, attention to the speech, feed-forward, each of the normalised frames and added to them.
+class AdaptedLayer(SpokenLayer):
+    """Each part is of the normalised frames and added to them.
 
-    Frames attend to two further tokens in both, that of the speaker and that of the step.
-
-    Args:
-        dim: channels.
-        num_heads: attention heads.
-        hidden_dim: channels of the feed-forward layer.
-        dropout: everywhere.
+    Frames attend to two further tokens in both attentions, that of the speaker and that of the step.
     """
-
-    def __init__(self, dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
-        super().__init__()
-        self.self_attention = ProjectedAttention(dim, num_heads, dropout)
-        self.cross_attention = ProjectedAttention(dim, num_heads, dropout)
-        self.first, self.second = nn.Linear(dim, hidden_dim), nn.Linear(hidden_dim, dim)
-        self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(3))
-        self.dropout = nn.Dropout(dropout)
 
     def forward(
         self,
