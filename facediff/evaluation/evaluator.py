@@ -241,7 +241,7 @@ def score_renders(
         path = None if corpus is None else corpus / "wav" / f"{clip}.wav"
         return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
 
-    drawing = RenderScorer(metrics, faces=faces, regions=regions, frame_rate=frame_rate, speech=speech)
+    drawing = RenderScorer(metrics=metrics, faces=faces, regions=regions, frame_rate=frame_rate, speech=speech)
     rows: dict[str, dict[str, list[dict[str, float]]]] = {}
     for method, (pairs, _) in paired.items():
         for pair in pairs:

@@ -278,10 +278,11 @@ def framing(metric: RenderMetric, template: Array, regions: Mapping[str, Sequenc
     return replace(camera, radius=whole.radius)
 
 
+@dataclass(frozen=True, kw_only=True)
 class RenderScorer:
     """Renders clips and scores them.
 
-    Args:
+    Attributes:
         metrics: by name.
         faces: (F, 3) triangles.
         regions: vertices of the ``lips`` and, if known, of the ``upper_face``.
@@ -289,17 +290,11 @@ class RenderScorer:
         speech: gives the samples of a clip by its name; empty where there is none.
     """
 
-    def __init__(
-        self,
-        metrics: Mapping[str, RenderMetric],
-        *,
-        faces: npt.NDArray[np.integer],
-        regions: Mapping[str, Sequence[int]],
-        frame_rate: float,
-        speech: Callable[[str], Speech],
-    ) -> None:
-        self.metrics, self.faces, self.regions = metrics, faces, regions
-        self.frame_rate, self.speech = frame_rate, speech
+    metrics: Mapping[str, RenderMetric]
+    faces: npt.NDArray[np.integer]
+    regions: Mapping[str, Sequence[int]]
+    frame_rate: float
+    speech: Callable[[str], Speech]
 
     def score(self, clip: str, vertices: Array, template: Array) -> dict[str, float]:
         """All scores of a clip, ``<metric>/<score>``.

@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -215,10 +216,11 @@ class PackedCorpus:
         return f"{self.source}: speech of clip {name}"
 
 
+@dataclass(frozen=True, eq=False)
 class PackedMotion:
     """The motion of one clip of a packed corpus.
 
-    Args:
+    Attributes:
         source: the corpus, for messages.
         record: of the corpus.
         clip: the clip.
@@ -226,14 +228,11 @@ class PackedMotion:
         decoded: cache of chunks.
     """
 
-    def __init__(
-        self, source: str, record: Record, clip: PackedClip, array: ShardedArray, decoded: DecodedChunks
-    ) -> None:
-        self.decoded = decoded
-        self.source = source
-        self.record = record
-        self.clip = clip
-        self.array = array
+    source: str
+    record: Record
+    clip: PackedClip
+    array: ShardedArray
+    decoded: DecodedChunks
 
     @property
     def frames(self) -> int:
