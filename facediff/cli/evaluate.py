@@ -137,7 +137,7 @@ def evaluate(
     from facediff.evaluation import evaluate as score
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
     from facediff.evaluation.files import count_vertices, find_truths, read_pairs
-    from facediff.evaluation.parameters import holds_parameters, parameter_files
+    from facediff.evaluation.parameters import ParameterFiles, holds_parameters
     from facediff.mesh.files import read_mesh
     from facediff.metrics import EyelidPairs
 
@@ -145,7 +145,7 @@ def evaluate(
     files = None
     corpus: Path | None = truth
     if layout is not None or holds_parameters(truth):
-        files = parameter_files(truth, (layout, truth_layout or layout), rig, truth_stride)
+        files = ParameterFiles.begin(truth, (layout, truth_layout or layout), rig, truth_stride)
     else:
         refuse_idle("is for motion in parameters, which TRUTH has not", rig=rig is not None)
         truth, corpus = find_truths(truth)

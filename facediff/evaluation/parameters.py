@@ -53,18 +53,24 @@ class ParameterFiles:
 
     @classmethod
     def begin(
-        cls,
-        truth: Path,
-        files: Sequence[Path],
-        layouts: tuple[str | None, str | None],
-        rig: Path | None,
-        stride: int,
+        cls, truth: Path, layouts: tuple[str | None, str | None], rig: Path | None, stride: int
     ) -> ParameterFiles:
-        """As the first truth's file says.
+        """As the first file of a folder of truths says.
+
+        Args:
+            truth: the folder.
+            layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
+            rig: a ``.glb``, a folder of shapes, or FLAME's model file; None to score channels only.
+            stride: of the truth, every frame at a multiple of this number is scored.
 
         Raises:
             FaceDiffError: if it cannot be read, or the rig has none of its channels.
         """
+        files = sorted(
+            path for path in truth.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        )
+        if not files:
+            raise FaceDiffError(f"{truth}: holds no {' or '.join(SUFFIXES)} file; expected motion in parameters")
         first = _read(files[0], layouts[1])
         opened: AnyRig | None = None
         if rig is not None:
@@ -168,25 +174,6 @@ class ParameterFiles:
                 f"{self.rig.title}/{name}", np.flatnonzero(sizes >= sizes.max() / 2).tolist(), n_vertices=count
             )
         return regions
-
-
-def parameter_files(
-    truth: Path, layouts: tuple[str | None, str | None], rig: Path | None, stride: int
-) -> ParameterFiles:
-    """How the files of a folder of truths are read, as the first of them says.
-
-    Args:
-        truth: the folder.
-        layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
-        rig: a ``.glb``, a folder of shapes, or FLAME's model file; None to score channels only.
-        stride: of the truth, every frame at a multiple of this number is scored.
-    """
-    files = sorted(
-        path for path in truth.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-    )
-    if not files:
-        raise FaceDiffError(f"{truth}: holds no {' or '.join(SUFFIXES)} file; expected motion in parameters")
-    return ParameterFiles.begin(truth, files, layouts, rig, stride)
 
 
 def _read(path: Path, layout: str | None) -> ParameterClip:
