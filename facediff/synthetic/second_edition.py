@@ -204,7 +204,6 @@ def generate_second(
     drawn: int = 0,
     people: Sequence[str] = (),
     workers: int | None = None,
-    scheduler: str | None = "",
     progress: bool = True,
     only: Sequence[str] | None = None,
     production: Production = PUPPET,
@@ -217,7 +216,6 @@ def generate_second(
         drawn: how many drawn speakers say training sentences, besides the cast of ten.
         people: voices of people that every second drawn speaker speaks with; see :func:`people_voices`.
         workers: how many processes share the work.
-        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
         only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
         production: the corpus itself, or the second one with the mask.
@@ -233,7 +231,6 @@ def generate_second(
             partial(_write_clip, folder, seed=seed, people=tuple(people), production=production),
             clips,
             workers=workers or 1,
-            scheduler=scheduler,
             writes=folder,
             progress="Puppet corpus" if progress else "",
         )

@@ -339,7 +339,7 @@ def read_state_dict(path: Path) -> dict[str, Any]:
     return tensors
 
 
-def read_arguments(path: Path, name: str = "args") -> dict[str, Any]:
+def read_arguments(path: Path) -> dict[str, Any]:
     """The options that another project's checkpoint keeps next to its tensors, as an ``argparse.Namespace`` or a dict.
 
     Nothing of the file is imported or run. Numbers, texts, lists of these and paths are kept, paths as texts; other
@@ -347,7 +347,6 @@ def read_arguments(path: Path, name: str = "args") -> dict[str, Any]:
 
     Args:
         path: a file that :func:`read_state_dict` reads.
-        name: where the options lie.
 
     Returns:
         options by name; empty if the file holds none.
@@ -359,7 +358,7 @@ def read_arguments(path: Path, name: str = "args") -> dict[str, Any]:
         raise
     except Exception as error:  # as in read_state_dict
         raise FaceDiffError(f"{path}: not a checkpoint that can be read safely; {AUTHORS}") from error
-    options = content.get(name) if isinstance(content, Mapping) else None
+    options = content.get("args") if isinstance(content, Mapping) else None
     options = options.state if isinstance(options, StoredNamespace) else options
     if not isinstance(options, Mapping):
         return {}

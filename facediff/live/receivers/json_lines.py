@@ -211,7 +211,7 @@ class _Clients:
         self._listening = listen(address, host, port)
         self._lock = threading.Lock()
         self._clients: dict[socket.socket, Outbox[bytes]] = {}
-        self.connected = self.gone = self._missed = 0
+        self.connected = self._missed = 0
         self._full = False
         self._thread = threading.Thread(target=self._accept, name=f"clients of {address.text}", daemon=True)
         self._thread.start()
@@ -252,7 +252,6 @@ class _Clients:
 
     def _forget(self, client: socket.socket) -> None:
         outbox = self._clients.pop(client)
-        self.gone += 1
         self._missed += outbox.dropped
         client.close()
 
