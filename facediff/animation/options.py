@@ -429,15 +429,7 @@ def with_options(options: type, keywords: type) -> Callable[[Function], Function
     return decorate
 
 
-GROUPS = (
-    GenerationOptions,
-    WindowOptions,
-    RecordingOptions,
-    AnimationControls,
-    TargetOptions,
-    DeviceOptions,
-    LicenceOptions,
-)
+GROUPS = AnimationOptions.__bases__
 """The groups that :class:`AnimationOptions` consists of, in the order of help texts."""
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff import registry
 from facediff.animation.options import LicenceOptions
-from facediff.cli.lightning import corpus_and_folder
+from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
@@ -140,9 +140,7 @@ def adapt(
     model = build_model(checkpoint, content)
     if licence.commercial_only:
         require_cleared(checkpoint, model.licences)
-    data.prepare_data()
-    if not data.root.is_dir():
-        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
+    prepared(data)
     if name not in data.corpus.templates:
         speakers = ", ".join(sorted(data.corpus.templates))
         raise FaceDiffError(f"--person {person}: neither a person's folder nor a speaker of the corpus ({speakers})")
@@ -207,10 +205,7 @@ def adapt_audio_encoder(
     if commercial_only:
         require_cleared(checkpoint, build_model(checkpoint, content).licences)
     module, options = corpus_and_folder(checkpoint, content, corpus, data_root)
-    data = module(**options)
-    data.prepare_data()
-    if not data.root.is_dir():
-        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
+    data = prepared(module(**options))
     content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
     error = write_distilled(checkpoint, content, data, output, chosen, encoder, device=device, quiet=quiet)
     tell(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import LicenceOptions
-from facediff.cli.lightning import corpus_and_folder
+from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
@@ -136,11 +136,7 @@ def corpus_of_checkpoint(
     module, options = corpus_and_folder(checkpoint, read_checkpoint(checkpoint), corpus, data_root)
     if eyelid_pairs is not None:
         options["eyelid_pairs"] = str(Path(eyelid_pairs).resolve())
-    data = module(**options)
-    data.prepare_data()
-    if not data.root.is_dir():
-        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
-    return data
+    return prepared(module(**options))
 
 
 def text(scores: GenerationScores) -> str:

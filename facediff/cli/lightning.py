@@ -257,6 +257,18 @@ def corpus_and_folder(
     return module, options
 
 
+def prepared(data: SpeechMotionDataModule) -> SpeechMotionDataModule:
+    """A data module whose corpus is on this machine.
+
+    Raises:
+        FaceDiffError: if it is not, and is none that facediff makes.
+    """
+    data.prepare_data()
+    if not data.root.is_dir():
+        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
+    return data
+
+
 def change_values(arguments: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
     """The words with ``change(flag, value)`` in place of every value, written ``--flag value`` or ``--flag=value``."""
     changed, flag = [], ""

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.animation.options import AnimationOptions, ExportOptions
+from facediff.animation.options import AnimationOptions, ExportOptions, RecordingOptions
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import check_options, direction_for
 from facediff.pipelines.trained import open_pipeline
@@ -65,18 +65,8 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
 
 
 WHOLE = (
-    "expressiveness",
-    "blinks",
-    "gaze",
-    "sway",
-    "target_mesh",
-    "output_unit",
-    "up",
-    "samples",
-    "denoise",
-    "voice_shift",
-    "alignment",
-    "transcript",
+    *("expressiveness", "blinks", "gaze", "sway", "target_mesh", "output_unit", "up"),
+    *RecordingOptions.defaults(),
 )
 """Options that need the whole animation."""
 
