@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 
 MANY = 40
@@ -206,3 +207,16 @@ class MissingExtraError(FaceDiffError):
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
         """Pickling, by which worker processes hand errors over, must not call the class with the message alone."""
         return type(self), self.arguments
+
+
+@contextmanager
+def needs_extra(package: str, extra: str, feature: str) -> Iterator[None]:
+    """A context that imports an optional package, or says how to install it; the arguments are those of the error.
+
+    Raises:
+        MissingExtraError: if it is not installed.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise MissingExtraError(package, extra, feature) from error

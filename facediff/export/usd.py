@@ -10,7 +10,7 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.export.format import (
     FileSpace,
     Format,
@@ -41,10 +41,8 @@ class Usd(Format):
             FaceDiffError: if the layer cannot be written.
             MissingExtraError: if usd-core is not installed.
         """
-        try:
+        with needs_extra("pxr", "usd", "writing USD"):
             from pxr import Sdf, Tf, Usd, UsdGeom, UsdMedia
-        except ImportError as error:
-            raise MissingExtraError("pxr", "usd", "writing USD") from error
         (animation,) = animations
         space = FileSpace.of(animation, options)
         stage = Usd.Stage.CreateInMemory()

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.mesh.mesh import Array, closest_on_triangles
 from facediff.mesh.spirals import Indices, Points, checked_faces, spirals
 from facediff.utils.arrays import read_arrays
@@ -346,10 +346,8 @@ def _nearest(points: Array, targets: Array) -> tuple[Indices, Array]:
 
 def _collapses(points: Array, faces: Indices, n_vertices: int) -> Indices:
     """Collapses (N, 2) in their order: the vertex that stays and the one that goes; usually enough of them."""
-    try:
+    with needs_extra("fast-simplification", "mesh", "down-sampling a mesh"):
         import fast_simplification
-    except ImportError as error:
-        raise MissingExtraError("fast-simplification", "mesh", "down-sampling a mesh") from error
     corners = points[faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).mean()
     scaled = (points - points.mean(axis=0)) * (EDGE / edge if edge > 0 else 1.0)

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
+from facediff.errors import ArgumentError, FaceDiffError, needs_extra
 from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
 from facediff.registry import audio_encoder
 from facediff.speech.cepstra import mel_filters
@@ -564,10 +564,8 @@ class CtcEncoder(FrozenEncoder):
 
 def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     """A HuBERT from a directory, from the hub, or from a plain configuration without weights."""
-    try:
+    with needs_extra("transformers", "train", "the hubert audio encoder"):
         from transformers import HubertConfig, HubertModel
-    except ImportError as error:
-        raise MissingExtraError("transformers", "train", "the hubert audio encoder") from error
     if config is not None:
         return HubertModel(known_options(HubertConfig, config))
     return load_pretrained(HubertModel, source, "HuBERT")
@@ -608,10 +606,8 @@ def load_typed(
         FaceDiffError: if ``source`` cannot be read, or is of another type.
         MissingExtraError: if transformers is not installed.
     """
-    try:
+    with needs_extra("transformers", "train", f"the {encoder} audio encoder"):
         import transformers
-    except ImportError as error:
-        raise MissingExtraError("transformers", "train", f"the {encoder} audio encoder") from error
     if config is None:
         check_source(source, option)
         try:

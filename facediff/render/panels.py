@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.render.rasteriser import Renderer
 from facediff.utils.files import atomic
 from facediff.utils.workers import processors
@@ -343,7 +343,5 @@ def _wide_font() -> str | None:
 
 def _pillow(module: str) -> Any:  # noqa: ANN401 - imported on first use
     """A module of Pillow."""
-    try:
+    with needs_extra("PIL", "render", "writing pictures and labels"):
         return importlib.import_module(f"PIL.{module}")
-    except ImportError as error:
-        raise MissingExtraError("PIL", "render", "writing pictures and labels") from error

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.render.meshes import (
     Faces,
     Float64,
@@ -437,10 +437,8 @@ def to_srgb(linear: npt.ArrayLike) -> Float32:
 
 def opencv() -> ModuleType:
     """The module cv2; refuses versions older than 5."""
-    try:
+    with needs_extra("cv2", "render", "drawing meshes"):
         import cv2
-    except ImportError as error:
-        raise MissingExtraError("cv2", "render", "drawing meshes") from error
     if not hasattr(cv2, "triangleRasterize"):
         raise FaceDiffError(
             f"drawing meshes needs OpenCV 5 or later, but {cv2.__version__} is installed: "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.files import atomic
 
 if TYPE_CHECKING:
@@ -145,10 +145,8 @@ def _encode(
     codecs: Codecs,
 ) -> int:
     """Encode everything into `path`; the first frame sets the size. Returns the number of frames."""
-    try:
+    with needs_extra("av", "render", "writing videos"):
         import av
-    except ImportError as error:
-        raise MissingExtraError("av", "render", "writing videos") from error
     iterator = iter(frames)
     first = next(iterator, None)
     if first is None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from facediff.errors import MissingExtraError
+from facediff.errors import needs_extra
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -40,12 +40,10 @@ LONGEST_LABEL = 34  # Letters of a legend's entry
 
 def matplotlib() -> ModuleType:
     """The package matplotlib."""
-    try:
+    with needs_extra("matplotlib", "figures", "drawing figures"):
         import matplotlib as package
         import matplotlib.backends.backend_agg
         import matplotlib.figure  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("matplotlib", "figures", "drawing figures") from error
     return package
 
 

@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError, OptionError
+from facediff.errors import FaceDiffError, OptionError, needs_extra
 from facediff.speech.pcm import samples_of
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
@@ -212,11 +212,9 @@ def _decoded(file: Any, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
 
 def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
     """The first sound track of a video, (S,) mono."""
-    try:
+    with needs_extra("av", "prepare", f"extracting the sound of {path.suffix} files"):
         import av
         from av.audio.resampler import AudioResampler
-    except ImportError as error:
-        raise MissingExtraError("av", "prepare", f"extracting the sound of {path.suffix} files") from error
     parts: list[npt.NDArray[np.float32]] = []
     try:
         with path.open("rb") as stream, av.open(stream, options={"format_whitelist": DEMUXERS}) as container:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import MissingExtraError
+from facediff.errors import needs_extra
 from facediff.utils import SAMPLE_RATE
 
 N_MELS = 40
@@ -76,11 +76,9 @@ def align_features(first: npt.NDArray[np.float64], second: npt.NDArray[np.float6
     Raises:
         MissingExtraError: if dtaidistance is not installed.
     """
-    try:
+    with needs_extra("dtaidistance", "mesh", "aligning two recordings of one sentence"):
         from dtaidistance import dtw_ndim
         from dtaidistance.dtw import best_path
-    except ImportError as error:
-        raise MissingExtraError("dtaidistance", "mesh", "aligning two recordings of one sentence") from error
     # The path may leave the diagonal by a quarter of the sentence. Without a band, a pause of one recording could be
     # aligned with half a sentence of the other.
     window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import MissingExtraError
+from facediff.errors import needs_extra
 from facediff.speech.audio import fit_length
 from facediff.utils import SAMPLE_RATE
 
@@ -16,10 +16,8 @@ def denoised(speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     Raises:
         MissingExtraError: if noisereduce is not installed.
     """
-    try:
+    with needs_extra("noisereduce", "voice", "--denoise"):
         import noisereduce
-    except ImportError as error:
-        raise MissingExtraError("noisereduce", "voice", "--denoise") from error
     if not speech.any():
         return speech
     cleaned = noisereduce.reduce_noise(y=speech, sr=SAMPLE_RATE, stationary=True)

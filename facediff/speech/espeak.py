@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils import SAMPLE_RATE
 
 _SYNCHRONOUS = 2
@@ -100,10 +100,8 @@ def speak(text: str, voice: EspeakVoice) -> Utterance:
 
 def _paths() -> tuple[str, str]:
     """Find the library and its data."""
-    try:
+    with needs_extra("espeakng_loader", "puppet", "speech by espeak-ng (corpus, --transcript)"):
         import espeakng_loader
-    except ImportError as error:
-        raise MissingExtraError("espeakng_loader", "puppet", "speech by espeak-ng (corpus, --transcript)") from error
     return str(espeakng_loader.get_library_path()), str(espeakng_loader.get_data_path())
 
 

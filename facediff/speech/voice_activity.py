@@ -16,7 +16,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError, OptionError
+from facediff.errors import FaceDiffError, OptionError, needs_extra
 from facediff.registry import UnknownComponentError, checks_arguments, voice_gate
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.numerics import RecursiveFilter
@@ -312,10 +312,8 @@ class WebRtcGate(VoiceGate):
         release: Seconds = 0.15,
     ) -> None:
         super().__init__(attack=attack, lead=lead, hold=hold, release=release)
-        try:
+        with needs_extra("webrtcvad", "voice", "the voice gate webrtc"):
             import webrtcvad
-        except ImportError as error:
-            raise MissingExtraError("webrtcvad", "voice", "the voice gate webrtc") from error
         self.strictness = strictness
         self._make = webrtcvad.Vad
 

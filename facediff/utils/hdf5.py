@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.limits import check_array
 
 if TYPE_CHECKING:
@@ -38,10 +38,8 @@ def read_frames(path: Path, widths: Mapping[str, int]) -> dict[str, Array]:
         MissingExtraError: if h5py is not installed.
         FaceDiffError: if the file lacks one, is damaged, or its numbers lie in another file.
     """
-    try:
+    with needs_extra("h5py", "prepare", "reading FLAME reconstructions (.hdf5)"):
         import h5py
-    except ImportError as error:
-        raise MissingExtraError("h5py", "prepare", "reading FLAME reconstructions (.hdf5)") from error
     try:
         with h5py.File(path, "r") as file:
             holder = file if "exp" in file else file.get("data", file)

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.checksums import sha256
 from facediff.utils.limits import LIMITS, brief
 
@@ -233,11 +233,9 @@ def fetch(name: str, revision: str | None = None) -> Path:
         FaceDiffError: if there is no such model, no network, or it is larger than the budget.
         MissingExtraError: if huggingface_hub is not installed.
     """
-    try:
+    with needs_extra("huggingface_hub", "hub", f"fetching the model {name}"):
         from huggingface_hub import snapshot_download
         from huggingface_hub.errors import DryRunError
-    except ImportError as error:
-        raise MissingExtraError("huggingface_hub", "hub", f"fetching the model {name}") from error
     shown = name if revision is None else f"{name}@{revision}"
     with _hub_errors(shown, "fetched"), _bounded_answers(), _progress():
         options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
@@ -263,10 +261,8 @@ def push(folder: Path, name: str, *, private: bool = False) -> str:
         FaceDiffError: if it cannot be sent.
         MissingExtraError: if huggingface_hub is not installed.
     """
-    try:
+    with needs_extra("huggingface_hub", "hub", "sending a model to the hub"):
         from huggingface_hub import HfApi
-    except ImportError as error:
-        raise MissingExtraError("huggingface_hub", "hub", "sending a model to the hub") from error
     with _hub_errors(name, "sent"), _bounded_answers(), _progress():
         api = HfApi(library_name="facediff")
         address = api.create_repo(name, private=private, exist_ok=True)

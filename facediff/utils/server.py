@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.limits import brief
 from facediff.utils.plain_files import parse_json
 
@@ -166,10 +166,8 @@ def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn
         MissingExtraError: naming the extra.
     """
     for name in names:
-        try:
+        with needs_extra(name, extra, purpose):
             importlib.import_module(name)
-        except ImportError as error:
-            raise MissingExtraError(name, extra, purpose) from error
 
 
 def run_server(

@@ -46,7 +46,7 @@ from facediff.data.packed.shards import shard_key
 from facediff.data.packed.stores import is_packed
 from facediff.data.prepare.runner import refuse_foreign, version
 from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, motion_path, open_motion, refuse_out_of_range
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import open_sound, refuse_cut_short
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
@@ -204,10 +204,8 @@ def pack(
 
 def require_zarr(purpose: str) -> None:
     """Refuse to begin what needs the zarr package where it is not installed."""
-    try:
+    with needs_extra("zarr", "packed", purpose):
         import zarr  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("zarr", "packed", purpose) from error
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from facediff.data.packed.layout import DAMAGED, METADATA, ArrayFacts, check_array_metadata
 from facediff.data.packed.read_ahead import Answer, ReadAhead
 from facediff.data.packed.stores import ByteStore, Range
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.limits import LIMITS, brief
 
 MISSING = 2**64 - 1
@@ -63,11 +63,9 @@ class ShardedArray:
     @cached_property
     def _codecs(self) -> tuple[Any, Any]:
         """Blosc and CRC-32C."""
-        try:
+        with needs_extra("zarr", "packed", "reading a packed corpus"):
             import google_crc32c
             from numcodecs import blosc
-        except ImportError as error:
-            raise MissingExtraError("zarr", "packed", "reading a packed corpus") from error
         # Its own threads would not survive a fork, and chunks are decoded in several threads already.
         blosc.use_threads = False
         return blosc, google_crc32c

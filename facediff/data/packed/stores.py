@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from facediff.data.packed.layout import DAMAGED, METADATA, STATE
 from facediff.data.packed.web import WebServer
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.files import atomic, cache_dir
 from facediff.utils.limits import brief
 
@@ -170,10 +170,8 @@ class RemoteStore:
     def _connected(self) -> Any:  # noqa: ANN401 - fsspec has no types
         # A connection belongs to the process that made it: loader processes, forks of this one, make their own.
         if self._system is None or self._process != os.getpid():
-            try:
+            with needs_extra("fsspec", "packed", "reading a corpus from an address"):
                 import fsspec
-            except ImportError as error:
-                raise MissingExtraError("fsspec", "packed", "reading a corpus from an address") from error
             try:
                 self._system, self._base = fsspec.core.url_to_fs(self.source, skip_instance_cache=True)
             except Exception as error:  # every file system asks for options of its own

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT, load_manifest
-from facediff.errors import FaceDiffError, MissingExtraError, choices
+from facediff.errors import FaceDiffError, choices, needs_extra
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import run_batch
 from facediff.utils.checksums import describe_files, same_sizes
@@ -404,10 +404,8 @@ def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]
 
 def write_mesh(path: Path, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> None:
     """Write vertices (V, 3) and triangles (F, 3) as binary PLY, atomically."""
-    try:
+    with needs_extra("trimesh", "prepare", "writing a mesh"):
         import trimesh
-    except ImportError as error:
-        raise MissingExtraError("trimesh", "prepare", "writing a mesh") from error
     with atomic(path) as temporary:
         temporary.write_bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type="ply"))
 

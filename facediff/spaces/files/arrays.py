@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError, needs_extra
 from facediff.spaces.files.clips import ParameterClip, checked
 from facediff.spaces.layouts import LAYOUTS, Layout, find_layout, layouts_of_width
 from facediff.utils.arrays import open_array, read_arrays
@@ -78,11 +78,8 @@ def _read_tensor(path: Path) -> npt.NDArray[Any]:
 
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a tensor of motion (.pt)")
-    try:
-        with path.open("rb") as stream:
-            content = load_tensors(stream, path)
-    except ImportError as error:
-        raise MissingExtraError("torch", "metrics", "reading a tensor of motion (.pt)") from error
+    with needs_extra("torch", "metrics", "reading a tensor of motion (.pt)"), path.open("rb") as stream:
+        content = load_tensors(stream, path)
     if not hasattr(content, "detach") or not content.is_floating_point():
         raise FaceDiffError(f"{path}: holds a {type(content).__name__}; expected one tensor of numbers")
     return np.asarray(content.detach().double().numpy())
