@@ -96,6 +96,10 @@ class SamplingLoop:
     quick_table: list[list[float]] = field(default_factory=list)
 
 
+NO_LOOP = SamplingLoop(0, 0, 0, "", [], [], -1, "sample", None, "clip")
+"""What is said of the loop of a model that has none."""
+
+
 @dataclass(frozen=True)
 class Graphs:
     """A whole model as graphs and numbers.

@@ -137,9 +137,9 @@ class SpeechAnimator(ABC):
         """The identities that it was trained on; the first one is the default."""
 
     @property
-    @abstractmethod
     def device(self) -> str:
-        """Where it computes."""
+        """Where it computes: without PyTorch, on the processor."""
+        return "cpu"
 
     @abstractmethod
     def open(self, options: AnimationOptions) -> AbstractContextManager[AnimationPipeline]:
@@ -476,11 +476,6 @@ class ExportedAnimator(SpeechAnimator):
         return self.model.frame_rate
 
     @property
-    def device(self) -> str:
-        """Where it computes."""
-        return "cpu"
-
-    @property
     def other_identities(self) -> list[str]:
         """Faces that it was not trained on."""
         return [name for name in self.model.description.faces if name not in self.identities]
@@ -577,11 +572,6 @@ class Audio2FaceAnimator(SpeechAnimator):
     def emotions(self) -> tuple[str, ...]:
         """The emotions that have a strength."""
         return self.model.folder.facts.emotions
-
-    @property
-    def device(self) -> str:
-        """Where it computes."""
-        return "cpu"
 
     @contextmanager
     def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:

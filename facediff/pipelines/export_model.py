@@ -366,9 +366,10 @@ def describe(
     faces: list[str],
 ) -> Description:
     """What ``model.json`` says."""
+    from facediff.models.graphs import NO_LOOP
     from facediff.pipelines.trained import with_rig
 
-    assets, plan, loop = model.assets, model.windows, graphs.sampling
+    assets, plan = model.assets, model.windows
     stillness = model_stillness(model) if graphs.style == "reference" else None
     return Description(
         model=type(model).__name__,
@@ -389,25 +390,15 @@ def describe(
         windows={name: min(float(value), ENDLESS) for name, value in vars(plan).items()},
         epsilon=graphs.epsilon,
         equal_lengths=graphs.equal_lengths,
-        state=loop.state if loop else 0,
-        kept=loop.kept if loop else 0,
-        sampler=loop.sampler if loop else "",
-        steps=loop.steps if loop else [],
-        table=loop.table if loop else [],
-        last_step=loop.last_step if loop else -1,
-        decoded=loop.decoded if loop else "sample",
-        generation="sampled" if loop else "direct",
+        generation="sampled" if graphs.sampling else "direct",
         blending=graphs.blending,
         clock=clock_facts(graphs.clock),
         style_source=graphs.style,
         longest=graphs.longest,
-        drawn=loop.drawn if loop else 0,
-        noise_of=loop.noise_of if loop else "clip",
         stillness=stillness.size if stillness else 0.0,
-        quick_steps=loop.quick_steps if loop else [],
-        quick_table=loop.quick_table if loop else [],
         voice_gate=model.usual_gate,
         space={} if assets.space.is_vertices else assets.space.state(),
+        **{name: value for name, value in vars(graphs.sampling or NO_LOOP).items() if name != "noise"},
     )
 
 
