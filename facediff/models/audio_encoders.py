@@ -189,7 +189,6 @@ class AudioEncoderFactory(Protocol):
 
     def __call__(self, *, dim: int) -> AudioEncoder:
         """Make one with ``dim`` output channels."""
-        ...
 
 
 def standardise(audio: Waves, lengths: Lengths, epsilon: float = 1e-7) -> Waves:

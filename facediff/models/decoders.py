@@ -62,7 +62,6 @@ class DecoderFactory(Protocol):
 
     def __call__(self, *, dim: int, style_dim: int) -> Decoder:
         """Make one for ``dim`` channels and style tokens of ``style_dim`` channels."""
-        ...
 
 
 class DecoderConstants(NamedTuple):

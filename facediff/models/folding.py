@@ -160,11 +160,9 @@ class DenoisingNetwork(Protocol):
         conditions: Any,  # noqa: ANN401 - the network's own
     ) -> Frames:
         """Everything between the two maps."""
-        ...
 
     def clean_motion(self, features: Frames) -> ScaledMotion:
         """The last map in the weights' own precision."""
-        ...
 
 
 class ConditionalDenoiser:

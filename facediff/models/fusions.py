@@ -32,7 +32,6 @@ class FusionFactory(Protocol):
 
     def __call__(self, *, dim: int) -> Fusion:
         """Make one for ``dim`` channels."""
-        ...
 
 
 class FusionConstants(NamedTuple):

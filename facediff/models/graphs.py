@@ -185,28 +185,23 @@ class GraphedModel(Protocol):
     @property
     def n_vertices(self) -> int:
         """Vertices of the topology."""
-        ...
 
     @property
     def dims(self) -> int:
         """Numbers of a point."""
-        ...
 
     @property
     def clock(self) -> FrameClock:
         """How the model counts its frames."""
-        ...
 
     @property
     def speech_encoder(self) -> AudioEncoder:
         """The audio encoder."""
-        ...
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
         """Style vectors of reference motions."""
-        ...
 
 
 ModelType = TypeVar("ModelType")

@@ -58,7 +58,6 @@ class MeshEncoderFactory(Protocol):
 
     def __call__(self, *, dim: int, n_vertices: int, dims: int) -> MeshEncoder:
         """Make one for features of ``dim`` channels and motion of ``n_vertices`` points of ``dims`` numbers."""
-        ...
 
 
 def check_points(motion: Tensor, n_vertices: int, dims: int) -> None:

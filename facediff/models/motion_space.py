@@ -222,7 +222,6 @@ class MotionSpaceFactory(Protocol):
 
     def __call__(self, *, n_vertices: int, dims: int, steps: int) -> MotionSpace:
         """Make one for motion of ``n_vertices`` points of ``dims`` numbers, noised in ``steps`` steps."""
-        ...
 
 
 @motion_space.register("vertices")

@@ -402,7 +402,6 @@ class SamplerFactory(Protocol):
 
     def __call__(self, *, process: NoiseProcess) -> Sampler:
         """Make one that reverses ``process``."""
-        ...
 
 
 @sampler.register("ddim")

@@ -63,7 +63,6 @@ class IdentityEncoderFactory(Protocol):
 
     def __call__(self, *, dim: int, n_identities: int) -> IdentityEncoder:
         """Make one for ``n_identities`` identities in a model of ``dim`` channels."""
-        ...
 
 
 @identity_encoder.register("hierarchical")
@@ -156,7 +155,6 @@ class StyleEncoderFactory(Protocol):
 
     def __call__(self, *, dim: int) -> StyleEncoder:
         """Make one for references embedded to ``dim`` channels."""
-        ...
 
 
 @style_encoder.register("tcn_gru_transformer")

@@ -41,23 +41,18 @@ class DualPathModel(GraphedModel, Protocol):
     @property
     def scale(self) -> float:
         """Factor from offsets to the motion that the network sees."""
-        ...
 
     def denoiser(self, conditions: Conditions, blend: Blend) -> ConditionalDenoiser:
         """The network under some conditions."""
-        ...
 
     def views(self) -> dict[tuple[str, ...], float]:
         """The predictions that guidance combines."""
-        ...
 
     def choosing(self) -> AbstractContextManager[None]:
         """Within it, chosen settings are temporary."""
-        ...
 
     def choose_low_latency(self) -> None:
         """Sample in few steps."""
-        ...
 
 
 class StepGraph(ModelPart[DualPathModel]):
