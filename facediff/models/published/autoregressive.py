@@ -22,7 +22,7 @@ from facediff.models.audio_encoders import StepRule
 from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
-from facediff.models.published.base import LongSpeech, PublishedModel
+from facediff.models.published.base import LongSpeech, PublishedModel, still_map
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts
 from facediff.utils.ranges import Range
 
@@ -434,10 +434,8 @@ class AutoregressiveNetwork(SpokenDecoder):
         decoder: dict[str, Any],
     ) -> None:
         super().__init__(audio_width, n_vertices, dims, decoder)
-        self.motion_out = nn.Linear(int(decoder["dim"]), dims * n_vertices)
+        self.motion_out = still_map(int(decoder["dim"]), dims * n_vertices)
         self.style = style
-        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
-        nn.init.zeros_(self.motion_out.bias)
 
     def teacher_forced(
         self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], motion: Tensor

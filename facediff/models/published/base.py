@@ -358,6 +358,14 @@ class SpeakerTable(nn.Module):
         return weights @ self.weight
 
 
+def still_map(dim: int, coordinates: int) -> nn.Linear:
+    """The last map of a network, which begins at zero: training starts from the face that does not move."""
+    last = nn.Linear(dim, coordinates)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return last
+
+
 def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEncoder, int]:
     """An audio encoder and its channels.
 

@@ -34,7 +34,7 @@ from facediff.models.published.autoregressive import (
     periodic_positions,
     read_period,
 )
-from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, whole_model, zeros
+from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, still_map, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
@@ -404,9 +404,7 @@ class DiffSpeakerNetwork(nn.Module):
             nn.Linear(time_dim, num_layers * dim), nn.SiLU(), nn.Linear(num_layers * dim, num_layers * dim)
         )
         self.layers = nn.ModuleList(AdaptedLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
-        self.motion_out = nn.Linear(dim, dims * n_vertices)
-        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
-        nn.init.zeros_(self.motion_out.bias)
+        self.motion_out = still_map(dim, dims * n_vertices)
         self.dropout = nn.Dropout(dropout)
         self.of_weights: WeightCache[Fold] = WeightCache()
 

@@ -28,7 +28,7 @@ from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
 from facediff.models.published.autoregressive import DecoderLayer, Period, decoder_sizes, periodic_bias
-from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
+from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean, still_map
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.lam_finishing import read_steps
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
@@ -232,9 +232,7 @@ class EmoTalkNetwork(nn.Module):
         self.level = SpeakerTable(levels, level_dim)
         self.style = SpeakerTable(n_identities, person_dim)
         self.layers = nn.ModuleList(DecoderLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
-        self.motion_out = nn.Linear(dim, coordinates)
-        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
-        nn.init.zeros_(self.motion_out.bias)
+        self.motion_out = still_map(dim, coordinates)
 
     def forward(
         self,

@@ -24,7 +24,7 @@ from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpac
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, SamplingLoop, Spoken, results_of
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states, frame_mask
-from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, whole_model, zeros
+from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, still_map, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
@@ -281,9 +281,7 @@ class FaceDiffuserNetwork(nn.Module):
         # Forward only, so that a frame's motion does not depend on later speech but for HuBERT's own attention.
         self.gru = nn.GRU(3 * dim, dim, num_layers, batch_first=True, dropout=dropout if num_layers > 1 else 0.0)
         self.style = SpeakerTable(n_identities, dim)
-        self.motion_out = nn.Linear(dim, dims * n_vertices)
-        nn.init.zeros_(self.motion_out.weight)
-        nn.init.zeros_(self.motion_out.bias)
+        self.motion_out = still_map(dim, dims * n_vertices)
         self.of_weights: WeightCache[Fold] = WeightCache()
 
     def forward(

@@ -33,7 +33,7 @@ from facediff.models.evaluation import IdentityPolicy
 from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
-from facediff.models.published.base import TRAINED_NETWORK, DirectModel, masked_mean
+from facediff.models.published.base import TRAINED_NETWORK, DirectModel, masked_mean, still_map
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, backbone_config, register
 from facediff.models.published.squared_errors import squared_errors
 from facediff.utils.ranges import Range
@@ -256,9 +256,7 @@ class SelfTalkNetwork(nn.Module):
         self.audio_map = nn.Linear(audio_width, dim)
         layer = nn.TransformerDecoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
         self.decoder = nn.TransformerDecoder(layer, num_layers)
-        self.motion_out = nn.Linear(dim, dims * n_vertices)
-        nn.init.zeros_(self.motion_out.weight)  # training starts from the face that does not move
-        nn.init.zeros_(self.motion_out.bias)
+        self.motion_out = still_map(dim, dims * n_vertices)
 
     def forward(
         self, speech: Float[Tensor, "batch frames width"], frames: Int[Tensor, " batch"] | None

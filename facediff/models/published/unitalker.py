@@ -29,7 +29,7 @@ from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress, Style, with_speech
 from facediff.models.layers import Heads, Share, Weight, Width, exporting, frame_mask
 from facediff.models.published.autoregressive import PeriodicDecoder
-from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
+from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean, still_map
 from facediff.models.published.convolutions import ConvolutionStack
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.utils import SAMPLE_RATE
@@ -286,9 +286,7 @@ class UniTalkerNetwork(nn.Module):
                 dim=dim, num_layers=1, num_heads=num_heads, hidden_dim=2 * dim, dropout=dropout, period=period, steps=1
             )
         self.components = components
-        self.head = nn.Linear(dim, components or coordinates)
-        nn.init.zeros_(self.head.weight)  # training starts from the face that does not move
-        nn.init.zeros_(self.head.bias)
+        self.head = still_map(dim, components or coordinates)
         self.register_buffer("mean", torch.zeros(coordinates) if components else None)
         self.register_buffer("basis", torch.zeros(components, coordinates) if components else None)
 
