@@ -401,10 +401,9 @@ def refuse_missing_corpus(data: Mapping[str, Any]) -> None:
     kind = getattr(import_module(module), name)
     root = (data.get("init_args") or {}).get("root")
     # A corpus that says how it is obtained is there before a run; others may be made by their data module.
-    if root is not None and getattr(kind, "obtain", "") and not address_of(str(root)):
-        folder = Path(str(root)).expanduser()
-        if not folder.exists():
-            raise FaceDiffError(f"{folder}: no such folder; set data.root to your copy. {kind.obtain}")
+    obtain: str = getattr(kind, "obtain", "")
+    if root is not None and obtain and not address_of(str(root)) and not Path(str(root)).expanduser().exists():
+        raise FaceDiffError(f"{root}: no such folder; set data.root to your copy. {obtain}")
 
 
 class ParsedCLI(FaceDiffCLI):

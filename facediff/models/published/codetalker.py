@@ -270,9 +270,9 @@ class CodeTalker(AutoregressiveModel):
         """The published terms of either stage."""
         frames = batch.frame_lengths if self.stage == "prior" else self.trained_frames(batch)
         truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
-        return (
-            self.prior_losses(truth, frames) if self.stage == "prior" else self.predictor_losses(batch, truth, frames)
-        )
+        if self.stage == "prior":
+            return self.prior_losses(truth, frames)
+        return self.predictor_losses(batch, truth, frames, generator)
 
     def prior_losses(self, truth: Tensor, frames: Int[Tensor, " batch"]) -> dict[str, Tensor]:
         """The mean absolute error of motion, and both squared distances between tokens and codes."""

@@ -222,6 +222,10 @@ def test_a_predictor_may_continue_its_own_motion(make_method: MakeMethod) -> Non
             assert not now[:, 0].any()
         passes.add(len(given))
     assert passes == {1, 2, 3}
+    model.eval()  # no dropout: validation draws from its own numbers, and leaves those of training alone
+    state = torch.get_rng_state()
+    model.losses(batch, torch.Generator().manual_seed(0))
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_gradients_pass_the_codes_and_move_them(make_method: MakeMethod) -> None:
