@@ -24,7 +24,7 @@ from facediff.synthetic.speakers import MOST_DRAWN, SPEAKERS, drawn_names, speak
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder
-from facediff.utils.jobs import in_order, run_tasks
+from facediff.utils.jobs import in_order, is_cluster, run_tasks
 from facediff.utils.plain_files import read_json, write_json, write_table
 
 FORMAT = 1
@@ -95,6 +95,7 @@ def generate(
     *,
     seed: int = 0,
     workers: int | None = None,
+    scheduler: str | None = "",
     progress: bool = True,
     only: Sequence[str] | None = None,
     drawn: int = 0,
@@ -107,7 +108,8 @@ def generate(
     Args:
         root: The folder to make.
         seed: Seed of the random part (blinks, drift, habits of the brows); the same seed gives the same bytes.
-        workers: How many workers share the work; by default one.
+        workers: How many workers share the work; by default one, or all of a cluster.
+        scheduler: Where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: Whether to show a progress bar.
         only: Names of clips to write instead of all, for trials; such a corpus never counts as complete.
         drawn: How many drawn speakers say the training sentences, besides the eight.
@@ -119,7 +121,7 @@ def generate(
     refuse_foreign(root)
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, chosen)
-        frames = _write_clips(folder, chosen, seed, workers, progress)
+        frames = _write_clips(folder, chosen, seed, workers, scheduler, progress)
         counts = {"subjects": len(SPEAKERS) + drawn, "vertices": len(build_face().vertices), "frames": frames}
         files = describe_files(folder)
         write_json(folder / MANIFEST, {**_facts(seed, len(chosen), drawn), **counts, "files": files})
@@ -237,12 +239,15 @@ def _write_common(folder: Path, chosen: Sequence[SyntheticClip]) -> None:
     write_table(folder / "clips.csv", table)
 
 
-def _write_clips(folder: Path, chosen: Sequence[SyntheticClip], seed: int, workers: int | None, progress: bool) -> int:
+def _write_clips(
+    folder: Path, chosen: Sequence[SyntheticClip], seed: int, workers: int | None, scheduler: str | None, progress: bool
+) -> int:
     """Write all clips and return how many frames they have together."""
     results = run_tasks(
         partial(_write_clip, folder, seed=seed),
         chosen,
-        workers=workers or 1,
+        workers=workers or (None if is_cluster(scheduler) else 1),
+        scheduler=scheduler,
         writes=folder,
         progress="Puppet corpus" if progress else "",
     )
