@@ -224,8 +224,8 @@ class Direction:
                 )
                 if exported:
                     reason = (
-                        "changes within a recording with a training's checkpoint (.ckpt) only, and this model is an "
-                        "exported one; leave these keys out, or give such a checkpoint"
+                        "changes within a recording with a checkpoint only (.ckpt of a training; this model is an "
+                        "exported one); leave these keys out, or give one"
                     )
                 raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
 
