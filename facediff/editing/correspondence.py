@@ -310,9 +310,8 @@ def refuse_other_mesh(
     )
 
 
-OTHER_FACE = (
-    1e-3  # Half of another face's vertices lie further off than this share of its extent; a sculpted nose's do not
-)
+OTHER_FACE = 1e-3
+"""Half of another face's vertices lie further off than this share of its extent; those of a sculpted nose are fewer."""
 
 
 def refuse_other_face(
