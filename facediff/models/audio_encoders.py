@@ -161,13 +161,21 @@ class AudioEncoder(nn.Module, ABC):
 
 
 class FrozenEncoder(AudioEncoder):
-    """Base of encoders whose frozen part always gives features that can be kept on disk."""
+    """Base of encoders with a frozen part, whose features can be kept on disk."""
 
     out: nn.Linear | None
 
     def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
         """What is made of the frozen part's features before the map to the model's width; here nothing."""
         return features, lengths
+
+    def states(
+        self, audio: Waves, audio_lengths: Lengths, features: Features | None, feature_lengths: Lengths | None
+    ) -> tuple[Tensor, Lengths]:
+        """The steps before the map to the model's width, from the frozen part's features where they are kept."""
+        if features is None or feature_lengths is None:
+            features, feature_lengths = self.frozen_features(audio, audio_lengths)
+        return self.trained(features, feature_lengths)
 
     def forward(
         self,
@@ -178,9 +186,7 @@ class FrozenEncoder(AudioEncoder):
         feature_lengths: Lengths | None = None,
     ) -> Frames:
         """Encode; see :class:`AudioEncoder`."""
-        if features is None or feature_lengths is None:
-            features, feature_lengths = self.frozen_features(audio, audio_lengths)
-        hidden, steps = self.trained(features, feature_lengths)
+        hidden, steps = self.states(audio, audio_lengths, features, feature_lengths)
         return interpolate_frames(hidden if self.out is None else self.out(hidden), steps, frame_lengths)
 
 
@@ -324,7 +330,7 @@ EDGE = 40
 
 
 @audio_encoder.register("hubert")
-class HubertEncoder(AudioEncoder):
+class HubertEncoder(FrozenEncoder):
     """Pretrained HuBERT; lower layers frozen, upper layers and the projection fine-tuned.
 
     The 50 steps a second are interpolated to the motion's frames. Frozen layers run without dropout, also in training,
@@ -449,24 +455,19 @@ class HubertEncoder(AudioEncoder):
             hidden = layer(hidden)
         return hidden
 
-    def forward(
-        self,
-        audio: Waves,
-        audio_lengths: Lengths,
-        frame_lengths: Lengths,
-        features: Features | None = None,
-        feature_lengths: Lengths | None = None,
-    ) -> Frames:
-        """Encode; see :class:`AudioEncoder`."""
+    def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
+        """The last hidden states."""
+        return by_length(features, lengths, self._upper)
+
+    def states(
+        self, audio: Waves, audio_lengths: Lengths, features: Features | None, feature_lengths: Lengths | None
+    ) -> tuple[Tensor, Lengths]:
+        """The last hidden states."""
         # SpecAugment masks the input of the first layer at random, so that nothing below the trained layers can be
         # cached.
         if self.hubert.config.apply_spec_augment:
-            hidden, steps = by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
-        else:
-            if features is None or feature_lengths is None:
-                features, feature_lengths = self.frozen_features(audio, audio_lengths)
-            hidden, steps = by_length(features, feature_lengths, self._upper)
-        return interpolate_frames(self.out(hidden), steps, frame_lengths)
+            return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
+        return super().states(audio, audio_lengths, features, feature_lengths)
 
     def _whole(self, wave: Tensor) -> Tensor:
         return self.hubert(with_edges(wave)).last_hidden_state

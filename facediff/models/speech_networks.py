@@ -8,7 +8,7 @@ frozen; the network is the same. Its convolutions are frozen in all of them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -29,9 +29,6 @@ from facediff.models.audio_encoders import (
 from facediff.models.layers import Share, Width, exporting, interpolate_ends, longest
 from facediff.registry import audio_encoder
 from facediff.utils.ranges import Range
-
-if TYPE_CHECKING:
-    pass
 
 NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
 """Types of networks that are built alike, and how their classes' names begin."""
