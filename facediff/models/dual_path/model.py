@@ -242,13 +242,12 @@ class DualPathDiffusion(AnimationModel):
             style_may_hide=style_dropout > 0,
             speech_style=SpeechStyle(dim, sum(style.token_dims), len(self.identities)) if style_from_speech else None,
         )
-        if style_from_speech and not style.token_dims:
+        weights = {f"{name}_weight": weight for name, weight in self.style_weights.items()}
+        needing = {name: value for name, value in {"style_from_speech": style_from_speech, **weights}.items() if value}
+        if needing and not style.token_dims:
             raise ArgumentError(
-                {"style_from_speech": True}, "there is no dynamic style; choose a style_encoder, or set this to false"
+                needing, "there is no dynamic style; choose a style_encoder, or leave out what needs one (false, 0)"
             )
-        for name, weight in self.style_weights.items():
-            if weight and not style.token_dims:
-                raise ArgumentError({f"{name}_weight": weight}, "there is no dynamic style; choose a style_encoder")
         self.style_identity = nn.Linear(sum(style.token_dims), len(self.identities)) if style_identity_weight else None
         self.guidance = dict.fromkeys(CONDITIONS, 1.0)
         scales = {"speech": speech_guidance, "identity": identity_guidance, "style": style_guidance}
