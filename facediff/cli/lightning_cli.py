@@ -398,12 +398,13 @@ class FaceDiffCLI(LightningCLI):
 def refuse_missing_corpus(data: Mapping[str, Any]) -> None:
     """Refuse a mistyped folder before the model is built, which may fetch an audio encoder's weights for minutes."""
     module, _, name = str(data["class_path"]).rpartition(".")
-    kind = getattr(import_module(module), name)
+    kind: type[SpeechMotionDataModule] = getattr(import_module(module), name)
     root = (data.get("init_args") or {}).get("root")
     # A corpus that says how it is obtained is there before a run; others may be made by their data module.
-    obtain: str = getattr(kind, "obtain", "")
-    if root is not None and obtain and not address_of(str(root)) and not Path(str(root)).expanduser().exists():
-        raise FaceDiffError(f"{root}: no such folder; set data.root to your copy. {obtain}")
+    if root is not None and kind.obtain and not address_of(str(root)):
+        folder = Path(str(root)).expanduser()
+        if not folder.exists():
+            raise kind.missing(folder)
 
 
 class ParsedCLI(FaceDiffCLI):

@@ -343,11 +343,16 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The corpus folder; of a packed corpus, a folder on this machine with all files but motion and speech."""
         return Path(self.source).expanduser() if self.packed is None else self.packed.folder
 
+    @classmethod
+    def missing(cls, root: Path) -> FaceDiffError:
+        """What is wrong where the corpus is not in its folder, and how to obtain it."""
+        return FaceDiffError(f"{root}: no such folder; set data.root to your copy. {cls.obtain}".rstrip())
+
     @cached_property
     def corpus(self) -> Corpus:
         """The corpus on disk."""
         if not self.root.is_dir():
-            raise FaceDiffError(f"{self.root}: no such folder; set data.root to your copy. {self.obtain}".rstrip())
+            raise self.missing(self.root)
         if not self.space.is_vertices and self.packed is not None:
             raise FaceDiffError(
                 "data.root: packed corpora hold vertices, and this data module reads channels; give the corpus's folder"
