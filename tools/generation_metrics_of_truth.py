@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from facediff.data import Batch, Puppet
+from facediff.data.prepare.runner import write_motion
 from facediff.models.base import AnimationModel
 from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, measure
 from facediff.speech.espeak import Utterance
@@ -105,8 +106,8 @@ def measured(root: Path | None = None, samples: int = 10, most_clips: int | None
     return measure({"another truth": load}, data, sampling=sampling, most_clips=most_clips)
 
 
-def write_motion(folder: Path, data: Puppet, seeds: Sequence[int]) -> None:
-    """Write other truths of all test clips, absolute vertices (frames, V, 3) as ``folder/seedN/CLIP.npy``."""
+def write_truths(folder: Path, data: Puppet, seeds: Sequence[int]) -> None:
+    """Write other truths of all test clips, absolute vertices (frames, 3V) as ``folder/seedN/CLIP.npy``."""
     data.prepare_data()
     data.setup("test")
     for seed in seeds:
@@ -114,8 +115,7 @@ def write_motion(folder: Path, data: Puppet, seeds: Sequence[int]) -> None:
         place.mkdir(parents=True, exist_ok=True)
         for clip in (clip for split in data.test_splits for clip in data.clips(split)):
             rest = np.asarray(data.corpus.templates[clip.identity], np.float32)
-            with atomic(place / f"{clip.name}.npy") as partial, partial.open("wb") as file:
-                np.save(file, rest + other_truth(clip.name, seed).numpy())
+            write_motion(place / f"{clip.name}.npy", rest + other_truth(clip.name, seed).numpy())
 
 
 def table(scores: GenerationScores) -> str:
@@ -142,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.write is not None:
         data = Puppet(root=options.data_root, drawn_speakers=options.drawn_speakers, edition=2)
-        write_motion(options.write, data, range(1, options.samples + 1))
+        write_truths(options.write, data, range(1, options.samples + 1))
         return
     text = table(measured(options.data_root, options.samples, options.clips))
     print(text)

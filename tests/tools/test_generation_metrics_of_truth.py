@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("espeakng_loader")
 
 from facediff.synthetic.second_edition import generate_second
-from tools.generation_metrics_of_truth import OtherTruths, other_truth, write_motion
+from tools.generation_metrics_of_truth import OtherTruths, other_truth, write_truths
 
 
 def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_path: Path) -> None:
@@ -46,6 +46,6 @@ def test_the_first_truth_is_the_corpus_and_others_differ_in_the_upper_face(tmp_p
         clips=lambda split: [clip],
         corpus=SimpleNamespace(templates={"F1": template}),
     )
-    write_motion(tmp_path / "truths", data, (3,))
-    written = np.load(tmp_path / "truths" / "seed3" / "F1_t03.npy")
+    write_truths(tmp_path / "truths", data, (3,))
+    written = np.load(tmp_path / "truths" / "seed3" / "F1_t03.npy").reshape(other.shape)
     np.testing.assert_allclose(written, template + other, atol=1e-6)

@@ -129,7 +129,7 @@ def qualities(checkpoints: Sequence[Path], clips: int) -> str:
                 base.setdefault((split, 0), scores[-1][0])
             if way.plan is not None:
                 plan = way.plan.in_frames(model.frame_rate)
-                waits = (plan.frames + plan.after) / model.frame_rate
+                waits = plan.look_ahead / model.frame_rate
             cells += [f"{waits * 1000:.0f}" if waits else "-", *times(computing)]
             for split, (error_of, liveliness) in zip(data.test_splits, scores, strict=True):
                 cells += [f"{error_of / base[split, 0]:.2f}", f"{liveliness:.2f}"]
@@ -183,7 +183,7 @@ def sizes(threads: int) -> str:
             model.low_latency_steps = steps
             model.choose_low_latency()
             plan = model.windows.in_frames(model.frame_rate)
-            waits = (plan.frames + plan.after) / model.frame_rate
+            waits = plan.look_ahead / model.frame_rate
             with tempfile.TemporaryDirectory() as name:
                 export_model(model, Path(name) / "model")
                 runtime = RuntimeModel.open(Path(name) / "model", threads=threads)
