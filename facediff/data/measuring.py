@@ -34,7 +34,7 @@ PRINCIPAL_NUMBERS = 30_000_000
 GOLDEN = (5**0.5 - 1) / 2
 """Multiples of it, without their whole parts, fill the numbers from 0 to 1 evenly."""
 
-METHOD = 2
+METHOD = 3
 """Goes up when the same corpus is measured in another way, so that results cached by an older version are not used."""
 
 
@@ -123,7 +123,7 @@ def measure_windows(
             # From the middle of long clips: a part of each tells as much as all of it.
             frames = corpus.frames(clip)
             first = max(0, (frames - WINDOWS * width) // 2)
-            motion = corpus.read_motion(clip, first, min(frames, WINDOWS * width))
+            motion = corpus.read_motion(clip, first, min(frames, first + WINDOWS * width))
             windows = project(motion[None].float())[0].double().unfold(0, width, 1) if frames >= width else motion[:0]
             if len(windows):
                 total = total + torch.einsum("nki,nkj->kij", windows, windows)
@@ -157,12 +157,15 @@ def _measured(
         return read_or_measure()
     # If the first process failed alone, the others would wait for ever, so its error is broadcast as well.
     measured: npt.NDArray[Any] | str = ""
+    failure: Exception | None = None
     if trainer.global_rank == 0:
         try:
             measured = read_or_measure()
-        except FaceDiffError as error:
-            measured = str(error)
+        except Exception as error:
+            measured, failure = f"the first process failed: {error!r}", error
     measured = trainer.strategy.broadcast(measured, src=0)
+    if failure is not None:
+        raise failure
     if isinstance(measured, str):
         raise FaceDiffError(measured)
     return measured

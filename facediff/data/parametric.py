@@ -30,7 +30,7 @@ class ParametricDataModule(SpeechMotionDataModule):
 
     Args:
         root: the folder.
-        extra_identities: speakers of the folder to train on; all that it has if None.
+        extra_identities: speakers of the folder to train on; all that it has if None. The others' test clips are test_b.
         options: those of every data module.
     """
 
@@ -75,6 +75,15 @@ class ParametricDataModule(SpeechMotionDataModule):
         """By ``clips.csv``, or by the order of each speaker's clips."""
         split = self._splits[clip.name]
         return None if split == "none" else split
+
+    def find_split(self, clip: Clip) -> str | None:
+        """As of every data module, but clips of no split stay so, and speakers who are not trained on are unseen."""
+        if clip.root in self.people:
+            return super().find_split(clip)
+        split = self.split_of(clip)
+        if clip.identity in self.extra_identities:
+            return split
+        return "test_b" if split == "test_a" else None
 
 
 @registry.corpus.register("BEAT")

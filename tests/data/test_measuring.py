@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from facediff.data import storage
-from facediff.data.corpus import read_templates
+from facediff.data.corpus import Corpus, read_templates
 from facediff.errors import FaceDiffError
 from facediff.utils.plain_files import write_json
 from tests.fakes.tiny import Tiny
@@ -125,6 +125,31 @@ def test_other_weights_and_other_training_speakers_are_measured_for_themselves(r
     assert Tiny(root=str(root), train_identities=["A"]).motion_scale() != Tiny(root=str(root)).motion_scale()
 
 
+@pytest.mark.parametrize("frames", [20, 25, 140, 400])
+def test_windows_are_read_from_the_middle_of_long_clips(
+    root: Path, frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    width, data = 25, Tiny(root=str(root))
+    motion = np.random.default_rng(0).normal(size=(frames, 24, 3)).cumsum(0)
+    clip = data.clips("train")[0]
+    rest = data.corpus.template(clip).numpy()
+    np.save(root / "vertices_npy" / f"{clip.name}.npy", (motion + rest).reshape(frames, -1).astype(np.float32))
+    monkeypatch.setattr(data, "clips", lambda split: [clip])
+
+    def project(given: torch.Tensor) -> torch.Tensor:
+        return given.flatten(2)[..., :2]
+
+    if frames < width:
+        with pytest.raises(FaceDiffError, match="lasts 25 frames"):
+            data.covariance_over_time(project, width)
+        return
+    first = max(0, (frames - 100) // 2)
+    part = motion.reshape(frames, -1)[first : first + 100, :2]
+    windows = np.stack([part[place : place + width] for place in range(len(part) - width + 1)])
+    wanted = np.einsum("nik,njk->kij", windows, windows) / len(windows)
+    np.testing.assert_allclose(data.covariance_over_time(project, width).numpy(), wanted, rtol=1e-4)
+
+
 def of_rank(data: Tiny, rank: int, sent: list[Any]) -> Tiny:
     """A data module of one of two processes; the first one's broadcast is put into ``sent``."""
 
@@ -149,7 +174,7 @@ def test_one_process_measures_and_the_others_receive(
     assert not opened
 
 
-def test_what_goes_wrong_in_one_process_ends_all(root: Path) -> None:
+def test_what_goes_wrong_in_one_process_ends_all(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for path in (root / "vertices_npy").glob("*.npy"):
         clip = np.load(path)
         np.save(
@@ -159,3 +184,8 @@ def test_what_goes_wrong_in_one_process_ends_all(root: Path) -> None:
     for rank in (0, 1):
         with pytest.raises(FaceDiffError, match="no motion"):
             of_rank(Tiny(root=str(root)), rank, sent).motion_scale()
+    monkeypatch.setattr(Corpus, "read_spread", lambda *_: 1 / 0)  # a fault, and no error of facediff's own
+    with pytest.raises(ZeroDivisionError):
+        of_rank(Tiny(root=str(root)), 0, sent).motion_scale()
+    with pytest.raises(FaceDiffError, match="first process failed: ZeroDivisionError"):
+        of_rank(Tiny(root=str(root)), 1, sent).motion_scale()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import lightning.pytorch as pl
 import numpy as np
@@ -90,6 +91,7 @@ def test_a_table_of_clips_decides_the_splits(tmp_path: Path) -> None:
     (root / "clips.csv").write_text("clip,split\nann_s0,test_a\nann_s4,none\n")
     data = FlameClips(root=str(root), layout="flame_diffposetalk")
     assert [clip.name for clip in data.clips("test_a")] == ["ann_s0"]
+    assert not any(data.find_split(clip) for clip in data.corpus.clips.values() if clip.name == "ann_s4")
     (root / "clips.csv").write_text("clip,split\nann_s0,tset\n")
     with pytest.raises(FaceDiffError, match="ann_s0"):
         FlameClips(root=str(root), layout="flame_diffposetalk").clips("train")
@@ -162,6 +164,20 @@ def test_a_take_of_one_is_a_speaker_of_another_corpus(tmp_path: Path) -> None:
     jaw = data.corpus.read_motion(clip)[:, data.space.index("jawOpen"), 0].numpy()
     assert np.abs(jaw - values[:, layout("live_link").index("jawOpen")]).max() < 1e-6
     assert LiveLink(root=str(person)).identities == ["Ann"]
+
+
+def test_conversations_and_speakers_who_are_not_asked_for_are_not_trained_on(tmp_path: Path) -> None:
+    scott = [f"2_scott_0_{number}_{number}" for number in (1, 9, 10, 11)]
+    for name in ("1_wayne_0_9_9", "1_wayne_1_1_1", *scott):
+        for suffix in (".json", ".wav"):
+            (tmp_path / name).with_suffix(suffix).write_bytes(b"")
+    ways: dict[Literal["order", "official"], str] = {"order": "2_scott_0_9_9", "official": "2_scott_0_1_1"}
+    for split, unseen in ways.items():
+        data = Beat(root=str(tmp_path), split=split)
+        assert "1_wayne_1_1_1" not in [clip.name for clip in data.clips("train")], "a conversation"
+        one = Beat(root=str(tmp_path), split=split, extra_identities=["1_wayne"])
+        clips = {split: [clip.name for clip in one.clips(split)] for split in ("train", "val", "test_a", "test_b")}
+        assert clips == {"train": ["1_wayne_0_9_9"], "val": [], "test_a": [], "test_b": [unseen]}
 
 
 def test_the_official_split_of_beat_is_that_of_its_table(tmp_path: Path) -> None:
