@@ -127,6 +127,7 @@ def adapt(
     from facediff.cli.trainer_options import explained
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
     from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.models.checkpoint_content import IMPORTED
     from facediff.utils.licences import require_cleared
     from facediff.utils.progress import on_terminal
 
@@ -150,7 +151,8 @@ def adapt(
     confirm_cost(yes, "--epochs", seconds=CLIP_SECONDS * epochs * len(clips))
     seed_everything(seed, verbose=False)
     model = with_extra_identities(model, list(data.identities)) if face is None else with_new_face(model, data)
-    model.provenance = {"parent": model_name(checkpoint)}
+    imported = {key: value for key, value in model.provenance.items() if key == IMPORTED}
+    model.provenance = {**imported, "parent": model_name(checkpoint)}
     model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
     train_only(model.train(), train)
     with explained({"max_epochs": epochs, "accelerator": accelerator}, prefix="--"):

@@ -30,7 +30,7 @@ class ParametricDataModule(SpeechMotionDataModule):
 
     Args:
         root: the folder.
-        extra_identities: speakers of the folder to train on; all that it has if None. The others' test clips are test_b.
+        extra_identities: speakers of the folder to train on; all that it has if None. Test clips of others are test_b.
         options: those of every data module.
     """
 

@@ -51,6 +51,8 @@ The regions come as the constructor's ``lips`` and ``upper``, either sort of pai
 
 MOMENTS: dict[str, Moment] = {"s_": "speaking", "l_": "listening"}
 """Prefixes of metrics that are taken in some frames only."""
+OF_ALL_FRAMES = {"closures", "waveform"}
+"""What metrics compare motion with by its place in the clip, so that no frames can be left out of it."""
 
 _NOT_CHOSEN = {"definition", "check_finite", "sync_on_compute", "process_group", "n_identities", "sample_rate"}
 
@@ -154,9 +156,10 @@ def parse(text: str) -> Request:
     except UnknownComponentError as error:
         # It is an AttributeError too, which a torch module that parses in a property would report as one of its own.
         raise FaceDiffError(str(error)) from error
-    if moment != "all" and not {"prediction", "truth"} <= inspect.signature(metrics.get(name).update).parameters.keys():
+    taken = inspect.signature(metrics.get(name).update).parameters.keys() if moment != "all" else set()
+    if moment != "all" and (not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken):
         raise FaceDiffError(
-            f"metric {text}: {name} is no score of prediction against truth frame by frame; omit the prefix"
+            f"metric {text}: {name} scores no frames of prediction and truth by themselves; omit the prefix"
         )
     return Request(text.replace(" ", ""), name, options, moment)
 

@@ -306,10 +306,15 @@ class AnimationModel(PersonStyles, ABC):
         optimizer._step_supports_amp_scaling = False
         if self.lr_schedule == "constant" and not self.warmup_steps:
             return optimizer
-        total = int(self.trainer.estimated_stepping_batches)
+        total = self.trainer.estimated_stepping_batches if self.lr_schedule == "cosine" else 0
+        if math.isinf(total):
+            raise ArgumentError(
+                {"lr_schedule": self.lr_schedule, "trainer.max_epochs": self.trainer.max_epochs},
+                "half a cosine needs the length of the training; state trainer.max_steps, or choose another schedule",
+            )
         factor = functools.partial(
             lr_factor,
-            total=total,
+            total=int(total),
             warmup_steps=self.warmup_steps,
             schedule=self.lr_schedule,
             epoch_steps=self._steps_an_epoch() if self.lr_schedule in ("exponential", "step") else 1,

@@ -92,16 +92,25 @@ def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Bat
     )
 
 
+def named(style: Reference | Style) -> str:
+    """The name of a style, of a reference that of its clip."""
+    return style.name if isinstance(style, Style) else style.clip
+
+
 def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]) -> list[Batch]:
-    """The clips as ``animate`` makes them where nobody names a style, in one batch for each identity that has one."""
+    """The clips as ``animate`` makes them where nobody names a style, in one batch for each identity that has one.
+
+    A clip whose own motion is that style is left out: a speaker of evaluated clips only has one of them as reference.
+    """
     views = []
     for name in dict.fromkeys(batch.identity_names):
-        clips = [clip for clip, other in enumerate(batch.identity_names) if other == name]
         try:
             style = style_of(name)
         except FaceDiffError:  # nobody animates as this identity without naming a style
             continue
-        if not isinstance(style, Style) or style.vector.numel():
+        identities = zip(batch.identity_names, batch.names, strict=True)
+        clips = [place for place, clip in enumerate(identities) if clip[0] == name and clip[1] != named(style)]
+        if clips and (not isinstance(style, Style) or style.vector.numel()):
             views.append(with_identity(batch.select(clips), int(batch.identity[clips[0]]), style))
     return views
 
@@ -391,7 +400,7 @@ class Evaluation:
             if "samples" in self.needs:
                 count = max(count, *(int(getattr(metric, "n_samples", 1)) for metric in chosen))
             # A sample is the seed of its noise; the first is the motion that all other metrics score.
-            if count > 1 or self.energies:
+            if count > 1 or self.energies or "samples" in self.needs:
                 more = [model.generate(batch, seed=seed) for seed in range(1, count)]
                 inputs["samples"] = torch.stack([motion, *more], 1)
             if self.energies:

@@ -50,7 +50,7 @@ from facediff.metrics import (
 )
 from facediff.metrics.eyes import LidMetric
 from facediff.models.base import AnimationModel
-from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of, with_identity
+from facediff.models.evaluation import closures_of, eyelid_pairs_of, named, regions_of, with_identity
 from facediff.utils import ranges
 
 REFERENCES = {
@@ -347,10 +347,12 @@ class Measurement:
                     self.of_references["nearest_speaker"].update(motion, self._number(clip))
 
     def _with_default_style(self, clip: Clip, sample: Sample) -> Batch | None:
-        """A clip with the style that its identity has where none is named; None if it has none."""
+        """A clip with the style that its identity has where none is named; None if it has none, or the clip itself."""
         try:
             style = self.model.default_style(clip.identity)
         except FaceDiffError:
+            return None
+        if named(style) == clip.name:  # of a speaker of evaluated clips only
             return None
         return with_identity(collate([sample]).to(self.model.device), sample.identity, style)
 

@@ -556,6 +556,11 @@ class TemporalPreconditioning(Preconditioning):
         mask: Bool[Tensor, "batch frames"],
     ) -> Coordinates:
         """The rows of V diag(gains) Vᵀ, each times the window of its frame."""
+        # In the weights' own precision: autocast would round the motion itself to half precision.
+        with torch.autocast(values.device.type, enabled=False):
+            return self._rows_times_windows(values.to(self.vectors.dtype), gains, mask)
+
+    def _rows_times_windows(self, values: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
         width, half, count = self.frames, self.frames // 2, values.shape[1]
         rows = (self.vectors * gains[:, :, None]) @ self.vectors.transpose(1, 2)  # batch, coordinates, row, window
         values = nn.functional.pad(values * mask[..., None], (0, 0, half, width)).transpose(1, 2)

@@ -19,7 +19,7 @@ from facediff.models import load_model
 from facediff.models.adaptation import grow
 from facediff.models.audio_distillation import encoder_weights
 from facediff.models.checkpoint import read_checkpoint
-from facediff.models.checkpoint_content import PROVENANCE_KEY
+from facediff.models.checkpoint_content import IMPORTED, PROVENANCE_KEY
 from facediff.utils.pickles import load_pickle
 from tests.fakes.tiny import Tiny
 
@@ -115,9 +115,11 @@ def test_train_person_leaves_the_rest_alone(checkpoint: Path, tmp_path: Path) ->
 
 
 def test_joint_training_uses_the_corpus_too(checkpoint: Path, tmp_path: Path) -> None:
-    path = tmp_path / "C.ckpt"
-    words = ["--checkpoint", str(checkpoint), "--person", "C", "-o", str(path), "--mode", "joint"]
+    path, imported = tmp_path / "C.ckpt", tmp_path / "imported.ckpt"
+    torch.save({**torch.load(checkpoint), PROVENANCE_KEY: {IMPORTED: "FaceFormer"}}, imported)
+    words = ["--checkpoint", str(imported), "--person", "C", "-o", str(path), "--mode", "joint"]
     assert main(["adapt", *words, *FAST[2:], "--epochs", "1"]) == 0
+    assert load_model(path).provenance.items() >= {IMPORTED: "FaceFormer", "parent": "imported.ckpt"}.items()
     printed = read_checkpoint(path)["datamodule_hyper_parameters"]
     assert (printed["extra_identities"], printed["train_identities"]) == (["C"], None)
 

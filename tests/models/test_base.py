@@ -219,6 +219,15 @@ def test_mixed_precision_trains_with_clipped_gradients(make_model: Make, tiny: T
     assert not torch.equal(before, after)
 
 
+def test_a_training_without_an_end_warms_up_and_takes_no_cosine(
+    make_model: Make, tiny: Tiny, make_trainer: MakeTrainer
+) -> None:
+    unlimited = {"max_epochs": -1, "max_time": {"seconds": 0}}
+    make_trainer(**unlimited).fit(make_model(warmup_steps=10, lr_schedule="exponential"), datamodule=tiny)
+    with pytest.raises(FaceDiffError, match=r"max_epochs.*max_steps"):
+        make_trainer(**unlimited).fit(make_model(lr_schedule="cosine"), datamodule=tiny)
+
+
 @pytest.mark.parametrize("schedule", ["constant", "cosine"])
 def test_the_learning_rate_warms_up_and_ends_as_asked(schedule: Schedule) -> None:
     factors = [lr_factor(step, total=100, warmup_steps=10, schedule=schedule) for step in range(100)]

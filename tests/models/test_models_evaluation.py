@@ -14,9 +14,11 @@ from lightning.pytorch import Trainer
 
 from facediff import registry
 from facediff.callbacks.outputs import ScoreTable
+from facediff.data import Reference, collate
 from facediff.errors import FaceDiffError
 from facediff.metrics import BilabialClosureRate, LipPairs, SampleDiversity, parse
-from facediff.models.evaluation import with_identity
+from facediff.models import Style
+from facediff.models.evaluation import with_identity, with_usual_styles
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., Any]
@@ -102,9 +104,11 @@ def test_closures_are_those_of_the_phonemes(make_model: Make, rich: Tiny, make_t
 
 
 def test_validation_has_them_too(make_model: Make, tiny: Tiny, make_trainer: Callable[..., Trainer]) -> None:
-    model = make_model(metrics=["lip_speed_correlation"], motion_scale="none")
+    of_one_sample = "mean_estimate_error:n_samples=1"
+    model = make_model(metrics=["lip_speed_correlation", of_one_sample, "lip_vertex_error"], motion_scale="none")
     (reported,) = make_trainer().validate(model, datamodule=tiny, verbose=False)
     assert -1 <= reported["val/lip_speed_correlation"] <= 1
+    assert reported[f"val/{of_one_sample}"] == pytest.approx(reported["val/lip_vertex_error"], rel=1e-6)
 
 
 def test_what_the_corpus_lacks_is_named(make_model: Make, rich: Tiny, make_trainer: Callable[..., Trainer]) -> None:
@@ -116,6 +120,24 @@ def test_what_the_corpus_lacks_is_named(make_model: Make, rich: Tiny, make_train
     assert all(
         name in message for name in ("bilabial_closure_rate", "inner_lip_pairs.txt", str(rich.root / "phonemes"))
     )
+
+
+def test_no_clip_is_scored_in_the_style_of_its_own_motion(tiny: Tiny) -> None:
+    dataset = tiny.dataset("test_b")
+    batch = collate([dataset[place] for place in range(3)])
+    reference = Reference(batch.names[0], batch.motion[0])
+    for style in (reference, Style(batch.names[0], torch.ones(4))):
+        (view,) = with_usual_styles(batch, lambda name, style=style: style)
+        assert view.names == batch.names[1:]
+    assert with_usual_styles(batch.select([0]), lambda name: reference) == []
+
+
+def test_metrics_that_read_the_clips_time_take_whole_clips() -> None:
+    """Leaving out frames would compare the motion with what is said elsewhere."""
+    assert parse("s_lip_vertex_error").moment == "speaking"
+    for name in ("s_bilabial_closure_rate", "l_frame_speech_lip_correlation", "s_clip_speech_lip_correlation"):
+        with pytest.raises(FaceDiffError, match="omit the prefix"):
+            parse(name)
 
 
 def test_wrong_names_are_refused_with_the_nearest(make_model: Make) -> None:

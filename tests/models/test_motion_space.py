@@ -245,6 +245,8 @@ def test_a_silent_network_smooths_by_the_frames_of_its_window(step: int) -> None
                 gain = np.linalg.solve(kept * own + (1 - kept) * np.eye(7), np.sqrt(kept) * own[frame - start])
                 assert float(clean[clip, frame, k]) == pytest.approx(gain @ window[:, k], rel=1e-3, abs=1e-5)
     features = torch.randn(2, 15, 3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(predicted(scales, noisy, silence, steps, mask), clean), "motion is not rounded"
     alone = predicted(scales, noisy[1:, :9], features[1:, :9], steps[1:], mask[1:, :9])
     torch.testing.assert_close(predicted(scales, noisy, features, steps, mask)[1:, :9], alone)
     # White features leave what the posterior leaves open.

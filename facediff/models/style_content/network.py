@@ -261,8 +261,9 @@ class WindowedTransformer(nn.Module):
             count = features.shape[1] if frames is None else frames
             middles = ((torch.arange(count, device=features.device) + 0.5) * ratio).floor().long()
             # Rounding may leave a clip one feature short of its last frame's.
-            last = middles.new_tensor(features.shape[1]) if lengths is None else lengths.max()
-            around = around[:, torch.minimum(middles, last - 1)]
+            last = middles.new_tensor([features.shape[1]]) if lengths is None else lengths
+            clips = torch.arange(len(features), device=features.device)[:, None]
+            around = around[clips, torch.minimum(middles, last[:, None] - 1)]
         return around.transpose(2, 3)
 
     def forward(
