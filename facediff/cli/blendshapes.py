@@ -82,7 +82,10 @@ def blendshapes(
         return
     for option, value in (("ANIMATION", animation), ("-o", output), ("--shapes", shapes)):
         if value is None:
-            raise FaceDiffError(f"{option}: is missing; `facediff blendshapes speech.npz -o weights.csv --shapes DIR`")
+            raise FaceDiffError(
+                f"{option}: is missing; `facediff blendshapes speech.npz -o weights.csv --shapes DIR`; the built-in "
+                f"face's shapes are called puppet"
+            )
     assert animation is not None and output is not None and shapes is not None  # noqa: S101, PT018 - for type checkers
     check_source(source, [animation])
     if output.suffix.lower() != ".csv":

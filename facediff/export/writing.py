@@ -179,6 +179,8 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         raise MissingExtraError(*form.requires, f"writing {suffix}")
     for target in _targets(path, form, n_animations):
         check_writable(target)
+        if suffix == ".json" and target.exists() and is_free(target):
+            raise FaceDiffError(f"{target}: describes {target.with_suffix('.csv').name}; choose another -o")
         if form.is_folder:
             check_free(folder_of(target))
 

@@ -11,6 +11,8 @@ from facediff.animation.options import AnimationOptions
 from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of
 from facediff.runtime.model import RuntimeModel, RuntimeStream
+from facediff.utils.files import valid_text
+from facediff.utils.hub import model_name
 
 if TYPE_CHECKING:
     from facediff.editing.direction import Direction
@@ -98,4 +100,5 @@ class ExportedPipeline(AnimationPipeline):
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
-        return {**self._metadata, **({"seed": str(seed)} if "seed" in self._metadata else {})}
+        drawn = {"seed": str(seed)} if "seed" in self._metadata else {}
+        return {**self._metadata, "checkpoint": valid_text(model_name(self.options.checkpoint)), **drawn}

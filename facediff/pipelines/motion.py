@@ -330,8 +330,16 @@ class SourceReader:
         return cast("AnimationFacts", overrides), defaults
 
     def read(self, path: Path, lender: Animation | None = None) -> Animation:
-        """The animation in a file, completed by this, then by another animation; all of its frames are finite."""
+        """The animation in a file, completed by this, then by another animation; all of its frames are finite.
+
+        Raises:
+            FaceDiffError: if it cannot be read, or says another frame rate or unit than the options.
+        """
         overrides, defaults = self.facts
+        bare = path.suffix.lower() == ".npy"
+        if not bare:
+            # Another frame rate would play the motion faster than its speech, another unit change the face's size.
+            overrides = cast("AnimationFacts", {k: v for k, v in overrides.items() if k not in ("frame_rate", "unit")})
         if lender is not None:
             defaults = complete(defaults or {}, facts_of(lender))
         from facediff.editing.recorded_weights import SUFFIXES, read_weights
@@ -341,6 +349,10 @@ class SourceReader:
             animation = replace(recorded, **complete(overrides, facts_of(recorded)))
         else:
             animation = read_animation(path, overrides, defaults)
+        for option, own in (("frame_rate", animation.frame_rate), ("unit", animation.unit)):
+            asked = getattr(self.options, option)
+            if not bare and asked not in (None, own):
+                raise OptionError(option, f"{path.name} has {own} by itself; the option is for a bare .npy", asked)
         animation.refuse_not_finite()
         return animation
 

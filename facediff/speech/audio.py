@@ -177,7 +177,8 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
             yield file
     except (soundfile.LibsndfileError, RuntimeError, TypeError, ValueError, OSError) as error:
         raise FaceDiffError(
-            f"{path}: not a readable sound file ({_reason(path, error)}); expected one of {', '.join(SUFFIXES)}"
+            f"{path}: not a readable sound file ({_reason(path, error)}); "
+            f"expected one of {', '.join(SUFFIXES + CONTAINERS)}"
         ) from error
 
 

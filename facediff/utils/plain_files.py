@@ -196,6 +196,8 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
                 cells += len(row)
                 LIMITS.check("entries", number, path)
                 LIMITS.check("bytes", BYTES_OF_A_CELL * cells, path)
+                if number == 0 and len(row) == 1 and ";" in row[0]:
+                    raise FaceDiffError(f"{path}: row 1: has semicolons between its columns; save it with commas")
                 if row:
                     yield [csv_text(cell) for cell in row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

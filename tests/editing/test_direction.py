@@ -113,6 +113,9 @@ def test_frames_and_timecodes_are_seconds(tmp_path: Path) -> None:
     path = tmp_path / "keys.csv"
     path.write_text("Frame,time,channel,value\n50,,sway,1\n,00:01:02:12,sway,2\n,00:00:03.480,gaze,3\n\n")
     assert [key.time for key in read_direction(path, 25.0).keys] == [2.0, 3.48, 62.48]
+    path.write_text(path.read_text().replace(",", ";"))  # as spreadsheets of countries with a decimal comma write it
+    with pytest.raises(FaceDiffError, match="semicolons between its columns"):
+        read_direction(path, 25.0)
     content = {"frame_rate": 24, "keys": [{"frame": 36, "channel": "sway", "value": 1}]}
     assert Direction.parse(content, "keys", 25.0).keys[0].time == 1.5
 

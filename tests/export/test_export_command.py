@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,19 @@ def test_bare_array_is_completed_by_options(
     assert soundfile.info(tmp_path / "out_obj" / "out.wav").duration == pytest.approx(40 / 30, abs=1e-3)
     assert main([*words, "--no-speech"]) == 0
     assert not (tmp_path / "out_obj" / "out.wav").exists()
+
+
+@pytest.mark.parametrize(("option", "wrong", "own"), [("--frame-rate", "31", "30"), ("--unit", "mm", "m")])
+def test_what_a_file_says_of_its_own_rate_and_unit_stands(
+    option: str, wrong: str, own: str, animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = tmp_path / "in.npz", tmp_path / "out.npz"
+    write_archive(source, replace(animation, frame_rate=30.0))
+    assert main(["export", str(source), "-o", str(out), option, own]) == 0
+    out.unlink()
+    assert main(["export", str(source), "-o", str(out), option, wrong]) == 2
+    assert f": in.npz has {own}" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_animations_of_one_recording_are_named_after_their_files(animation: Animation, tmp_path: Path) -> None:

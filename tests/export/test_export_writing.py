@@ -253,6 +253,8 @@ def test_csv_holds_weights_solved_for_the_shapes(make_animation: Callable[..., A
     animation = make_animation(vertices=(rest + opened[:, None, None] * shapes["jawOpen"]).astype(np.float32))
     written = write_animations(tmp_path / "a.csv", [animation], ExportOptions(shapes=tmp_path / "shapes"))
     assert [path.name for path in written] == ["a.csv", "a.json", "a.wav"]
+    with pytest.raises(FaceDiffError, match=r"a\.json: describes a\.csv"):
+        write_animations(tmp_path / "a.json", [animation], ExportOptions(shapes=tmp_path / "shapes"))
     table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     np.testing.assert_allclose(table["JawOpen"], opened, atol=0.03)
     assert np.abs(table["MouthFunnel"]).max() < 0.03
