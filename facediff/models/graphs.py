@@ -128,8 +128,8 @@ class Graphs:
 def update_table(sampler: Sampler) -> list[list[float]]:
     """The updates of a linear sampler as numbers.
 
-    For each step: the factors of the noisy motion, of the latest prediction and the two before it, and of new noise.
-    The last one is 0 where no noise is drawn.
+    For each step: the factors of the noisy motion, of the latest prediction and the two before it, and of new noise,
+    which is 0 where none is drawn. A last row may have one number more, the factor of the first prediction.
 
     Raises:
         FaceDiffError: if the sampler is not linear.
@@ -154,6 +154,12 @@ def update_table(sampler: Sampler) -> list[list[float]]:
             latest = predictions[:count][::-1]
             row.append(float(sampler.update(i, noisy, latest, lambda like, drawn=drawn: drawn)))  # type: ignore[misc]
         table.append(row)
+    if sampler.spread != 1 and sampler.steps > 1:
+        table[0][0] *= sampler.spread
+        table[-1] = [sampler.spread * factor for factor in table[-1]] + [0.0]
+        # The first prediction is among the latest three of two or three steps.
+        table[-1][sampler.steps if sampler.steps <= 3 else 5] += 1 - sampler.spread
+        table[-1] = table[-1][: 5 if sampler.steps <= 3 else 6]
     return table
 
 

@@ -195,6 +195,7 @@ def half_hidden(
 
 Spacing = Literal["steps", "log_snr"]
 NoiseLevel = Annotated[float, Range(1e-6, 1e6)]
+Spread = Annotated[float, Range(0.5, 2.0)]
 
 
 def visited(
@@ -275,6 +276,24 @@ def ended_earlier(first_noise: float, last_noise: float, share: float) -> float:
     return float(first_noise * (last_noise / first_noise) ** math.sqrt(max(0.0, share)))
 
 
+def widened(first_noise: float, last_noise: float, share: float) -> float:
+    """What :attr:`Sampler.spread` gives few steps the spread of the usual number.
+
+    A path that ends early shows less of what the conditions leave open, and more so the more noise there is at its end:
+    by 1 + 8 (noise − usual noise) / first noise, near a sweep with two to eight steps (docs/generation.md). The factor
+    counts twice, see there.
+
+    Args:
+        first_noise: from which steps are spread evenly in ln SNR.
+        last_noise: at which the usual number of steps ends.
+        share: of the steps that go to the last noise.
+
+    >>> [round(widened(2000.0, 10.0, steps / 10), 2) for steps in (2, 3, 5, 10, 20)]
+    [1.31, 1.18, 1.07, 1.0, 1.0]
+    """
+    return math.sqrt(1 + 8 * (ended_earlier(first_noise, last_noise, share) - last_noise) / first_noise)
+
+
 PART = 2**21
 """How many numbers one random stream draws on a processor."""
 
@@ -324,6 +343,8 @@ class Sampler(ABC):
         spacing: how they are spread over the process, see :func:`visited`.
         last_noise: noise left at the last of them, see :func:`visited`.
         first_noise: noise from which ``log_snr`` is spread, see :func:`visited`.
+        spread: what the noise at the start is multiplied by where the first step goes on from it, and the distance of
+            the result from the first prediction, which is the mean; few steps vary too little, see :func:`widened`.
 
     Attributes:
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
@@ -350,6 +371,7 @@ class Sampler(ABC):
         spacing: Spacing = "steps",
         last_noise: float | None = None,
         first_noise: float | None = None,
+        spread: Spread = 1.0,
     ) -> None:
         if not 1 <= steps <= process.steps:
             raise ArgumentError(
@@ -357,6 +379,7 @@ class Sampler(ABC):
             )
         self.process = process
         self.steps = steps
+        self.spread = spread
         self.timesteps = visited(process, steps, spacing, last_noise, first_noise)
         self.signal = [*(float(process.signal[n]) for n in self.timesteps), 1.0]
 
@@ -378,12 +401,16 @@ class Sampler(ABC):
         """
         # Solvers of a higher order extrapolate from earlier predictions instead of calling the network again, which is
         # why the predictions and not the states are kept.
-        noisy = start
+        noisy = mean = start
         predictions: list[Tensor] = []
         for i, step in enumerate(progress(self.timesteps) if progress is not None else self.timesteps):
             predictions = [*predictions, denoise(noisy, step)][-self.memory :]
+            if i == 0:
+                mean = predictions[0]
+                # Louder noise alone makes blinks more frequent, and distance alone larger; by half each, as they are.
+                noisy = self.spread * noisy if self.spread != 1 else noisy
             noisy = self.update(i, noisy, predictions, noise)
-        return noisy
+        return noisy if self.spread == 1 else mean + self.spread * (noisy - mean)
 
     @abstractmethod
     def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
@@ -492,6 +519,7 @@ class DpmSolverSampler(Sampler):
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
         first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
+        spread: how much further from the mean a sample is taken, twice, as few steps need it.
 
     Raises:
         FaceDiffError: if the number of steps or the order is impossible.
@@ -509,8 +537,9 @@ class DpmSolverSampler(Sampler):
         spacing: Spacing = "steps",
         last_noise: NoiseLevel | None = None,
         first_noise: NoiseLevel | None = None,
+        spread: Spread = 1.0,
     ) -> None:
-        super().__init__(process, steps, spacing, last_noise, first_noise)
+        super().__init__(process, steps, spacing, last_noise, first_noise, spread)
         self.order = order
         # Without the clean end, whose time λ is infinite; the last update returns the prediction and needs none.
         signal = self.signal[:-1]

@@ -73,7 +73,8 @@ class Description:
         kept: numbers in a frame by which windows of long speech are blended.
         sampler: its name.
         steps: the diffusion steps visited.
-        table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise.
+        table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise;
+            where there is a sixth, of the first prediction.
         last_step: the step at which only the mean is left.
         decoded: input of the last graph: the ``sample``, or what was ``kept`` of the last step.
         generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
@@ -251,10 +252,12 @@ def _check(path: Path, description: Description) -> None:
         if not least <= len(visited) <= MOST_STEPS or not all(isinstance(step, int) and step >= 0 for step in visited):
             refuse(steps, f"{least} to {MOST_STEPS} steps of the noise process")
         if len(rows) != len(visited) or not all(
-            isinstance(row, list) and len(row) == 5 and all(isinstance(n, int | float) and abs(n) < 1e9 for n in row)
+            isinstance(row, list)
+            and len(row) in (5, 6)
+            and all(isinstance(n, int | float) and abs(n) < 1e9 for n in row)
             for row in rows
         ):
-            refuse(table, "five numbers for each step, below 10^9")
+            refuse(table, "five or six numbers for each step, below 10^9")
     if description.decoded not in ("sample", "kept"):
         refuse("decoded", "sample or kept")
     for name in ("identities", "faces", "styles"):

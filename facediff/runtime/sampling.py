@@ -219,13 +219,15 @@ class SamplerRun:
     def _loop(self, features: Array, noisy: Array, noise: Draw) -> tuple[Array, Array]:
         """The sampler's result, and what was kept of the last step."""
         about = self.model.description
-        predictions: list[Array] = []
-        kept = noisy
-        for step, (of_noisy, first, second, third, of_noise) in self.model.loop:
+        latest: list[Array] = []
+        kept = first = noisy
+        six = ((step, [*row, 0.0][:6]) for step, row in self.model.loop)
+        for i, (step, (of_noisy, *of_latest, of_noise, of_first)) in enumerate(six):
             prediction, kept = self._evaluate(features, noisy, step)
-            predictions = [prediction, *predictions][:3]
+            latest = [prediction, *latest][:3]
+            first = prediction if i == 0 else first
             updated = np.float32(of_noisy) * noisy
-            for factor, earlier in zip((first, second, third), predictions, strict=False):
+            for factor, earlier in [*zip(of_latest, latest, strict=False), (of_first, first)]:
                 if factor:
                     updated = updated + np.float32(factor) * earlier
             if of_noise:

@@ -244,6 +244,20 @@ def test_fewer_steps_end_at_more_noise(make_model: Make, name: str | None) -> No
         model.choose_sampler(steps=-1)
 
 
+def test_samples_of_few_steps_are_taken_further_from_the_mean(make_model: Make) -> None:
+    made = {"steps": 10, "spacing": "log_snr", "first_noise": 200.0, "last_noise": 1.0}
+    sampler = partial(registry.sampler.dpm_solver, **made)
+    for space, wider in (("vertices", False), ("components", True)):
+        model = make_model(diffusion_steps=1000, sampler=sampler, motion_space=getattr(registry.motion_space, space))
+        assert model.hparams["sampler"]["init_args"]["spread"] == 1
+        factors = []
+        for steps in (2, 3, 5, 10, 20):
+            model.choose_sampler(steps=steps)
+            factors.append(model.sampler.spread)
+        wanted = [1.31, 1.18, 1.07, 1.0, 1.0] if wider else [1.0] * 5
+        assert factors == pytest.approx(wanted, abs=0.005)
+
+
 def test_sizes_that_do_not_fit_are_named(make_model: Make, tiny: Tiny) -> None:
     with pytest.raises(FaceDiffError, match=r"vertices are \{30\} in the model and \{24\} in the corpus"):
         make_model(n_vertices=30).adopt(tiny.assets())

@@ -245,6 +245,22 @@ def test_sampler_of_gaussian_data_keeps_mean_and_deviation(name: str) -> None:
     torch.testing.assert_close(samples.std(0), deviation, rtol=0.025, atol=0)
 
 
+def test_spread_takes_samples_twice_that_factor_further_from_the_mean() -> None:
+    """Of Gaussian data, where all is linear: once by louder noise, once by distance from the first prediction."""
+    process, mean, deviation = NoiseProcess(1000), 0.7, 0.8
+
+    def predict(noisy: Tensor, step: int) -> Tensor:
+        kept = process.signal[step]
+        weight = kept * deviation**2 + 1 - kept
+        return (mean * (1 - kept) + kept.sqrt() * deviation**2 * noisy) / weight
+
+    start = torch.randn(2_000, 1, generator=torch.Generator().manual_seed(1))
+    plain, wide = (DpmSolverSampler(process=process, steps=4, spread=s).run(predict, start) for s in (1.0, 1.3))
+    torch.testing.assert_close(wide - mean, 1.3**2 * (plain - mean), rtol=0.01, atol=0.01)
+    once = DpmSolverSampler(process=process, steps=1, spread=1.3).run(predict, start)
+    torch.testing.assert_close(once, predict(start, 999))
+
+
 @every_sampler
 def test_sampler_repeats_a_seed_bit_for_bit_whatever_the_global_state(name: str) -> None:
     start = torch.randn(2, 3, 4)

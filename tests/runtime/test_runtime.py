@@ -72,6 +72,10 @@ def test_noise_of_clips_and_windows_is_that_of_the_model() -> None:
         partial(DdpmSampler, steps=5),
         partial(DpmSolverSampler, steps=6, order=3),
         partial(DpmSolverSampler, steps=1),
+        partial(DpmSolverSampler, steps=1, spread=1.2),
+        partial(DpmSolverSampler, steps=2, spread=1.3),
+        partial(DpmSolverSampler, steps=3, spread=1.2),
+        partial(DpmSolverSampler, steps=5, spread=1.1),
     ],
 )
 def test_table_of_updates_runs_the_sampler(make: Callable[..., Sampler]) -> None:
@@ -80,9 +84,12 @@ def test_table_of_updates_runs_the_sampler(make: Callable[..., Sampler]) -> None
     drawn, again = iter(noise[1:]), iter(noise[1:])
     wanted = sampler.run(lambda noisy, step: noisy.sin() + step / 40, noise[0], noise=lambda _: next(drawn))
     noisy, predictions = noise[0], list[torch.Tensor]()
-    for step, (own, *factors, fresh) in zip(sampler.timesteps, update_table(sampler), strict=True):
-        predictions = [noisy.sin() + step / 40, *predictions][:3]
-        noisy = own * noisy + sum(f * p for f, p in zip(factors, predictions, strict=False))
+    for step, row in zip(sampler.timesteps, update_table(sampler), strict=True):
+        own, *factors, fresh, of_first = [*row, 0.0][:6]
+        predictions = [noisy.sin() + step / 40, *predictions]
+        noisy = (
+            own * noisy + of_first * predictions[-1] + sum(f * p for f, p in zip(factors, predictions, strict=False))
+        )
         noisy = noisy + fresh * next(again) if fresh else noisy
     torch.testing.assert_close(noisy, wanted)
 
@@ -284,10 +291,11 @@ def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:
         {"motion_space": partial(registry.motion_space.components, count=6)},
         {"motion_space": partial(registry.motion_space.components, count=6, prior_frames=7)},
         {"sampler": partial(registry.sampler.ddpm, steps=4)},
+        {"sampler": partial(registry.sampler.dpm_solver, steps=5, spread=1.3)},
         {"style_encoder": registry.style_encoder.none, "fusion": registry.fusion.add},
         {"decoder": registry.decoder.gru},
     ],
-    ids=["vertices", "components", "prior over time", "ddpm", "no style", "gru"],
+    ids=["vertices", "components", "prior over time", "ddpm", "spread", "no style", "gru"],
 )
 def test_other_parts_are_exported_too(tiny_root: Path, tmp_path: Path, options: dict[str, object]) -> None:
     made = ready(tiny_root, **options)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.network import Conditions, DualPathNetwork
-from facediff.models.folding import Blend, ConditionalDenoiser, SamplingSpace, unchanged
+from facediff.models.folding import Blend, ConditionalDenoiser, unchanged
 from facediff.models.graphs import (
     BATCH,
     FRAMES,
@@ -36,7 +36,10 @@ class DualPathModel(GraphedModel, Protocol):
     motion_space: MotionSpace
     process: NoiseProcess
     sampler: Sampler
-    sampling_space: SamplingSpace
+
+    @property
+    def folds(self) -> bool:
+        """Whether the sampler runs on folded motion."""
 
     @property
     def scale(self) -> float:
@@ -125,7 +128,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
         quick = model.sampler
     preconditioned = model.motion_space.preconditioning is not None
     # A folded sampler goes on in the network's width; preconditioning works on components, which are few already.
-    folded = model.sampling_space == "folded" and not preconditioned
+    folded = model.folds and not preconditioned
     # Example sizes: neither is 1, which the exporter would take for a constant instead of a size that may change.
     batch, frames, width = 2, 50, network.coordinates
     dim = network.embed.out_features

@@ -54,6 +54,7 @@ from facediff.models.samplers import (
     ended_earlier,
     half_hidden,
     unit_noise,
+    widened,
 )
 from facediff.models.speaker_encoders import (
     HierarchicalIdentity,
@@ -361,7 +362,8 @@ class DualPathDiffusion(AnimationModel):
 
         A sampler chosen by name keeps the spacing and the last noise that the model was made with, where as many steps
         have that much noise; its other options are its own. Where both ends of the path are set, as ``first_noise``
-        and ``last_noise``, fewer steps end at more noise (:func:`~facediff.models.samplers.ended_earlier`).
+        and ``last_noise``, fewer steps end at more noise (:func:`~facediff.models.samplers.ended_earlier`), and
+        their samples are taken further from the mean (:func:`~facediff.models.samplers.widened`).
         """
         chosen = registry.sampler.get(name) if name is not None else type(self.sampler)
         first: dict[str, Any] = self.hparams["sampler"]["init_args"]
@@ -374,6 +376,9 @@ class DualPathDiffusion(AnimationModel):
         if count is not None and options.get("first_noise") and options.get("last_noise"):
             share = count / min(self._usual_steps, MANY_STEPS)
             options["last_noise"] = ended_earlier(first["first_noise"], first["last_noise"], share)
+            if "spread" in registry.defaults(chosen) and self.motion_space.preconditioning is not None:
+                wider = widened(first["first_noise"], first["last_noise"], share)
+                options["spread"] = min(2.0, wider * first.get("spread", 1.0))
         try:
             self.sampler = chosen(process=self.process, **options)
         except ArgumentError:
@@ -754,13 +759,16 @@ class DualPathDiffusion(AnimationModel):
         ]
         return (ends[0] + ends[1]) / 2
 
+    @property
+    def folds(self) -> bool:
+        """Whether the sampler runs on folded motion: not where it acts on vertices, or goes on after its last step."""
+        return self.sampling_space == "folded" and self.sampler.linear and self.sampler.spread == 1
+
     def denoiser(self, conditions: Conditions, blend: Blend) -> ConditionalDenoiser:
         """The network under some conditions, in the space in which the sampler runs."""
-        # A sampler that clips or thresholds acts on vertices, and no fold can follow it.
-        folded = self.sampling_space == "folded" and self.sampler.linear
         preconditioning = self.motion_space.preconditioning
         return self.network.prepare_for_inference(
-            conditions, self.process.steps, folded=folded, blend=blend, preconditioning=preconditioning
+            conditions, self.process.steps, folded=self.folds, blend=blend, preconditioning=preconditioning
         )
 
     def _empty(self, denoiser: ConditionalDenoiser, conditions: Conditions) -> Tensor:

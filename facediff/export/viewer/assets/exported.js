@@ -63,11 +63,11 @@ function checkDescription(about) {
   const names = (value) => Array.isArray(value) && value.every((each) => typeof each === "string");
   for (const name of ["identities", "faces", "styles"]) if (!names(about[name])) refuse(name, "names");
   for (const name of about.style_source === "reference" ? ["faces", "styles"] : ["faces"]) if (!about[name].length) refuse(name, "one name at least");
-  const row = (each) => Array.isArray(each) && each.length === 5 && each.every(Number.isFinite);
+  const row = (each) => Array.isArray(each) && [5, 6].includes(each.length) && each.every(Number.isFinite);
   for (const [named, tabled, least] of [["steps", "table", sampled ? 1 : 0], ["quick_steps", "quick_table", 0]]) {
     const steps = about[named], table = about[tabled];
     if (!Array.isArray(steps) || !within(steps.length, least, 100_000) || !steps.every((each) => whole(each, 0, 2 ** 31))) refuse(named, "steps of the noise process");
-    if (!Array.isArray(table) || table.length !== steps.length || !table.every(row)) refuse(tabled, "five numbers for each step");
+    if (!Array.isArray(table) || table.length !== steps.length || !table.every(row)) refuse(tabled, "five or six numbers for each step");
   }
   if (!whole(about.last_step, -1, 2 ** 31)) refuse("last_step", "a step of the noise process");
   if (!["sample", "kept"].includes(about.decoded)) refuse("decoded", "sample or kept");

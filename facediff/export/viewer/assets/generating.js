@@ -100,15 +100,16 @@ class Sampling {
   /** The sampler's result, and what was kept of the last step. */
   async loop(noisy, noise) {
     const { loop, about: { state } } = this.model;
-    let sample = noisy, predictions = [], kept = noisy;
-    for (const [step, [ofSample, first, second, third, ofNoise]] of loop) {
+    let sample = noisy, predictions = [], kept = noisy, earliest = null;
+    for (const [step, [ofSample, first, second, third, ofNoise, ofFirst = 0]] of loop) {
       const found = await this.evaluate(sample, step);
       predictions = [found.prediction, ...predictions].slice(0, 3);
+      earliest ??= found.prediction;
       kept = found.kept;
       const made = sample.map((value) => ofSample * value);
-      [first, second, third].forEach((factor, which) => {
-        if (factor && predictions[which]) predictions[which].forEach((value, i) => (made[i] += factor * value));
-      });
+      for (const [factor, prediction] of [[first, predictions[0]], [second, predictions[1]], [third, predictions[2]], [ofFirst, earliest]]) {
+        if (factor && prediction) prediction.forEach((value, i) => (made[i] += factor * value));
+      }
       if (ofNoise) this.coloured(noise.draw(this.frames, state)).forEach((value, i) => (made[i] += ofNoise * value));
       sample = made;
     }
