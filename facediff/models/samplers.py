@@ -277,11 +277,11 @@ def ended_earlier(first_noise: float, last_noise: float, share: float) -> float:
 
 
 def widened(first_noise: float, last_noise: float, share: float) -> float:
-    """What :attr:`Sampler.spread` gives few steps the spread of the usual number.
+    """The :attr:`Sampler.spread` that lets few steps vary as much as the usual number.
 
-    A path that ends early shows less of what the conditions leave open, and more so the more noise there is at its end:
-    by 1 + 8 (noise − usual noise) / first noise, near a sweep with two to eight steps (docs/generation.md). The factor
-    counts twice, see there.
+    A path that ends at more noise shows less of what the conditions leave open: by 1 + 8 (noise − usual noise) / first
+    noise, within 8 % of a sweep with two to eight steps of the bundled model (docs/generation.md). The factor is the
+    root of it, since it counts twice.
 
     Args:
         first_noise: from which steps are spread evenly in ln SNR.
@@ -343,8 +343,8 @@ class Sampler(ABC):
         spacing: how they are spread over the process, see :func:`visited`.
         last_noise: noise left at the last of them, see :func:`visited`.
         first_noise: noise from which ``log_snr`` is spread, see :func:`visited`.
-        spread: what the noise at the start is multiplied by where the first step goes on from it, and the distance of
-            the result from the first prediction, which is the mean; few steps vary too little, see :func:`widened`.
+        spread: what the noise is multiplied by where the first step goes on from it, and the distance of the result
+            from the first prediction, which is the mean; few steps vary too little, see :func:`widened`.
 
     Attributes:
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
@@ -407,7 +407,7 @@ class Sampler(ABC):
             predictions = [*predictions, denoise(noisy, step)][-self.memory :]
             if i == 0:
                 mean = predictions[0]
-                # Louder noise alone makes blinks more frequent, and distance alone larger; by half each, as they are.
+                # Louder noise alone made blinks too frequent, distance alone closed fewer lips: each does its half.
                 noisy = self.spread * noisy if self.spread != 1 else noisy
             noisy = self.update(i, noisy, predictions, noise)
         return noisy if self.spread == 1 else mean + self.spread * (noisy - mean)
@@ -519,7 +519,8 @@ class DpmSolverSampler(Sampler):
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
         first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
-        spread: how much further from the mean a sample is taken, twice, as few steps need it.
+        spread: how much louder the noise is where the first step goes on from it, and how much further from the first
+            prediction, the mean, the result is; above 1 lets few steps vary more.
 
     Raises:
         FaceDiffError: if the number of steps or the order is impossible.
