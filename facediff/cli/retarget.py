@@ -94,6 +94,7 @@ def retarget(
 
     from facediff.editing.blendshapes import has_arkit_weights
     from facediff.editing.fit_check import refuse_poor
+    from facediff.editing.retargeting import has_z_up
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.glb_own_shapes import own_shapes as own_shapes_of
@@ -141,10 +142,10 @@ def retarget(
         notes += unused_shapes(target_mesh)
     notes += surface_notes(target_mesh, output, made)
     into = target_mesh if dressed or own_shapes or has_uvs(target_mesh) else None
-    written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes)
+    written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes, z_up=has_z_up(found))
     if show is not None:
         written.append(show)
-    lines = [*remarks(own, made, found, reports[-1]), *notes]
+    lines = [*remarks(own, made, found, reports[-1]), *axes_notes(found, output, dressed or own_shapes), *notes]
     tell(*written, *(line for line in lines if not quiet or line.startswith("WARNING")))
 
 
@@ -246,6 +247,19 @@ def remarks(animation: Animation, made: Animation, found: Correspondence, report
     lines.append(report.summary)
     lines += [f"WARNING: {fault}" for fault in report.faults]
     lines += [f"note: {remark}" for remark in report.remarks]
-    if found.similarity.rotation[1, 1] < TURNED:
-        lines.append("the target mesh is turned against the animation, whose y axis points up; so is what is written")
     return lines
+
+
+def axes_notes(correspondence: Correspondence, output: Path, copied: bool) -> list[str]:
+    """How the target mesh is turned, and how what is written; ``copied`` if that is a copy of the mesh's own file."""
+    from facediff.editing.retargeting import has_z_up
+    from facediff.export import FORMATS
+
+    if has_z_up(correspondence) and not copied:
+        form = FORMATS.get(output.suffix)
+        if form is not None and "z" in form.up_axes:
+            return ["the target mesh has z up, and so has what is written"]
+        return ["the target mesh has z up and is turned: what is written has y up"]
+    if correspondence.similarity.rotation[1, 1] < TURNED:
+        return ["the target mesh is turned against the animation, whose y axis points up; so is what is written"]
+    return []

@@ -44,6 +44,9 @@ from facediff.utils.limits import check_format
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
 SAME_UNIT = 1.4  # Named units lie further apart than this factor, and heads differ by less
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns an animation as ``export --up z`` does."""
+TILT = np.deg2rad(20.0)  # A mesh whose rotation differs by less from that one has z up
 
 
 def retarget(
@@ -55,7 +58,7 @@ def retarget(
     parts: Sequence[str] = (),
     judge: Callable[[Animation, Correspondence, FitReport], object] | None = None,
 ) -> tuple[Animation, Correspondence]:
-    """An animation on the mesh in a file, and the correspondence between both meshes.
+    """An animation on the mesh in a file, and the correspondence between both meshes; :func:`upright` if z is up in it.
 
     Args:
         animation: with triangles.
@@ -64,19 +67,19 @@ def retarget(
         landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
         parts: names of the parts of the file that show the face, see :func:`facediff.mesh.parts.named_triangles`; it is
             searched for in all of them if there are none.
-        judge: called with the result and what was measured of it, before a new correspondence is written; raises where
-            it should not be. Where it raises and both meshes are of known topologies, their named landmarks are tried.
-            Nothing is measured if None.
+        judge: called with the result in the mesh's own axes and what was measured of it, before a new correspondence is
+            written; raises where it should not be. Where it raises and both meshes are of known topologies, their named
+            landmarks are tried. Nothing is measured if None.
     """
     triangles = animation.triangles  # refuses an animation without triangles before the other mesh is read
     mesh = read_mesh(mesh_path)
 
     def judged(correspondence: Correspondence) -> tuple[Animation, Correspondence]:
         if judge is None:
-            return carry(animation, correspondence, mesh), correspondence
+            return upright(carry(animation, correspondence, mesh), correspondence), correspondence
         carried, correspondence, report = carry_checked(animation, correspondence, mesh)
         judge(carried, correspondence, report)
-        return carried, correspondence
+        return upright(carried, correspondence), correspondence
 
     if correspondence_path is not None and correspondence_path.exists():
         if landmarks_path is not None:
@@ -136,6 +139,28 @@ def retarget(
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
     return carried, correspondence
+
+
+def has_z_up(correspondence: Correspondence) -> bool:
+    """Whether z points up in the target's file, and its face looks along −y, as Blender and 3ds Max write meshes."""
+    cosine = (np.trace(Z_UP.T @ correspondence.similarity.rotation) - 1) / 2
+    return bool(cosine > np.cos(TILT))
+
+
+def upright(carried: Animation, correspondence: Correspondence) -> Animation:
+    """An animation on a target mesh with y up, as animations have it, where the mesh has z up; else the same."""
+    return turned(carried, Z_UP.T) if has_z_up(correspondence) else carried
+
+
+def turned(animation: Animation, rotation: Array) -> Animation:
+    """An animation in other axes: all points rotated (3, 3) about the origin, and the head's motion with them."""
+    by, head = rotation.T.astype(np.float32), animation.head
+    return replace(
+        animation,
+        vertices=animation.vertices @ by,
+        template=animation.template @ by,
+        head=None if head is None else np.concatenate([head[:, :3] @ rotation.T, head[:, 3:] @ rotation.T], axis=1),
+    )
 
 
 MOST_PARTS, LEAST_PART = 6, 60  # So many of the largest parts are looked at, and triangles that a face has at least

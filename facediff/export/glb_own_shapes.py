@@ -236,7 +236,8 @@ def _bones(glb: Glb) -> dict[str, int]:
 
 def _solved(glb: Glb, own: OwnShapes, animation: Animation) -> Weights:
     """Weights of the avatar's own shapes that come nearest to an animation of its mesh."""
-    parts, total = parts_of(glb, animation), len(animation.template)
+    parts, animation = parts_of(glb, animation)
+    total = len(animation.template)
     check_array(glb.source, (2, len(own.binds), total, 3), 8)
     deltas, first = np.zeros((len(own.binds), total, 3)), 0
     for part in parts:

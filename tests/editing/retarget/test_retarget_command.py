@@ -10,7 +10,9 @@ import trimesh
 
 from facediff.animation import Animation, read_archive, write_archive
 from facediff.cli.app import main
+from facediff.editing.procedural import move_head
 from facediff.editing.retargeting import retarget
+from facediff.mesh.glb import open_glb
 
 TARGET = ("--target-mesh", "face.obj")
 
@@ -90,6 +92,72 @@ def test_retarget_names_a_reordered_mesh(
     assert "face.obj: " in said
     assert "reordered" in said
     assert not (tmp_path / "other.npz").exists()
+
+
+def as_z_up(points: np.ndarray) -> np.ndarray:
+    """Points (…, 3) as Blender and 3ds Max see them: the front is at −y."""
+    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+UPRIGHT = "the target mesh has z up and is turned: what is written has y up"
+
+
+@pytest.mark.parametrize("tilt", [0, 15, 90])
+def test_only_a_mesh_with_z_up_is_set_upright(
+    tilt: float,
+    animation: Animation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A head may look up a little; one that lies on its side is nobody's axes."""
+    monkeypatch.chdir(tmp_path)
+    turn = trimesh.transformations.rotation_matrix(np.deg2rad(tilt), [0, 1, 0])[:3, :3]
+    write_obj(tmp_path / "z.obj", 1000 * as_z_up(animation.template) @ turn.T, animation.triangles)
+    write_archive(tmp_path / "take.npz", swaying := move_head(animation, *np.full((2, 3, 3), 0.02)))
+    assert main(["retarget", "take.npz", "--target-mesh", "z.obj", "-o", "out.npz"]) == 0
+    said, goal = capsys.readouterr().out, as_z_up(1000 * swaying.vertices) @ turn.T
+    upright = read_archive(tmp_path / "out.npz")
+    assert (UPRIGHT in said, "so is what is written" in said) == (tilt < 20, tilt > 20)
+    moved = upright.vertices if tilt > 20 else as_z_up(upright.vertices)
+    assert np.abs(moved - goal).max() < 0.01
+    assert np.abs(upright.still().vertices[0] - upright.template).max() < 0.01, "the head's motion turns with its face"
+
+
+def test_files_that_may_have_z_up_fit_a_mesh_that_has(
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rest, moved = as_z_up(1000 * animation.template), as_z_up(1000 * animation.vertices)
+    write_obj(tmp_path / "z.obj", rest, animation.triangles)
+    words = ["retarget", "take.npz", "--target-mesh", "z.obj", "--correspondence", "map.npz", "-o"]
+    assert main([*words, "out.pc2"]) == 0
+    assert "the target mesh has z up, and so has what is written" in capsys.readouterr().out
+    cache = np.frombuffer((tmp_path / "out.pc2").read_bytes()[32:], "<f4").reshape(moved.shape)
+    assert np.abs(cache - moved).max() < 0.01
+    assert " z up" in (tmp_path / "out.obj").read_text().splitlines()[0]
+    for again in ("out.glb", "out.html"):
+        assert main([*words, again]) == 0
+        assert UPRIGHT in capsys.readouterr().out
+    glb = open_glb(tmp_path / "out.glb")
+    points = glb.positions(glb.primitives(0)[0])
+    assert np.abs(points - animation.template).max() < 1e-5
+
+
+def test_a_glb_with_z_up_keeps_its_axes(
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trimesh.Trimesh(as_z_up(animation.template), animation.triangles, process=False).export("z.glb")
+    words = ["retarget", "take.npz", "--target-mesh", "z.glb", "-o", "own.glb", "--add-to-mesh"]
+    assert main(words) == 0
+    assert "so is what is written" in capsys.readouterr().out
+    glb = open_glb(tmp_path / "own.glb")
+    (part,) = glb.primitives(0)
+    targets = np.stack([glb.numbers(target["POSITION"], "VEC3", ("f4",)) for target in part["targets"]])
+    weights = glb.numbers(glb.entries("animations")[0]["samplers"][0]["output"], "SCALAR", ("f4",)).reshape(3, -1)
+    own = glb.positions(part) + np.tensordot(weights, targets, 1)
+    assert np.abs(own - as_z_up(animation.vertices)).max() < 1e-4
 
 
 @pytest.mark.parametrize(
