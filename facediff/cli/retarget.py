@@ -215,10 +215,18 @@ def pick_on_page(
 
 
 def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
-    """What of an .obj's texture coordinates and materials a file does not get, a sentence each."""
+    """What of a mesh's texture coordinates and materials a file does not get, a sentence each."""
     from facediff.export import FORMATS
+    from facediff.mesh.glb import open_glb
     from facediff.mesh.obj_surface import has_uvs, read_surface
 
+    if mesh.suffix.lower() == ".glb" and output.suffix not in (".glb", ".fbx", ".npy"):
+        glb = open_glb(mesh)
+        if not glb.entries("materials"):
+            return []
+        lost = "materials, pictures and parts" if glb.entries("images") else "materials and parts"
+        shown = "" if made.colours is None else "the colours of materials are kept as those of vertices, and "
+        return [f"of {mesh.name}, {shown}{lost} are left out; write .glb to keep them"]
     if not has_uvs(mesh):
         return []
     if output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses:

@@ -13,6 +13,8 @@ from facediff.cli.app import main
 from facediff.editing.procedural import move_head
 from facediff.editing.retargeting import retarget
 from facediff.mesh.glb import open_glb
+from facediff.render import Look
+from tests.fakes.avatar import File
 
 TARGET = ("--target-mesh", "face.obj")
 
@@ -158,6 +160,32 @@ def test_a_glb_with_z_up_keeps_its_axes(
     weights = glb.numbers(glb.entries("animations")[0]["samplers"][0]["output"], "SCALAR", ("f4",)).reshape(3, -1)
     own = glb.positions(part) + np.tensordot(weights, targets, 1)
     assert np.abs(own - as_z_up(animation.vertices)).max() < 1e-4
+
+
+def test_plain_materials_of_a_glb_colour_what_is_no_glb(
+    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = File()
+    looks: list[dict[str, object]] = [{"baseColorFactor": [0.5, 0.2159, 0.0, 1.0]}, {"baseColorFactor": [2, 0, 0, 1]}]
+    looks.append({"baseColorFactor": [0.5, 0, 0, 1], "baseColorTexture": {"index": 0}})
+    file.content["materials"] = [{"pbrMetallicRoughness": look} for look in looks]
+    primitives = []
+    for material in range(4):  # the last one does not exist
+        points, corners = animation.template, animation.triangles
+        if material:
+            points, corners = points[corners[0]] + np.float32([0, 0.2, 0]), np.array([[0, 1, 2]])
+        attributes = {"POSITION": file.add(points, "VEC3", bounds=True)}
+        indices = file.add(corners.astype(np.uint16).ravel(), "SCALAR")
+        primitives.append({"attributes": attributes, "indices": indices, "material": material})
+    file.content |= {"meshes": [{"primitives": primitives}], "nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}]}
+    file.write(tmp_path / "own.glb")
+    assert main(["retarget", "take.npz", "--target-mesh", "own.glb", "-o", "out.npz"]) == 0
+    assert "of own.glb, the colours of materials are kept as those of vertices" in capsys.readouterr().out
+    colours = read_archive(tmp_path / "out.npz").colours
+    assert colours is not None
+    assert np.unique(colours[:-9], axis=0).tolist() == [[188, 128, 0]], "sRGB of the linear factor"
+    assert np.unique(colours[-9:], axis=0).tolist() == [np.rint(255 * np.array(Look.albedo)).tolist()], "as skin"
 
 
 @pytest.mark.parametrize(
