@@ -108,8 +108,9 @@ def retarget(
     dressed = add_to_mesh or (not bare_face and output.suffix in (".glb", ".fbx") and wears_more(target_mesh))
     if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
-    driven = own_shapes_of(target_mesh).summary if own_shapes else ""
+    avatar = own_shapes_of(target_mesh) if own_shapes else None
     own = SourceReader(source).read(animation)
+    driven = [] if avatar is None else [avatar.summary, *avatar.left_out(own)]
     if own_shapes and has_arkit_weights(own):
         idle = {"correspondence": correspondence, "landmarks": landmarks, "part": part, "show": show}
         refuse_idle(
@@ -119,7 +120,7 @@ def retarget(
             accept_poor=accept_poor,
         )
         written = write_animations(output, [own], ExportOptions(), into=target_mesh, own_shapes=True)
-        tell(*written, *([] if quiet else [driven]))
+        tell(*written, *([] if quiet else driven))
         return
     if pick:
         pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
@@ -136,7 +137,7 @@ def retarget(
     made, found = transfer(own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge)
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
     if own_shapes:
-        notes.append(driven)
+        notes += driven
     elif dressed and not add_to_mesh:
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
         notes += unused_shapes(target_mesh)

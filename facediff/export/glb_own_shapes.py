@@ -88,6 +88,14 @@ class OwnShapes:
             f"and gaze: {bones or 'none'}"
         )
 
+    def left_out(self, animation: Animation) -> list[str]:
+        """A sentence for an animation whose head moves, where no bone turns the head."""
+        if animation.head is None or not {"head", "neck"}.isdisjoint(self.bones):
+            return []
+        return [
+            "note: the head's motion is left out, since there is no bone for it; call one Head or Neck, with any prefix"
+        ]
+
 
 def own_shapes(target: Path) -> OwnShapes:
     """The shapes and bones of an avatar by their names.
