@@ -134,7 +134,9 @@ def retarget(
         if not accept_poor:
             refuse_poor(target_mesh, reports[-1])
 
-    made, found = transfer(own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge)
+    made, found = transfer(
+        own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge, whole_head=own_shapes
+    )
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
     if own_shapes:
         notes += driven

@@ -480,7 +480,8 @@ class AnimationPipeline(ABC):
         target = Path(self.options.target_mesh)
         file = None if self.options.correspondence is None else Path(self.options.correspondence)
         if self._correspondence is not None:
-            return upright(carry(animation, self._correspondence, read_mesh(target)), self._correspondence)
+            carried = carry(animation, self._correspondence, read_mesh(target), self.options.own_shapes)
+            return upright(carried, self._correspondence)
 
         def judge(retargeted: Animation, fit: Correspondence, report: FitReport) -> None:
             refuse_poor(target, report)
@@ -488,7 +489,9 @@ class AnimationPipeline(ABC):
 
         # All samples have one face, so that one correspondence serves all.
         is_known = file is not None and file.exists()
-        retargeted, self._correspondence = retarget(animation, target, file, judge=None if is_known else judge)
+        retargeted, self._correspondence = retarget(
+            animation, target, file, judge=None if is_known else judge, whole_head=self.options.own_shapes
+        )
         return retargeted
 
     def _acting_seed(self, seed: int) -> int:
