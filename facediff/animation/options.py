@@ -284,7 +284,7 @@ class ExportOptions(CheckedOptions):
 
     Attributes:
         output_unit: unit of length of the file: m, cm, mm, in, or a number of metres (default: the motion's own)
-        up: axis that points up in the file (default: y)
+        up: axis that points up in the file (default: y, or z if a target mesh has it up)
         no_speech: omit the sound
         shapes: for .csv and .glb: folder of meshes, .glb with targets, or "puppet" (built in)
         tracks: for .csv: arkit, or oculus (15 visemes) or vrm (vowels and blinks) as a plain table

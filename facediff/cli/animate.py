@@ -174,6 +174,9 @@ def animate(
 
         mesh = Path(options.target_mesh)
         tell(*pipeline.target_notes, *surface_notes(mesh, output, animation))
-        if output.suffix in (".glb", ".fbx"):
-            tell(*([own_shapes(mesh).summary] if options.own_shapes else unused_shapes(mesh)))
+        if options.own_shapes:
+            avatar = own_shapes(mesh)
+            tell(avatar.summary, *avatar.left_out(animation))
+        elif output.suffix in (".glb", ".fbx"):
+            tell(*unused_shapes(mesh))
     return 0

@@ -94,6 +94,7 @@ def retarget(
 
     from facediff.editing.blendshapes import has_arkit_weights
     from facediff.editing.fit_check import refuse_poor
+    from facediff.editing.retargeting import has_z_up
     from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.glb_own_shapes import own_shapes as own_shapes_of
@@ -107,8 +108,9 @@ def retarget(
     dressed = add_to_mesh or (not bare_face and output.suffix in (".glb", ".fbx") and wears_more(target_mesh))
     if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
-    driven = own_shapes_of(target_mesh).summary if own_shapes else ""
+    avatar = own_shapes_of(target_mesh) if own_shapes else None
     own = SourceReader(source).read(animation)
+    driven = [] if avatar is None else [avatar.summary, *avatar.left_out(own)]
     if own_shapes and has_arkit_weights(own):
         idle = {"correspondence": correspondence, "landmarks": landmarks, "part": part, "show": show}
         refuse_idle(
@@ -118,7 +120,7 @@ def retarget(
             accept_poor=accept_poor,
         )
         written = write_animations(output, [own], ExportOptions(), into=target_mesh, own_shapes=True)
-        tell(*written, *([] if quiet else [driven]))
+        tell(*written, *([] if quiet else driven))
         return
     if pick:
         pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
@@ -132,19 +134,21 @@ def retarget(
         if not accept_poor:
             refuse_poor(target_mesh, reports[-1])
 
-    made, found = transfer(own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge)
+    made, found = transfer(
+        own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge, whole_head=own_shapes
+    )
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
     if own_shapes:
-        notes.append(driven)
+        notes += driven
     elif dressed and not add_to_mesh:
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
         notes += unused_shapes(target_mesh)
     notes += surface_notes(target_mesh, output, made)
     into = target_mesh if dressed or own_shapes or has_uvs(target_mesh) else None
-    written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes)
+    written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes, z_up=has_z_up(found))
     if show is not None:
         written.append(show)
-    lines = [*remarks(own, made, found, reports[-1]), *notes]
+    lines = [*remarks(own, made, found, reports[-1]), *axes_notes(found, output, dressed or own_shapes), *notes]
     tell(*written, *(line for line in lines if not quiet or line.startswith("WARNING")))
 
 
@@ -214,10 +218,18 @@ def pick_on_page(
 
 
 def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
-    """What of an .obj's texture coordinates and materials a file does not get, a sentence each."""
+    """What of a mesh's texture coordinates and materials a file does not get, a sentence each."""
     from facediff.export import FORMATS
+    from facediff.mesh.glb import open_glb
     from facediff.mesh.obj_surface import has_uvs, read_surface
 
+    if mesh.suffix.lower() == ".glb" and output.suffix not in (".glb", ".fbx", ".npy"):
+        glb = open_glb(mesh)
+        if not glb.entries("materials"):
+            return []
+        lost = "materials, pictures and parts" if glb.entries("images") else "materials and parts"
+        shown = "" if made.colours is None else "the colours of materials are kept as those of vertices, and "
+        return [f"of {mesh.name}, {shown}{lost} are left out; write .glb to keep them"]
     if not has_uvs(mesh):
         return []
     if output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses:
@@ -246,6 +258,19 @@ def remarks(animation: Animation, made: Animation, found: Correspondence, report
     lines.append(report.summary)
     lines += [f"WARNING: {fault}" for fault in report.faults]
     lines += [f"note: {remark}" for remark in report.remarks]
-    if found.similarity.rotation[1, 1] < TURNED:
-        lines.append("the target mesh is turned against the animation, whose y axis points up; so is what is written")
     return lines
+
+
+def axes_notes(fit: Correspondence, output: Path, copied: bool) -> list[str]:
+    """How the target mesh is turned, and how what is written; ``copied`` if that is a copy of the mesh's own file."""
+    from facediff.editing.retargeting import has_z_up
+    from facediff.export import FORMATS
+
+    if has_z_up(fit) and not copied:
+        form = FORMATS.get(output.suffix)
+        if form is not None and "z" in form.up_axes:
+            return ["the target mesh has z up, and so has what is written"]
+        return ["the target mesh has z up and is turned: what is written has y up"]
+    if fit.similarity.rotation[1, 1] < TURNED:
+        return ["the target mesh is turned against the animation, whose y axis points up; so is what is written"]
+    return []

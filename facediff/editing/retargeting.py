@@ -44,6 +44,9 @@ from facediff.utils.limits import check_format
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
 SAME_UNIT = 1.4  # Named units lie further apart than this factor, and heads differ by less
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns an animation as ``export --up z`` does."""
+TILT = np.deg2rad(20.0)  # A mesh whose rotation differs by less from that one has z up
 
 
 def retarget(
@@ -54,8 +57,9 @@ def retarget(
     *,
     parts: Sequence[str] = (),
     judge: Callable[[Animation, Correspondence, FitReport], object] | None = None,
+    whole_head: bool = False,
 ) -> tuple[Animation, Correspondence]:
-    """An animation on the mesh in a file, and the correspondence between both meshes.
+    """An animation on the mesh in a file, and the correspondence between both meshes; :func:`upright` if z is up in it.
 
     Args:
         animation: with triangles.
@@ -64,19 +68,20 @@ def retarget(
         landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
         parts: names of the parts of the file that show the face, see :func:`facediff.mesh.parts.named_triangles`; it is
             searched for in all of them if there are none.
-        judge: called with the result and what was measured of it, before a new correspondence is written; raises where
-            it should not be. Where it raises and both meshes are of known topologies, their named landmarks are tried.
-            Nothing is measured if None.
+        judge: called with the result in the mesh's own axes and what was measured of it, before a new correspondence is
+            written; raises where it should not be. Where it raises and both meshes are of known topologies, their named
+            landmarks are tried. Nothing is measured if None.
+        whole_head: as of :func:`carry`.
     """
     triangles = animation.triangles  # refuses an animation without triangles before the other mesh is read
     mesh = read_mesh(mesh_path)
 
     def judged(correspondence: Correspondence) -> tuple[Animation, Correspondence]:
         if judge is None:
-            return carry(animation, correspondence, mesh), correspondence
-        carried, correspondence, report = carry_checked(animation, correspondence, mesh)
+            return upright(carry(animation, correspondence, mesh, whole_head), correspondence), correspondence
+        carried, correspondence, report = carry_checked(animation, correspondence, mesh, whole_head)
         judge(carried, correspondence, report)
-        return carried, correspondence
+        return upright(carried, correspondence), correspondence
 
     if correspondence_path is not None and correspondence_path.exists():
         if landmarks_path is not None:
@@ -138,6 +143,28 @@ def retarget(
     return carried, correspondence
 
 
+def has_z_up(correspondence: Correspondence) -> bool:
+    """Whether z points up in the target's file, and its face looks along −y, as Blender and 3ds Max write meshes."""
+    cosine = (np.trace(Z_UP.T @ correspondence.similarity.rotation) - 1) / 2
+    return bool(cosine > np.cos(TILT))
+
+
+def upright(carried: Animation, correspondence: Correspondence) -> Animation:
+    """An animation on a target mesh with y up, as animations have it, where the mesh has z up; else the same."""
+    return turned(carried, Z_UP.T) if has_z_up(correspondence) else carried
+
+
+def turned(animation: Animation, rotation: Array) -> Animation:
+    """An animation in other axes: all points rotated (3, 3) about the origin, and the head's motion with them."""
+    by, head = rotation.T.astype(np.float32), animation.head
+    return replace(
+        animation,
+        vertices=animation.vertices @ by,
+        template=animation.template @ by,
+        head=None if head is None else np.concatenate([head[:, :3] @ rotation.T, head[:, 3:] @ rotation.T], axis=1),
+    )
+
+
 MOST_PARTS, LEAST_PART = 6, 60  # So many of the largest parts are looked at, and triangles that a face has at least
 
 
@@ -163,21 +190,21 @@ def parts_with_a_face(animation: Animation, path: Path, mesh: Mesh) -> list[str]
 
 
 def carry_checked(
-    animation: Animation, correspondence: Correspondence, target: Mesh
+    animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False
 ) -> tuple[Animation, Correspondence, FitReport]:
     """The motion of an animation on a target mesh, the correspondence that carried it, and what was measured of it.
 
     Where a result is poor, its eyes are carried another way: lids go the share of their own opening, if they did not
     yet, and else stay at rest. That result counts if nothing else is wrong.
     """
-    carried = carry(animation, correspondence, target)
+    carried = carry(animation, correspondence, target, whole_head)
     report = check_fit(animation, carried, correspondence)
     faults = report.faults
     for lids in (LIDS_FITTED, LIDS_AT_REST):
         if report.good or report.eyes is None or correspondence.lids >= lids:
             continue
         other = replace(correspondence, lids=lids)
-        moved = carry(animation, other, target)
+        moved = carry(animation, other, target, whole_head)
         again = check_fit(animation, moved, other)
         if again.good:
             why = [f"lids in motion were worse: {faults[0]}"] if lids == LIDS_AT_REST else []
@@ -185,10 +212,17 @@ def carry_checked(
     return carried, correspondence, report
 
 
-def carry(animation: Animation, correspondence: Correspondence, target: Mesh) -> Animation:
+def carry(animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False) -> Animation:
     """The motion of an animation of the correspondence's source mesh, of any identity, on its target mesh.
 
     The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is.
+
+    Args:
+        animation: of any identity.
+        correspondence: between both meshes.
+        target: the mesh.
+        whole_head: whether all of a figure moves as its head does, so that the motion of the head can be taken off
+            again, as weights of shapes need it; else its body stands still.
 
     Raises:
         FaceDiffError: if one of the meshes is not the correspondence's, or has its vertices in another order, or a
@@ -215,7 +249,7 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh) ->
         vertices[some] = rest + carry_displacements(
             correspondence, np.asarray(animation.vertices[some], np.float64) - neutral
         )
-    head = None if head is None else _carried_head(vertices, rest, head, correspondence)
+    head = None if head is None else _carried_head(vertices, rest, head, correspondence, whole_head)
     return Animation(
         name=animation.name,
         vertices=vertices,
@@ -240,7 +274,7 @@ NECK = 0.5  # Below a head, its motion as a whole fades over this share of the s
 
 
 def _carried_head(
-    vertices: npt.NDArray[np.float32], rest: Array, head: Array, correspondence: Correspondence
+    vertices: npt.NDArray[np.float32], rest: Array, head: Array, correspondence: Correspondence, whole: bool
 ) -> Array | None:
     """Move vertices (T, V, 3) as a head does, eyes and hair included; the motion (T, 6), if all of them move so."""
     own = correspondence.similarity
@@ -251,7 +285,9 @@ def _carried_head(
     low, high = correspondence.source_vertices[:, 1].min(), correspondence.source_vertices[:, 1].max()
     # A figure's head turns on its neck: below the source's lowest vertex the turn fades, and its feet stay put.
     share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
-    whole = bool((share > 0.999).all())  # carried back, the lowest vertex may lie a rounding below its own height
+    whole = whole or bool(
+        (share > 0.999).all()
+    )  # carried back, the lowest vertex may lie a rounding below its own height
     for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
         if motion.any():
             moved = frame @ matrix.T + shift

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.editing.retargeting import Z_UP, turned
 from facediff.errors import FaceDiffError
 from facediff.export.glb import Morphs, compress, normal_shapes
 from facediff.export.glb_writer import ARRAY_BUFFER, GlbWriter
@@ -42,7 +43,7 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
     """
     try:
         glb, writer = open_to_add(target)
-        parts = parts_of(glb, animation)
+        parts, animation = parts_of(glb, animation)
         _animate(glb, writer, parts, animation, tolerance_mm / 1000 / metres_per_unit(animation.unit))
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again") from error
@@ -57,8 +58,8 @@ def open_to_add(target: Path) -> tuple[Glb, GlbWriter]:
     return glb, GlbWriter(glb.content, glb.binary)
 
 
-def parts_of(glb: Glb, animation: Animation) -> list[Placed]:
-    """The placed parts of a .glb that an animation was carried to.
+def parts_of(glb: Glb, animation: Animation) -> tuple[list[Placed], Animation]:
+    """The placed parts of a .glb that an animation was carried to, and the animation in the axes of the file.
 
     Raises:
         FaceDiffError: if the animation has another number of vertices.
@@ -70,7 +71,10 @@ def parts_of(glb: Glb, animation: Animation) -> list[Placed]:
             f"{glb.source}: has {total} vertices and the animation {len(animation.template)}; give the file that the "
             f"animation was carried to"
         )
-    return parts
+    rest = np.asarray(animation.template, np.float64)
+    shown = np.concatenate([part.points for part in parts])
+    is_upright = np.linalg.norm(shown - rest @ Z_UP.T) < np.linalg.norm(shown - rest)  # of a file that has z up
+    return parts, turned(animation, Z_UP) if is_upright else animation
 
 
 def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animation, tolerance: float) -> None:

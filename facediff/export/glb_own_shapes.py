@@ -88,6 +88,14 @@ class OwnShapes:
             f"and gaze: {bones or 'none'}"
         )
 
+    def left_out(self, animation: Animation) -> list[str]:
+        """A sentence for an animation whose head moves, where no bone turns the head."""
+        if animation.head is None or not {"head", "neck"}.isdisjoint(self.bones):
+            return []
+        return [
+            "note: the head's motion is left out, since there is no bone for it; call one Head or Neck, with any prefix"
+        ]
+
 
 def own_shapes(target: Path) -> OwnShapes:
     """The shapes and bones of an avatar by their names.
@@ -236,7 +244,8 @@ def _bones(glb: Glb) -> dict[str, int]:
 
 def _solved(glb: Glb, own: OwnShapes, animation: Animation) -> Weights:
     """Weights of the avatar's own shapes that come nearest to an animation of its mesh."""
-    parts, total = parts_of(glb, animation), len(animation.template)
+    parts, animation = parts_of(glb, animation)
+    total = len(animation.template)
     check_array(glb.source, (2, len(own.binds), total, 3), 8)
     deltas, first = np.zeros((len(own.binds), total, 3)), 0
     for part in parts:

@@ -49,6 +49,7 @@ def write_animations(
     *,
     into: Path | None = None,
     own_shapes: bool = False,
+    z_up: bool = False,
 ) -> list[Path]:
     """Write animations in the format that the suffix chooses; either all files appear, each complete, or none.
 
@@ -61,6 +62,8 @@ def write_animations(
         into: the file of the animations' mesh: to the copy of a .glb each animation is added, and of an .obj the
             texture coordinates and materials are written where the format has them; surfaces alone are written if None.
         own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
+        z_up: whether z points up in that file. Formats that hold either axis then have z up too, unless the options
+            choose one, so that what is written fits the file.
 
     Returns:
         The written files and folders: first the animations, then what was written next to them.
@@ -84,6 +87,8 @@ def write_animations(
             written += write_fbx(name, animation, sound, glb)
         return written
     form = FORMATS[path.suffix]
+    if z_up and options.up is None and "z" in form.up_axes:
+        options = replace(options, up="z")
     if into is not None and into.suffix.lower() == ".obj":
         if "surface" in form.uses and options.surface is None and has_uvs(into):
             options = replace(options, surface=into)

@@ -20,6 +20,8 @@ from facediff.utils.limits import LIMITS
 ALIKE = 1e-5
 """Matrices of a skin that differ by less than this share are one: it is in the pose that it was bound in."""
 JOINTS, WEIGHTS = ("u1", "u2"), ("f4", "u1", "u2")
+PLAIN = np.array([230, 190, 168], np.uint8)
+"""Colour (sRGB) of parts that have theirs in a picture or none, as of a face without colours in videos."""
 MOST_SETS = 8  # of four joints a vertex
 
 
@@ -32,6 +34,7 @@ class Placed:
         node: number of the node; -1 in a file without nodes.
         primitive: its description in the file, which may be changed.
         names: those of the node, the mesh and the material, where they have one.
+        material: its description in the file; empty if there is none.
         local: (V, 3) vertices as the file has them.
         matrix: (4, 4) or (V, 4, 4) what places them; None if they stay.
         faces: (F, 3) triangles, counter-clockwise seen from outside once they are placed.
@@ -41,6 +44,7 @@ class Placed:
     node: int
     primitive: dict[str, Any]
     names: tuple[str, ...]
+    material: dict[str, Any]
     local: Array
     matrix: Array | None
     faces: npt.NDArray[np.int64]
@@ -100,11 +104,11 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
             # A scale below zero turns a mesh inside out; its triangles are turned round so that they face outwards
             # again. A skin has a matrix per vertex, of which the mean decides.
             mirrored = matrix is not None and np.linalg.det(matrix[..., :3, :3].reshape(-1, 3, 3).mean(axis=0)) < 0
-            material = primitive.get("material")
-            holders = [entry, glb.entry("meshes", mesh)]
-            holders += [materials[material]] if type(material) is int and 0 <= material < len(materials) else []
+            index = primitive.get("material")
+            material = materials[index] if type(index) is int and 0 <= index < len(materials) else {}
+            holders = (entry, glb.entry("meshes", mesh), material)
             names = tuple(dict.fromkeys(n for holder in holders if isinstance(n := holder.get("name"), str) and n))
-            yield Placed(mesh, node, primitive, names, local, matrix, faces[:, ::-1] if mirrored else faces)
+            yield Placed(mesh, node, primitive, names, material, local, matrix, faces[:, ::-1] if mirrored else faces)
 
 
 def read_glb(data: bytes, source: object) -> Mesh:
@@ -121,15 +125,29 @@ def read_glb(data: bytes, source: object) -> Mesh:
         faces.append(part.faces + before)
         colours.append(_colours(glb, part))
         before += len(part.local)
-    coloured = bool(colours) and all(colour is not None for colour in colours)
-    return Mesh(
-        np.concatenate(points), np.concatenate(faces).astype(np.int32), np.concatenate(colours) if coloured else None
-    )
+    vertices, triangles = np.concatenate(points), np.concatenate(faces).astype(np.int32)
+    if all(colour is None for colour in colours):
+        return Mesh(vertices, triangles)
+    shown = [
+        np.broadcast_to(PLAIN if colour is None else colour, one.shape)
+        for colour, one in zip(colours, points[1:], strict=True)
+    ]
+    return Mesh(vertices, triangles, np.concatenate(shown))
 
 
-def _colours(glb: Glb, part: Placed) -> Any:  # noqa: ANN401 - bytes (V, 3), or None
+def _colours(glb: Glb, part: Placed) -> Any:  # noqa: ANN401 - sRGB bytes (V, 3) or (3,), or None
+    if "material" in part.primitive:  # it tints the colours of vertices, which then are not the face's
+        look = part.material.get("pbrMetallicRoughness")
+        factor = look.get("baseColorFactor") if isinstance(look, dict) and "baseColorTexture" not in look else None
+        if not isinstance(factor, list) or len(factor) != 4:
+            return None
+        if not all(type(value) in (int, float) and 0 <= value <= 1 for value in factor):
+            return None
+        linear = np.array(factor[:3], np.float64)
+        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        return np.rint(255 * srgb).astype(np.uint8)
     color = attributes(part.primitive).get("COLOR_0")
-    if color is None or "material" in part.primitive:  # a material tints the colours, which then are not the face's
+    if color is None:
         return None
     form = "VEC4" if glb.entry("accessors", color).get("type") == "VEC4" else "VEC3"
     values = glb.numbers(color, form, ("f4", "u1", "u2"), len(part.local))[:, :3]

@@ -63,7 +63,9 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
 def _of_mesh(glb: Glb, index: int) -> Targets:
     """The targets of one mesh, its primitives one after the other, as they are stored: no node acts on them."""
     parts = [
-        Placed(index, -1, primitive, (), local := glb.positions(primitive), None, glb.triangles(primitive, len(local)))
+        Placed(
+            index, -1, primitive, (), {}, local := glb.positions(primitive), None, glb.triangles(primitive, len(local))
+        )
         for primitive in glb.primitives(index)
     ]
     count = len(glb.entries("targets", parts[0].primitive))

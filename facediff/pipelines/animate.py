@@ -269,6 +269,7 @@ class AnimationPipeline(ABC):
         Returns:
             the files, and the first animation.
         """
+        from facediff.editing.retargeting import has_z_up
         from facediff.export import write_animations
 
         # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates of an .obj.
@@ -279,7 +280,11 @@ class AnimationPipeline(ABC):
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
         with self.animations(speech, name, output, seed=seed) as animations:
-            return write_animations(output, animations, export, into=into, own_shapes=own_shapes), animations[0]
+            z_up = self._correspondence is not None and has_z_up(self._correspondence)
+            return (
+                write_animations(output, animations, export, into=into, own_shapes=own_shapes, z_up=z_up),
+                animations[0],
+            )
 
     @cached_property
     def _target_beyond_surface(self) -> tuple[bool, bool]:
@@ -469,13 +474,14 @@ class AnimationPipeline(ABC):
         if self.options.target_mesh is None or (self.options.own_shapes and has_arkit_weights(animation)):
             return animation
         from facediff.editing.fit_check import FitReport, refuse_poor
-        from facediff.editing.retargeting import carry, retarget
+        from facediff.editing.retargeting import carry, retarget, upright
         from facediff.mesh import read_mesh
 
         target = Path(self.options.target_mesh)
         file = None if self.options.correspondence is None else Path(self.options.correspondence)
         if self._correspondence is not None:
-            return carry(animation, self._correspondence, read_mesh(target))
+            carried = carry(animation, self._correspondence, read_mesh(target), self.options.own_shapes)
+            return upright(carried, self._correspondence)
 
         def judge(retargeted: Animation, fit: Correspondence, report: FitReport) -> None:
             refuse_poor(target, report)
@@ -483,7 +489,9 @@ class AnimationPipeline(ABC):
 
         # All samples have one face, so that one correspondence serves all.
         is_known = file is not None and file.exists()
-        retargeted, self._correspondence = retarget(animation, target, file, judge=None if is_known else judge)
+        retargeted, self._correspondence = retarget(
+            animation, target, file, judge=None if is_known else judge, whole_head=self.options.own_shapes
+        )
         return retargeted
 
     def _acting_seed(self, seed: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
+from facediff.editing.procedural import move_head
 from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.export.glb_own_shapes import drive_avatar, own_shapes
@@ -316,6 +318,28 @@ def posed_at_rest(path: Path) -> dict[str, np.ndarray]:
     return {glb.content["nodes"][part.node]["name"]: part.points for part in placed_parts(glb)}
 
 
+def test_a_figures_head_turns_by_its_bone_where_shapes_are_solved_for(
+    tmp_path: Path, parts: dict[str, AvatarPart]
+) -> None:
+    """The body, which has no shape that sways, would else take the weights with it."""
+    write_avatar(tmp_path / "avatar.glb", parts)
+    rest, opening = parts["Head"].vertices - [0, 1.6, 0], np.clip(np.sin(np.arange(FRAMES) / 5), 0, 0.8)
+    vertices = rest + opening[:, None, None] * parts["Head"].targets["jawOpen"]
+    talk = Animation("talk", vertices.astype("f4"), rest.astype("f4"), 25.0, faces=parts["Head"].faces.astype("i4"))
+    turns = 0.1 * np.sin(np.outer(np.arange(FRAMES) / 5, [1, 2, 1]))
+    rows = []
+    for shown in (talk, move_head(talk, turns, 0.02 * turns)):
+        write_archive(tmp_path / "talk.npz", shown)
+        words = ["--target-mesh", str(tmp_path / "avatar.glb"), "--correspondence", str(tmp_path / "map.npz")]
+        words += ["--own-shapes", "--accept-poor", "-o", str(tmp_path / "out.glb")]
+        assert main(["retarget", str(tmp_path / "talk.npz"), *words]) == 0
+        rows.append((moving := tracks(opened(tmp_path / "out.glb")))["Head", "weights"])
+    assert ("HeadJoint", "rotation") in moving
+    jaw = rows[0][:, list(parts["Head"].targets).index("jawOpen")]
+    assert np.abs(jaw - opening).max() < 0.15
+    assert np.abs(rows[1] - rows[0]).max() < 1e-3
+
+
 def test_the_command_says_what_plays_and_what_has_no_effect(
     tmp_path: Path, parts: dict[str, AvatarPart], spoken: Animation, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -323,7 +347,9 @@ def test_the_command_says_what_plays_and_what_has_no_effect(
     write_archive(tmp_path / "talk.npz", spoken)
     words = ["retarget", str(tmp_path / "talk.npz"), "--target-mesh", str(tmp_path / "avatar.glb"), "--own-shapes"]
     assert main([*words, "-o", str(tmp_path / "out.glb")]) == 0
-    assert "HeadJoint" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "HeadJoint" in said
+    assert "left out" not in said
     assert main([*words, "-o", str(tmp_path / "out.glb"), "--quiet"]) == 0
     assert capsys.readouterr().out.split() == [str(tmp_path / "out.glb")]
     for more, option in (
@@ -334,6 +360,14 @@ def test_the_command_says_what_plays_and_what_has_no_effect(
         assert main([*words, "-o", str(tmp_path / "b.glb"), *more]) == 2
         assert option in capsys.readouterr().err
     assert main([*words, "-o", str(tmp_path / "b.npz")]) == 2
+    glb = opened(tmp_path / "avatar.glb")
+    next(node for node in glb.content["nodes"] if node["name"] == "HeadJoint")["name"] = "Crown"
+    (tmp_path / "boneless.glb").write_bytes(pack(glb.content, glb.binary))
+    for head, lost in ((spoken.head, True), (None, False)):
+        still = replace(spoken, head=head).made_of(spoken.space, np.asarray(spoken.values))
+        write_archive(tmp_path / "talk.npz", still)
+        assert main([*words[:3], str(tmp_path / "boneless.glb"), words[4], "-o", str(tmp_path / "c.glb")]) == 0
+        assert ("head's motion is left out" in capsys.readouterr().out) == lost
     write_avatar(tmp_path / "mute.glb", parts, names={name: f"x{k}" for k, name in enumerate(ALPHABETICAL)})
     words[3] = str(tmp_path / "mute.glb")
     assert main([*words, "-o", str(tmp_path / "b.glb")]) == 2

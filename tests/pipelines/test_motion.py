@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 import facediff
 from facediff.cli.app import main
@@ -161,6 +162,24 @@ def test_other_meshes_and_weights_are_those_of_the_commands(model: facediff.Anim
     np.testing.assert_array_equal(made.vertices, facediff.read("command.npz").vertices)
     carried = model.animate("speech.wav", identity="F1", target_mesh="face.ply", correspondence="map.npz")
     np.testing.assert_array_equal(made.vertices, carried.vertices)
+    face = trimesh.load("face.ply", process=False)
+    face.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])).export("z_up.ply")
+    upright = model.animate("speech.wav", identity="F1", target_mesh="z_up.ply")
+    assert np.abs(upright.vertices - carried.vertices).max() < 1e-5
+    words = [
+        "animate",
+        "speech.wav",
+        "--checkpoint",
+        "demo/puppet.ckpt",
+        "--identity",
+        "F1",
+        "--target-mesh",
+        "z_up.ply",
+    ]
+    command(*words, "-o", "own.pc2")
+    assert " z up" in Path("own.obj").read_text().splitlines()[0], "a point cache fits its mesh"
+    command(*words, "-o", "turned.pc2", "--up", "y")
+    assert " y up" in Path("turned.obj").read_text().splitlines()[0]
     words = ["--shapes", "shapes", "--only-arkit", "--smoothness", 0.1, "--residual-limit", 1]
     command("blendshapes", "a.npz", "-o", "command.csv", *words)
     weights = anim.blendshapes("shapes", only_arkit=True, smoothness=0.1, residual_limit=1)
