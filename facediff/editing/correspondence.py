@@ -16,7 +16,7 @@ import numpy.typing as npt
 from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
 from facediff.editing.lids import EyeLids, eye_lids
-from facediff.editing.loose_pieces import loose_pieces
+from facediff.editing.loose_pieces import lash_pieces, loose_pieces
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
@@ -381,6 +381,9 @@ def partners(source: Surface, laid: Surface, features: tuple[Features, Features]
         ]
         cost[is_skin[1]] = 1e6
         cost[:, is_skin[0]] = 1e6
+        # Lashes go with the lids that they grow from, which are not the partner's.
+        own = [np.flatnonzero(labels[1] == name) for name in others]
+        cost[lash_pieces(laid.vertices, own, features[1])] = 1e6
         rest = Surface(source.vertices, source.faces[features[0].skin[source.faces[:, 0]]])
     # Every piece may also stay without a partner, which costs as much as a partner at the limit.
     cost = np.concatenate([cost, np.ones((len(goals),) * 2)], axis=1)

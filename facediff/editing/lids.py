@@ -210,7 +210,7 @@ def lid_edges(vertices: Array, features: Features, eye: int) -> LidEdges | None:
         # Seeds are the corners of the triangles along the edge: those that are nearest to it somewhere are the rim.
         away = np.linalg.norm(vertices[own][None] - curve[:, None], axis=2)
         rim = own[np.unique(away.argmin(axis=1))]
-        place = _along(vertices[rim], curve)[0]
+        place = along(vertices[rim], curve)[0]
         inner = (place > 1.0) & (place < SAMPLES - 2.0)
         # Both lids end in the corners, which belong to neither.
         ends = [np.flatnonzero(features.skin)[_nearest(vertices[features.skin], curve[end])] for end in (0, -1)]
@@ -235,8 +235,8 @@ def evened(values: Array, samples: float, axis: int = 0) -> Array:
     return np.asarray(gaussian_filter1d(values, samples, axis=axis, mode="nearest"))
 
 
-def _along(points: Array, curve: Array) -> tuple[Array, Array]:
-    """Places (N,) of points along a curve (SAMPLES, 3), from 0 to SAMPLES - 1, and their distances (N,) from it."""
+def along(points: Array, curve: Array) -> tuple[Array, Array]:
+    """Places (N,) of points along a curve (K, 3), from 0 to K - 1, and their distances (N,) from it."""
     first, way = curve[:-1], np.diff(curve, axis=0)
     square = np.maximum(np.square(way).sum(axis=1), 1e-24)
     part = np.clip(((points[:, None] - first) * way).sum(axis=2) / square, 0.0, 1.0)
@@ -258,7 +258,7 @@ def _field(vertices: Array, features: Features, eye: int, edges: LidEdges, most:
     near = features.skin & (vertices >= both.min(axis=0) - reach).all(axis=1)
     near &= (vertices <= both.max(axis=0) + reach).all(axis=1)
     some = np.flatnonzero(near)
-    (above, up), (below, down) = (_along(vertices[some], curve) for curve in (opening.upper, opening.lower))
+    (above, up), (below, down) = (along(vertices[some], curve) for curve in (opening.upper, opening.lower))
     codes = features.codes[some]
     upper = np.where(codes == LIDS[eye][0], 1.0, np.where(codes == LIDS[eye][1], 0.0, np.nan))
     # Beyond the corners a vertex belongs to both lids, to the nearer one more.
@@ -367,28 +367,35 @@ def with_lids(lids: list[EyeLids], vertices: Array, displacements: Array, edges:
             displacements[:, some, 2] += np.where(np.isfinite(into), np.maximum(into, 0.0), 0.0)
 
 
-def swing(lids: list[EyeLids], vertices: Array, lashes: Indices, roots: Indices, displacements: Array) -> Array:
+def swing(
+    lids: list[EyeLids], vertices: Array, lashes: Indices, roots: Indices, weights: Array, displacements: Array
+) -> Array:
     """Displacements (T, A, 3) by which lashes turn about their roots with an upper lid, in the source's axes.
 
     A lid turns about the eyeball's centre, and what grows from its edge turns with it: lashes that were only shifted
-    would stick out of a shut eye.
+    would stick out of a shut eye. The plate in a lid is stiff, so that all of it turns as its middle does, also near
+    the corners, where the edge hardly moves.
 
     Args:
         lids: of both eyes.
         vertices: (Vt, 3) of the target at rest.
         lashes: (A,) vertices of lashes.
-        roots: (A,) the vertices at the edges of the lids that they move with.
+        roots: (A, 3) the vertices at the edges of the lids between which they grow.
+        weights: (A, 3) of the roots.
         displacements: (T, Vt, 3) of the target's vertices.
     """
     turned = np.zeros((len(displacements), len(lashes), 3))
+    arms = vertices[lashes] - np.einsum("ak,akd->ad", weights, vertices[roots])
     for eye in lids:
         if eye.target is None:
             continue
         field = eye.target_field
-        some = np.flatnonzero(np.isin(roots, field.vertices[field.upper == 1.0]))
-        down = -displacements[:, roots[some]] @ field.axes[1]
-        angle = np.clip(down / (RADIUS * eye.target.opening.width), *SWING)
-        _, up, forwards = ((vertices[lashes[some]] - vertices[roots[some]]) @ field.axes.T).T
+        # Both edges end in the corners, which belong to neither lid.
+        upper = np.setdiff1d(field.vertices[field.upper == 1.0], eye.target.rims[1])
+        some = np.flatnonzero(np.isin(roots, upper).any(axis=1))
+        down = -eye.target.displacements(displacements)[:, 0, SAMPLES // 2, 1]
+        angle = np.clip(down / (RADIUS * eye.target.opening.width), *SWING)[:, None]
+        _, up, forwards = (arms[some] @ field.axes.T).T
         sine, less = np.sin(angle), np.cos(angle) - 1.0
         turned[:, some] += (up * less - forwards * sine)[..., None] * field.axes[1]
         turned[:, some] += (up * sine + forwards * less)[..., None] * field.axes[2]

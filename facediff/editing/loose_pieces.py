@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.face_features import LIDS, Features
+from facediff.editing.face_features import Features, Opening
+from facediff.editing.lids import LidEdges, along, lid_edges
 from facediff.editing.surface import Nearest, Surface, nearest
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +25,10 @@ ABOUT, BEARD = 1.2, 0.1  # A large piece of which so much lies within so many wi
 BELOW = 0.5  # and its middle is no further above the mouth than this share of its width
 ON_SKIN = 0.08  # A piece no further from the skin than this share of the mouth's width lies on it; others are worn
 TOUCHES = 0.05  # What is nearer than this to a thing that is worn, and nearer than to the skin, belongs to it
-LASH, LASHES = 0.1, 1.5  # Lashes begin so near to a lid's edge, and are no wider, in widths of the eye
+BETWEEN = 0.6  # A piece of which more than this share is seen in an eye's opening belongs to the eyeball
+LASH, LASHES = 0.15, 1.5  # Lashes begin so near to a lid's edge, and are no wider, in widths of the eye
+ROOT, SINGLE = 0.3, 0.1  # A piece's root is so much of its way from the lid; narrower, in widths, it is a single lash
+RISES = 0.25  # A lash may lie so much of its rise further from its own lid than from the other one
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +92,8 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
     large = extent > LARGE * width
     lower = oral & (middle[:, 1] < _gap(middle[oral, 1], mouth[1], width))
     # What lies between the lids belongs to the eyeball: an iris, a cornea, a reflection.
-    between = mean(_between_lids(points, seen).astype(float)) > 0.6
-    lash = _lashes(points, starts, extent, seen) & ~oral & ~large & ~between
+    between = _between_lids(points, starts, seen)
+    lash = lash_pieces(laid.vertices, alone, seen) & ~oral & ~large
     still = ~lower & ~lash & (oral | inside | between | (large & ~about))
     # What else is there lies on the skin, or is worn in front of it.
     left = np.flatnonzero(~lower & ~lash & ~still)
@@ -118,56 +122,88 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
         followers = which[some][kept], on_skin.corners[kept], on_skin.weights[kept]
     else:
         followers = none
-    lashes = which[np.repeat(lash, counts)]
-    rims = _rim_vertices(laid.vertices, lashes, seen)
+    lashes = [some for some, is_lash in zip(alone, lash, strict=True) if is_lash]
+    rims = _rim_places(laid.vertices, lashes, seen)
     return Loose(
         which[np.repeat(lower, counts)],
         which[np.repeat(still, counts)],
         place,
-        np.concatenate([followers[0], lashes]),
-        np.concatenate([followers[1], np.repeat(rims[:, None], 3, axis=1)]),
-        np.concatenate([followers[2], np.tile([1.0, 0.0, 0.0], (len(lashes), 1))]),
+        np.concatenate([followers[0], *lashes]),
+        np.concatenate([followers[1], rims[0]]),
+        np.concatenate([followers[2], rims[1]]),
     )
 
 
-def _between_lids(points: Array, seen: Features) -> Mask:
-    """Which points (N, 3) are seen in an eye's opening."""
-    chosen = np.zeros(len(points), bool)
-    for eye in seen.eyes:
-        if eye is not None:
-            x, y = points[:, 0], points[:, 1]
-            top, bottom = (np.interp(x, side[:, 0], side[:, 1], -np.inf, -np.inf) for side in (eye.upper, eye.lower))
-            chosen |= (y < top) & (y > bottom)
-    return chosen
+def _between_lids(points: Array, starts: Indices, seen: Features) -> Mask:
+    """Which pieces (P,) of points (N, 3) are seen in an eye's opening; points at its edge, as roots are, say little."""
+    eyes, inside = [eye for eye in seen.eyes if eye is not None], np.zeros(len(points), bool)
+    x, y = points[:, 0], points[:, 1]
+    for eye in eyes:
+        top, bottom = (np.interp(x, side[:, 0], side[:, 1], -np.inf, -np.inf) for side in (eye.upper, eye.lower))
+        inside |= (y < top) & (y > bottom)
+    away = np.min([_from_edges(points, eye) for eye in eyes] or [np.zeros(len(points))], axis=0)
+    return np.asarray(np.add.reduceat(inside * away, starts) > BETWEEN * np.add.reduceat(away, starts))
 
 
-def _lashes(points: Array, starts: Indices, extent: Array, seen: Features) -> Mask:
-    """Which pieces begin at the edge of a lid."""
-    chosen = np.zeros(len(starts), bool)
-    for eye in seen.eyes:
-        if eye is not None:
-            edges = np.concatenate([eye.upper, eye.lower])
-            away = np.linalg.norm(points[:, None] - edges[None, ::2], axis=2).min(axis=1)
-            near = np.minimum.reduceat(away, starts) < LASH * eye.width
-            within = np.maximum.reduceat(away, starts) < 0.5 * eye.width
-            chosen |= near & within & (extent < LASHES * eye.width)
-    return chosen
-
-
-def _rim_vertices(vertices: Array, lashes: Indices, seen: Features) -> Indices:
-    """The vertex at the edge of a lid (A,) that each vertex of lashes moves with."""
+def _from_edges(points: Array, eye: Opening) -> Array:
+    """Distances (N,) of points (N, 3) from the nearer edge of an eye's lids."""
     from scipy.spatial import cKDTree
 
-    seeds = [
-        own[seen.codes[own] == code]
-        for eye, codes in zip(seen.eyes, LIDS, strict=True)
-        if eye is not None
-        for own, code in zip((eye.upper_seeds, eye.lower_seeds), codes, strict=True)
-    ]
-    if not len(lashes):
-        return lashes
-    rim = np.concatenate(seeds)
-    return np.asarray(rim[cKDTree(vertices[rim]).query(vertices[lashes])[1]])
+    return np.asarray(cKDTree(np.concatenate([eye.upper, eye.lower])).query(points)[0])
+
+
+def lash_pieces(vertices: Array, pieces: list[Indices], seen: Features) -> Mask:
+    """Which pieces of a mesh begin at the edge of a lid, and do not lie between both lids as an iris does.
+
+    Args:
+        vertices: (V, 3) of the mesh.
+        pieces: the vertices of each piece.
+        seen: openings of the mesh's face.
+    """
+    points, starts = vertices[np.concatenate(pieces)], np.cumsum([0, *(len(some) for some in pieces[:-1])])
+    extent = (np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)).max(axis=1)
+    chosen = np.zeros(len(pieces), bool)
+    for eye in _open_eyes(vertices, seen):
+        away, width = _from_edges(points, eye.opening), eye.opening.width
+        near = np.minimum.reduceat(away, starts) < LASH * width
+        chosen |= near & (np.maximum.reduceat(away, starts) < 0.5 * width) & (extent < LASHES * width)
+    return chosen & ~_between_lids(points, starts, seen)
+
+
+def _open_eyes(vertices: Array, seen: Features) -> list[LidEdges]:
+    return [edges for eye in (0, 1) if (edges := lid_edges(vertices, seen, eye)) is not None]
+
+
+def _rim_places(vertices: Array, lashes: list[Indices], seen: Features) -> tuple[Indices, Array]:
+    """The place on the edge of a lid that each vertex of lashes moves with, between two vertices of it.
+
+    All vertices of a single lash have one place, that of its root, so that it keeps its shape.
+
+    Args:
+        vertices: (V, 3) of the mesh.
+        lashes: the vertices of each piece, A in all.
+        seen: openings of the mesh's face.
+
+    Returns:
+        The two vertices, the second one twice, and their weights, both (A, 3).
+    """
+    corners, weights = [np.zeros((0, 3), np.int64)], [np.zeros((0, 3))]
+    rims = [(rim, SINGLE * eye.opening.width) for eye in _open_eyes(vertices, seen) for rim in eye.rims]
+    for some in lashes:
+        places, away = np.array([along(vertices[some], vertices[rim]) for rim, _ in rims]).transpose(1, 2, 0)
+        nearest_rim, nearest_own = away.argmin(axis=1), np.arange(len(some))
+        # Where both lids meet, a lash that rises is an upper one.
+        first, tip = away.min(axis=1).argsort()[[0, -1]]
+        rise = vertices[some[tip], 1] - vertices[some[first], 1]
+        lid = int((away.mean(axis=0) - np.tile([RISES * rise, -RISES * rise], len(rims) // 2)).argmin())
+        root = vertices[some[away[:, lid] <= away[:, lid].min() + ROOT * np.ptp(away[:, lid])]]
+        if np.ptp(root, axis=0).max() < rims[lid][1]:
+            nearest_rim[:], nearest_own[:] = lid, away[:, lid].argmin()
+        for rim, place in zip(nearest_rim, places[nearest_own, nearest_rim], strict=True):
+            low = min(int(place), len(rims[rim][0]) - 2)
+            corners.append(rims[rim][0][[[low, low + 1, low + 1]]])
+            weights.append(np.array([[low + 1.0 - place, place - low, 0.0]]))
+    return np.concatenate(corners), np.concatenate(weights)
 
 
 def _gap(heights: Array, line: float, width: float) -> float:

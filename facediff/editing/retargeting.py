@@ -332,12 +332,13 @@ def carry_displacements(correspondence: Correspondence, displacements: npt.NDArr
             "ak,takd->tad", correspondence.follower_weights, carried[:, correspondence.follower_corners]
         )
         carried[:, correspondence.followers] = with_skin
-        # Lashes hang on one vertex at the edge of a lid.
-        hangs = (correspondence.follower_corners == correspondence.follower_corners[:, :1]).all(axis=1)
+        # Lashes hang between two vertices at the edge of a lid.
+        hangs = correspondence.follower_corners[:, 1] == correspondence.follower_corners[:, 2]
         if lids is not None and hangs.any():
-            lashes, roots = correspondence.followers[hangs], correspondence.follower_corners[hangs, 0]
+            lashes = correspondence.followers[hangs]
+            roots = correspondence.follower_corners[hangs], correspondence.follower_weights[hangs]
             laid = carried @ np.linalg.inv(matrix).T
-            carried[:, lashes] += swing(lids, correspondence.laid.vertices, lashes, roots, laid) @ matrix.T
+            carried[:, lashes] += swing(lids, correspondence.laid.vertices, lashes, *roots, laid) @ matrix.T
     return carried
 
 

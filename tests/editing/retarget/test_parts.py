@@ -22,7 +22,7 @@ from facediff.mesh.glb_scene import placed_parts
 from facediff.mesh.parts import mesh_parts, named_triangles
 from tests.editing.retarget.test_avatar_round_trip import opened
 from tests.fakes.avatar import avatar_parts, write_avatar
-from tests.fakes.heads import joined, talking, turned
+from tests.fakes.heads import APART, BALLS, TILTED, coarser, joined, only, second, talking, talking_second, turned
 
 OBJ = """v 0 0 0
 v 1 0 0
@@ -159,6 +159,39 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     lash = np.isin(loose.followers, begins["lash"] + np.arange(8))
     assert np.isin(loose.follower_corners[lash], eye.upper_seeds).all()
     assert loose.follower_weights.sum(axis=1) == pytest.approx(1)
+    # Lashes that are one strip bend with the edge.
+    assert len(np.unique(loose.follower_corners[lash], axis=0)) > 1
+
+
+@pytest.mark.parametrize("second_edition", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_single_lashes_keep_their_shape_in_a_blink_and_turn_together(
+    second_edition: bool, animation: Animation
+) -> None:
+    """Whether or not the animation's face has lashes too, and on lids of few triangles."""
+    blinking = talking_second() if second_edition else animation
+    skin = coarser(*second(TILTED, *APART), 0.5)
+    head = joined(skin=skin, balls=only(TILTED, *BALLS), lashes=only(TILTED, "lash_"))
+    correspondence = correspond(blinking.template, blinking.triangles, head.vertices, head.faces)
+    retargeted = carry(blinking, correspondence, Mesh(head.vertices, head.faces.astype(np.int32)))
+    # A lash is a triangle whose first two corners, in the order of its vertices, are the root.
+    lashes = np.sort(np.unique(np.sort(head.faces[head.parts["lashes"]], axis=1), axis=0))
+    lashes = lashes[(np.diff(lashes, axis=1) > 0).all(axis=1)]
+    assert len(lashes) == 30
+    rest, shut = np.float64(retargeted.template)[lashes], np.float64(retargeted.vertices[9])[lashes]
+    edges = [np.linalg.norm(points - np.roll(points, 1, axis=1), axis=2) for points in (rest, shut)]
+    assert edges[1] == pytest.approx(edges[0], rel=0.02)
+    arms = [points[:, 2] - points[:, :2].mean(axis=1) for points in (rest, shut)]
+    one, two = (arm / np.linalg.norm(arm, axis=1, keepdims=True) for arm in arms)
+    turns = np.rad2deg(np.arccos(np.einsum("nd,nd->n", one, two)))
+    for side in (-1, 1):
+        some = np.flatnonzero(side * rest[:, 0, 0] > 0)
+        some = some[np.argsort(rest[some, 0, 0])]
+        # Where the lid turns by t, a lash at an angle to its axis goes 2 asin(sin(t / 2) sin(angle)). With sines that
+        # differ by up to 0.08 between neighbours and t up to 50 degrees, these differ by 0.08 * 2 tan(t / 2), 4.3
+        # degrees.
+        assert turns.max() < 50
+        assert turns[some].min() > 15
+        assert np.abs(np.diff(turns[some])).max() < 4.5
 
 
 @pytest.mark.parametrize("words", [["--part", "Head"], pytest.param([], marks=pytest.mark.slow)])
