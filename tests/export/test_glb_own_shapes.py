@@ -318,6 +318,7 @@ def posed_at_rest(path: Path) -> dict[str, np.ndarray]:
     return {glb.content["nodes"][part.node]["name"]: part.points for part in placed_parts(glb)}
 
 
+@pytest.mark.slow
 def test_a_figures_head_turns_by_its_bone_where_shapes_are_solved_for(
     tmp_path: Path, parts: dict[str, AvatarPart]
 ) -> None:
