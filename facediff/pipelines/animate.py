@@ -269,7 +269,6 @@ class AnimationPipeline(ABC):
         Returns:
             the files, and the first animation.
         """
-        from facediff.editing.retargeting import has_z_up
         from facediff.export import write_animations
 
         # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates of an .obj.
@@ -280,11 +279,17 @@ class AnimationPipeline(ABC):
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
         with self.animations(speech, name, output, seed=seed) as animations:
-            z_up = self._correspondence is not None and has_z_up(self._correspondence)
-            return (
-                write_animations(output, animations, export, into=into, own_shapes=own_shapes, z_up=z_up),
-                animations[0],
+            written = write_animations(
+                output, animations, export, into=into, own_shapes=own_shapes, z_up=self._target_has_z_up()
             )
+            return written, animations[0]
+
+    def _target_has_z_up(self) -> bool:
+        if self._correspondence is None:
+            return False
+        from facediff.editing.retargeting import has_z_up
+
+        return has_z_up(self._correspondence)
 
     @cached_property
     def _target_beyond_surface(self) -> tuple[bool, bool]:
