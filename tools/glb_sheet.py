@@ -16,7 +16,7 @@ import pygltflib
 from numpy.typing import NDArray
 
 from facediff.render import Renderer, contact_sheet, save_image
-from facediff.render.rasteriser import to_srgb
+from facediff.utils.colours import to_srgb
 
 COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}

@@ -19,7 +19,7 @@ from facediff.animation.options import ExportOptions, Up
 from facediff.errors import FaceDiffError
 from facediff.mesh.obj_surface import ObjSurface, read_surface
 from facediff.render.meshes import face_outward, vertex_normals
-from facediff.render.rasteriser import to_linear
+from facediff.utils.colours import to_linear
 
 MARK = b"facediff"  # Stands near the start of every file that is written without having been named by the user
 

@@ -21,8 +21,8 @@ from facediff.export.format import FileSpace, Format, facts, linear_colours, nor
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
 from facediff.mesh.obj_surface import ObjSurface
 from facediff.registry import export_format
-from facediff.render.rasteriser import to_linear
 from facediff.spaces.rotations import convert
+from facediff.utils.colours import to_linear
 
 Array = npt.NDArray[np.float32]
 

@@ -23,7 +23,7 @@ from facediff.export.format import (
 )
 from facediff.mesh.obj_surface import ObjSurface
 from facediff.registry import export_format
-from facediff.render.rasteriser import to_linear
+from facediff.utils.colours import to_linear
 
 
 class Usd(Format):

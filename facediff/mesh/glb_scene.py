@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from facediff.mesh.glb import Glb, attributes, whole
 from facediff.mesh.mesh import Array, Mesh
+from facediff.utils.colours import to_srgb
 from facediff.utils.limits import LIMITS
 
 ALIKE = 1e-5
@@ -143,9 +144,7 @@ def _colours(glb: Glb, part: Placed) -> Any:  # noqa: ANN401 - sRGB bytes (V, 3)
             return None
         if not all(type(value) in (int, float) and 0 <= value <= 1 for value in factor):
             return None
-        linear = np.array(factor[:3], np.float64)
-        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        return np.rint(255 * srgb).astype(np.uint8)
+        return np.rint(255 * to_srgb(factor[:3])).astype(np.uint8)
     color = attributes(part.primitive).get("COLOR_0")
     if color is None:
         return None

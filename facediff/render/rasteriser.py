@@ -31,6 +31,7 @@ from facediff.render.meshes import (
 )
 from facediff.render.occlusion import occlusion
 from facediff.render.refinement import Refinement
+from facediff.utils.colours import to_linear, to_srgb
 
 Picture = npt.NDArray[np.uint8]
 Float32 = npt.NDArray[np.float32]
@@ -416,20 +417,6 @@ def background(look: Look, height: int, width: int) -> Float32:
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     glow = 1 - 0.05 * np.clip(x * x + y * y, 0, 2)[..., None]
     return to_linear(((1 - blend) * top + blend * bottom) * glow)
-
-
-def to_linear(srgb: npt.ArrayLike) -> Float32:
-    """SRGB values from 0 to 1 as linear light (IEC 61966-2-1)."""
-    values = np.asarray(srgb, dtype=np.float64)
-    linear = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
-
-
-def to_srgb(linear: npt.ArrayLike) -> Float32:
-    """Linear light from 0 to 1 as sRGB."""
-    values = np.clip(np.asarray(linear, dtype=np.float64), 0, 1)
-    srgb = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
-    return srgb.astype(np.float32)
 
 
 # Buffers, and the calls of OpenCV's software rasteriser that fill them.

@@ -11,7 +11,8 @@ import pytest
 
 from facediff.errors import FaceDiffError
 from facediff.render import EVEN, VIEWS, Camera, Light, Look, Renderer, portrait
-from facediff.render.rasteriser import TABLE_SIZE, light_table, to_linear, to_srgb
+from facediff.render.rasteriser import TABLE_SIZE, light_table
+from facediff.utils.colours import to_linear, to_srgb
 
 MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
 
