@@ -285,9 +285,8 @@ def _carried_head(
     low, high = correspondence.source_vertices[:, 1].min(), correspondence.source_vertices[:, 1].max()
     # A figure's head turns on its neck: below the source's lowest vertex the turn fades, and its feet stay put.
     share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
-    whole = whole or bool(
-        (share > 0.999).all()
-    )  # carried back, the lowest vertex may lie a rounding below its own height
+    # Carried back, the lowest vertex may lie a rounding below its own height.
+    whole = whole or bool((share > 0.999).all())
     for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
         if motion.any():
             moved = frame @ matrix.T + shift

@@ -156,11 +156,12 @@ def parse(text: str) -> Request:
     except UnknownComponentError as error:
         # It is an AttributeError too, which a torch module that parses in a property would report as one of its own.
         raise FaceDiffError(str(error)) from error
-    taken = inspect.signature(metrics.get(name).update).parameters.keys() if moment != "all" else set()
-    if moment != "all" and (not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken):
-        raise FaceDiffError(
-            f"metric {text}: {name} scores no frames of prediction and truth by themselves; omit the prefix"
-        )
+    if moment != "all":
+        taken = inspect.signature(metrics.get(name).update).parameters.keys()
+        if not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken:
+            raise FaceDiffError(
+                f"metric {text}: {name} scores no frames of prediction and truth by themselves; omit the prefix"
+            )
     return Request(text.replace(" ", ""), name, options, moment)
 
 

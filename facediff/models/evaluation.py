@@ -33,7 +33,7 @@ from facediff.metrics import (
 )
 from facediff.metrics.by_name import parse_all
 from facediff.metrics.generation import SMOOTHNESS
-from facediff.models.inference import Inference, Style
+from facediff.models.inference import Inference, Style, named
 from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
@@ -90,11 +90,6 @@ def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Bat
         reference_names=[reference.clip] * len(batch),
         style=None,
     )
-
-
-def named(style: Reference | Style) -> str:
-    """The name of a style, of a reference that of its clip."""
-    return style.name if isinstance(style, Style) else style.clip
 
 
 def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]) -> list[Batch]:

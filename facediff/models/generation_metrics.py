@@ -50,7 +50,8 @@ from facediff.metrics import (
 )
 from facediff.metrics.eyes import LidMetric
 from facediff.models.base import AnimationModel
-from facediff.models.evaluation import closures_of, eyelid_pairs_of, named, regions_of, with_identity
+from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of, with_identity
+from facediff.models.inference import named
 from facediff.utils import ranges
 
 REFERENCES = {

@@ -55,6 +55,11 @@ class Style:
     vector: Float[Tensor, " style_dim"]
 
 
+def named(style: Reference | Style) -> str:
+    """The name of a style, of a reference that of its clip."""
+    return style.name if isinstance(style, Style) else style.clip
+
+
 @dataclass
 class Prediction:
     """Predicted motion of one clip; not frozen, since Lightning moves predictions between devices in place.

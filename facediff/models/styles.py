@@ -62,6 +62,7 @@ def read_styles(
     import torch
 
     from facediff.models import Style
+    from facediff.models.inference import named
 
     own = model.own_styles()
     if not own and not style_width(model):
@@ -81,8 +82,8 @@ def read_styles(
     styles = [read_style(part.name, identity, model, template=template) for part in parts]
     # Vectors are mixed, not motions: two motions averaged frame by frame cancel each other where they differ in timing.
     vector = torch.stack([share * vector_of(s, model) for share, s in zip(shares, styles, strict=True)]).sum(0)
-    names = [style.name if isinstance(style, Style) else style.clip for style in styles]
-    return Style(" + ".join(f"{share:.3g} {name}" for share, name in zip(shares, names, strict=True)), vector)
+    name = " + ".join(f"{share:.3g} {named(style)}" for share, style in zip(shares, styles, strict=True))
+    return Style(name, vector)
 
 
 def style_from(

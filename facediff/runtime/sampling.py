@@ -220,12 +220,12 @@ class SamplerRun:
         """The sampler's result, and what was kept of the last step."""
         about = self.model.description
         latest: list[Array] = []
-        kept = first = noisy
-        six = ((step, [*row, 0.0][:6]) for step, row in self.model.loop)
-        for i, (step, (of_noisy, *of_latest, of_noise, of_first)) in enumerate(six):
+        kept, first = noisy, None
+        for step, row in self.model.loop:
+            of_noisy, *of_latest, of_noise, of_first = [*row, 0.0][:6]
             prediction, kept = self._evaluate(features, noisy, step)
             latest = [prediction, *latest][:3]
-            first = prediction if i == 0 else first
+            first = prediction if first is None else first
             updated = np.float32(of_noisy) * noisy
             for factor, earlier in [*zip(of_latest, latest, strict=False), (of_first, first)]:
                 if factor:

@@ -127,8 +127,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
         model.choose_low_latency()
         quick = model.sampler
     preconditioned = model.motion_space.preconditioning is not None
-    # A folded sampler goes on in the network's width; preconditioning works on components, which are few already.
-    folded = model.folds and not preconditioned
+    folded = model.folds  # such a sampler goes on in the network's width
     # Example sizes: neither is 1, which the exporter would take for a constant instead of a size that may change.
     batch, frames, width = 2, 50, network.coordinates
     dim = network.embed.out_features

@@ -761,8 +761,12 @@ class DualPathDiffusion(AnimationModel):
 
     @property
     def folds(self) -> bool:
-        """Whether the sampler runs on folded motion: not where it acts on vertices, or goes on after its last step."""
-        return self.sampling_space == "folded" and self.sampler.linear and self.sampler.spread == 1
+        """Whether the sampler runs on folded motion: not where it acts on vertices, or goes on after its last step.
+
+        Nor where the network's output is preconditioned, which works on components, which are few already.
+        """
+        whole = self.sampler.linear and self.sampler.spread == 1
+        return self.sampling_space == "folded" and whole and self.motion_space.preconditioning is None
 
     def denoiser(self, conditions: Conditions, blend: Blend) -> ConditionalDenoiser:
         """The network under some conditions, in the space in which the sampler runs."""
