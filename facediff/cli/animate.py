@@ -152,15 +152,15 @@ def animate(
         options = replace(options, direction=direction_for(options.direction, speech[0]))
     check_options(options)
     check_export(output, files, options.samples, weights=may_have_weights(options.checkpoint))
-    speech_samples = read_recording(speech[0], options.max_seconds)  # before the model, which takes longer to load
-    for problem in speech_problems(speech_samples):
+    spoken = read_recording(speech[0], options.max_seconds)  # before the model, which takes longer to load
+    for problem in speech_problems(spoken.speech):
         tell(f"note: {speech[0]}: {problem}")
     pipeline = open_pipeline(options)
     weights = seeks_weights(output, files) and pipeline.has_weights
     check_export(output, files, options.samples, weights=weights)
-    seconds, size = pipeline.cost(speech_samples, output, files.size)
+    seconds, size = pipeline.cost(spoken.speech, output, files.size)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
-    written, animation = pipeline.write(speech_samples, speech[0].stem, output, files)
+    written, animation = pipeline.write(spoken, output, files)
     metadata = animation.metadata
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
     notes += f", licence: {metadata.get('licence', 'not stated')}"

@@ -66,7 +66,7 @@ def export_model(
     if speech is not None:
         from facediff.speech.audio import read_recording
 
-        samples = read_recording(speech)
+        samples = read_recording(speech).speech
 
     from facediff.models import load_model
 

@@ -89,13 +89,9 @@ def acted(kind: Acting, speech: Wave, frames: int, frame_rate: float, seed: int)
 
 def act(kind: Acting, animation: Animation, seed: int) -> Acted:
     """The values (T, 5) for an animation with its speech."""
-    if animation.speech is None:
+    speech = animation.heard()
+    if speech is None:
         raise OptionError.naming(f"{animation.name}: {{acting}}: has no speech to act on; give it with {{speech}}")
-    from facediff.speech.audio import to_speech
-
-    speech = animation.speech
-    if animation.sample_rate != SAMPLE_RATE:
-        speech = to_speech(speech, animation.sample_rate, animation.name)
     return acted(kind, speech, len(animation.vertices), animation.frame_rate, seed)
 
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
     from facediff.spaces.decoding import ChannelDecoder
+    from facediff.speech.audio import Recording
     from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.stream import AnimationStream, VertexGenerator
     from facediff.speech.voice_activity import MouthAtRest
@@ -255,13 +256,12 @@ class AnimationPipeline(ABC):
         return seconds, 12 * frames * len(self.facts["template"])
 
     def write(
-        self, speech: Array, name: str, output: Path, export: ExportOptions, *, seed: int | None = None
+        self, recording: Recording, output: Path, export: ExportOptions, *, seed: int | None = None
     ) -> tuple[list[Path], Animation]:
-        """Animate speech and write the animations.
+        """Animate a recording and write the animations.
 
         Args:
-            speech: (S,) at 16 kHz.
-            name: the animations' name.
+            recording: its speech is animated; its sound and name are the animations'.
             output: the file; its suffix names the format.
             export: how it is written.
             seed: of the first sample; the options' if None.
@@ -278,7 +278,7 @@ class AnimationPipeline(ABC):
         own_shapes = self.options.own_shapes
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
-        with self.animations(speech, name, output, seed=seed) as animations:
+        with self.animations(recording, output, seed=seed) as animations:
             written = write_animations(
                 output, animations, export, into=into, own_shapes=own_shapes, z_up=self._target_has_z_up()
             )
@@ -304,15 +304,16 @@ class AnimationPipeline(ABC):
 
     @contextmanager
     def animations(
-        self, speech: Array, name: str, output: Path | None = None, *, seed: int | None = None
+        self, recording: Recording, output: Path | None = None, *, seed: int | None = None
     ) -> Iterator[list[Animation]]:
-        """Finished samples of some speech; long ones are on disk as long as the context lasts.
+        """Finished samples of a recording; long ones are on disk as long as the context lasts.
 
         The arguments are those of :meth:`write`; the folder of ``output`` must have room for long samples, which are
         kept in memory if it is None.
         """
         first = self.seed if seed is None else seed
-        seeds, name = [first + i for i in range(self.options.samples)], valid_text(name)
+        seeds, name = [first + i for i in range(self.options.samples)], valid_text(recording.name)
+        speech = recording.speech
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
         short = self.windows.in_one_pass(self.frames_of(len(speech)), self.frame_rate)
@@ -323,7 +324,7 @@ class AnimationPipeline(ABC):
             finished = []
             for i, points in enumerate(self._motions(speech, seeds, folder)):
                 title = name if len(seeds) == 1 else f"{name}, sample {i + 1}"
-                animation = self.made_of(self._animation(self.shown(points), speech, title, seeds[i]), points)
+                animation = self.made_of(self._animation(self.shown(points), recording, title, seeds[i]), points)
                 finished.append(self._finished(animation, seeds[i], points))
             yield finished
 
@@ -442,7 +443,7 @@ class AnimationPipeline(ABC):
             writer.close()
         return [open_array(writer.path) for writer in writers]
 
-    def _animation(self, vertices: Array, speech: Array, name: str, seed: int) -> Animation:
+    def _animation(self, vertices: Array, recording: Recording, name: str, seed: int) -> Animation:
         from facediff.animation import Animation
         from facediff.version import __version__
 
@@ -461,7 +462,8 @@ class AnimationPipeline(ABC):
         for option in ("expressivity", "guidance"):
             if (scales := getattr(options, option)) is not None:
                 metadata[option] = scales_text(scales)
-        return Animation(name=name, vertices=vertices, speech=speech, metadata=metadata, **self.facts)
+        sound, rate = recording.sound, recording.rate
+        return Animation(name, vertices, speech=sound, sample_rate=rate, metadata=metadata, **self.facts)
 
     def _finished(self, animation: Animation, seed: int, points: Array) -> Animation:
         """A sample after everything that the options ask for after inference."""
@@ -504,7 +506,7 @@ class AnimationPipeline(ABC):
 
     def _closed(self, animation: Animation) -> Animation:
         """A sample whose lips touch where its phonemes say so, if their times are given."""
-        alignment, transcript, speech = self.options.alignment, self.options.transcript, animation.speech
+        alignment, transcript = self.options.alignment, self.options.transcript
         from facediff.animation.animation import PHONEMES
         from facediff.editing.closures import BUDGET, close_lips
         from facediff.speech.phonemes import closed_times, phonemes_text, read_alignment
@@ -512,7 +514,7 @@ class AnimationPipeline(ABC):
         if self._phonemes is None:
             if alignment is not None:
                 self._phonemes = read_alignment(Path(alignment))
-            elif transcript is not None and speech is not None:
+            elif transcript is not None and (speech := animation.heard()) is not None:
                 from facediff.editing.transcripts import align_transcript
 
                 self._phonemes = align_transcript(transcript, speech)

@@ -234,8 +234,8 @@ class SpeechAnimator(ABC):
                     direction = direction_for(chosen.direction, Path(recording))
                     if direction is not chosen.direction:
                         pipeline.direct(keys_of(direction, pipeline.frame_rate))
-                waveform, usual_name = speech_of(recording, rate, chosen.max_seconds)
-                with pipeline.animations(waveform, name or usual_name) as finished:
+                spoken = speech_of(recording, rate, chosen.max_seconds)
+                with pipeline.animations(replace(spoken, name=name or spoken.name)) as finished:
                     animations.append(finished[0] if chosen.samples == 1 else Samples(finished))
         return animations[0] if several is None else animations
 

@@ -184,11 +184,12 @@ def write_correspondence(options: AnimationOptions, files: Sequence[Path]) -> No
     problems = []
     for file in files:
         try:
-            speech = read_recording(file, options.max_seconds)
+            recording = read_recording(file, options.max_seconds)
         except FaceDiffError as error:  # the batch will say so of this recording, and goes on with others
             problems.append(error)
             continue
-        with open_pipeline(options).animations(speech[: FITTED_SECONDS * SAMPLE_RATE], file.stem):
+        start = replace(recording, speech=recording.speech[: FITTED_SECONDS * SAMPLE_RATE])
+        with open_pipeline(options).animations(start):
             return
     raise problems[0]
 
@@ -206,7 +207,7 @@ def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: l
             file = next(iter(_own_files(options, recording)), None)
             pipeline.direct(None if file is None else read_direction(file, pipeline.frame_rate))
         seed = seed_of_recording(recording, pipeline.seed)
-        return list(pipeline.write(speech, recording.stem, output, export, seed=seed)[0])
+        return list(pipeline.write(speech, output, export, seed=seed)[0])
 
     return animate
 

@@ -321,10 +321,9 @@ class SourceReader:
             overrides |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
             overrides |= {} if mesh.colours is None else {"colours": mesh.colours}
         if options.speech is not None:
-            from facediff.speech.audio import read_speech
-            from facediff.utils import SAMPLE_RATE
+            from facediff.speech.audio import read_sound_to_play
 
-            overrides |= {"speech": read_speech(Path(options.speech)), "sample_rate": SAMPLE_RATE}
+            overrides["speech"], overrides["sample_rate"] = read_sound_to_play(Path(options.speech))
         overrides |= {} if options.frame_rate is None else {"frame_rate": options.frame_rate}
         overrides |= {} if options.unit is None else {"unit": options.unit}
         return cast("AnimationFacts", overrides), defaults

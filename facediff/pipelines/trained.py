@@ -38,7 +38,7 @@ def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
     Example::
 
         pipeline = open_pipeline(AnimationOptions(checkpoint="demo/puppet.ckpt", identity="F1"))
-        pipeline.write(read_recording(Path("speech.wav")), "speech", Path("speech.mp4"), ExportOptions())
+        pipeline.write(read_recording(Path("speech.wav")), Path("speech.mp4"), ExportOptions())
     """
     if is_audio2face(options.checkpoint):
         from facediff.pipelines.audio2face import Audio2FacePipeline

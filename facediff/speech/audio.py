@@ -1,8 +1,8 @@
 """Reading speech, in every form that Python and the command line give it in, as samples (S,) at 16 kHz.
 
 From top to bottom: files of any common format, rate and number of channels; stretches of a corpus's files; recordings
-to animate, with :func:`speech_of` for whatever Python has; pieces of a stream; and whether a file is whole. Nothing
-here needs PyTorch.
+to animate, which keep their own sound, with :func:`speech_of` for whatever Python has; pieces of a stream; and whether
+a file is whole. Nothing here needs PyTorch.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import os
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
@@ -56,6 +57,9 @@ UNKNOWN = 1 << 62
 MIN_SECONDS = 0.2
 """Of the shortest recording that is animated."""
 
+PLAYED = 48_000
+"""Highest sample rate of the sound that an animation keeps, in Hz."""
+
 FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0)}
 """What whole numbers are divided by to get a full scale of 1, and where they have silence; as .wav files hold them."""
 
@@ -75,6 +79,15 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
             finite.
         MissingExtraError: if PyAV is not installed, which videos need.
     """
+    return to_speech(*_read(path, max_seconds), str(path))
+
+
+def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
+    """Read a recording as :func:`read_speech` does, for :func:`to_sound`'s samples and rate."""
+    return to_sound(*_read(path, None), str(path))
+
+
+def _read(path: Path, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such sound file; expected {', '.join(SUFFIXES + CONTAINERS)}")
     if path.stat().st_size == 0:
@@ -84,17 +97,17 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
     samples, rate = decode(path, _Length(path, max_seconds))
     if not len(samples):
         raise FaceDiffError(f"{path}: holds no samples; expected a recording of speech")
-    return to_speech(samples, rate, str(path))
+    return samples, rate
 
 
-def read_sound(file: IO[bytes], name: str, *, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
-    """Read an open sound file, such as ``io.BytesIO`` of a .wav, as :func:`read_speech` reads one on disk."""
+def _read_open(file: IO[bytes], name: str, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
+    """The same of an open sound file, such as ``io.BytesIO`` of a .wav."""
     length = _Length(Path(name), max_seconds)
     with open_sound(file, name) as sound:
         samples, rate = _decoded(sound, length)
     if not len(samples):
         raise FaceDiffError(f"{name}: holds no samples; expected a recording of speech")
-    return to_speech(samples, rate, name)
+    return samples, rate
 
 
 def write_wav(path: Path, samples: npt.NDArray[Any], rate: int, bits: int = 16) -> None:
@@ -112,16 +125,30 @@ def write_wav(path: Path, samples: npt.NDArray[Any], rate: int, bits: int = 16) 
 
 def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.NDArray[np.float32]:
     """Samples (S,) or (S, channels), full scale 1, at any rate as (S',) float32 mono at 16 kHz."""
-    import soxr
+    return _resampled(_checked(samples, name), rate, SAMPLE_RATE)
 
+
+def to_sound(samples: npt.NDArray[np.floating], rate: float, name: str) -> tuple[npt.NDArray[np.float32], int]:
+    """Such samples as (S',) float32 mono at their own rate, from 16 to 48 kHz; the samples and the rate."""
+    own = int(min(max(rate, SAMPLE_RATE), PLAYED))
+    return _resampled(_checked(samples, name), rate, own), own
+
+
+def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
+    """Mono, where all samples are in range."""
     if not np.isfinite(samples).all():
         raise FaceDiffError(f"{name}: holds samples that are not finite numbers; convert it again")
     peak = max(float(samples.max(initial=0)), -float(samples.min(initial=0)))
     if peak > LOUDEST:
         raise FaceDiffError(f"{name}: holds a sample of {peak:g}; expected a full scale of 1, convert it again")
-    mono = samples if samples.ndim == 1 else samples.mean(axis=1)
-    if rate != SAMPLE_RATE:
-        mono = soxr.resample(mono, rate, SAMPLE_RATE, quality="HQ")
+    return samples if samples.ndim == 1 else samples.mean(axis=1)
+
+
+def _resampled(mono: npt.NDArray[np.floating], rate: float, to: int) -> npt.NDArray[np.float32]:
+    if rate != to:
+        import soxr
+
+        mono = soxr.resample(mono, rate, to, quality="HQ")
     return np.ascontiguousarray(mono, dtype=np.float32)
 
 
@@ -282,11 +309,33 @@ def samples_for(frames: int, frame_rate: float) -> int:
     return round(frames * SAMPLE_RATE / frame_rate)
 
 
-def read_recording(path: Path, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
-    """Speech (S,) of a wav, flac, ogg, mp3 or video file."""
-    speech = read_speech(path, max_seconds=max_seconds)
-    check_speech(speech, str(path))
-    return speech
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording to animate.
+
+    Attributes:
+        name: its animation's name.
+        speech: (S,) float32 mono at 16 kHz, which models hear.
+        sound: (N,) float32 mono, which is played and written with the animation.
+        rate: sample rate of the sound in Hz.
+    """
+
+    name: str
+    speech: npt.NDArray[np.float32]
+    sound: npt.NDArray[np.float32]
+    rate: int
+
+    @classmethod
+    def of(cls, samples: npt.NDArray[np.floating], rate: float, name: str, source: str) -> Recording:
+        """Of samples (S,), full scale 1, at any rate; ``source`` is what errors call them."""
+        speech = to_speech(samples, rate, source)
+        check_speech(speech, source)
+        return cls(name, speech, *((speech, SAMPLE_RATE) if rate <= SAMPLE_RATE else to_sound(samples, rate, source)))
+
+
+def read_recording(path: Path, max_seconds: float | None = None) -> Recording:
+    """A wav, flac, ogg, mp3 or video file, to animate."""
+    return Recording.of(*_read(path, max_seconds), path.stem, str(path))
 
 
 def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
@@ -296,10 +345,8 @@ def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
         raise FaceDiffError(f"{name}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
 
 
-def speech_of(
-    speech: Speech, rate: float | None = None, max_seconds: float | None = None
-) -> tuple[npt.NDArray[np.float32], str]:
-    """Samples (S,) and a name, from whatever one recording may be given as.
+def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | None = None) -> Recording:
+    """A recording to animate, from whatever it may be given as.
 
     Args:
         speech: a path; an open file; a data set's audio, ``{"array", "sampling_rate"}`` or ``{"bytes", "path"}``;
@@ -313,12 +360,10 @@ def speech_of(
         if rate is not None:
             raise FaceDiffError(f"rate {rate:g}: belongs to an array, and {speech} says its own; omit it")
         if isinstance(speech, str | Path):
-            return read_recording(Path(speech), max_seconds), Path(speech).stem
+            return read_recording(Path(speech), max_seconds)
         file = cast("IO[bytes]", speech)
         path = file.name if isinstance(getattr(file, "name", None), str) else "speech"
-        samples = read_sound(file, path, max_seconds=max_seconds)
-        check_speech(samples, path)
-        return samples, Path(path).stem
+        return Recording.of(*_read_open(file, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
         if rate is not None or len(speech) != 2:
             raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
@@ -334,23 +379,19 @@ def speech_of(
     if max_seconds is not None and seconds > max_seconds:
         raise OptionError("max_seconds", f"speech lasts {seconds:.0f} s; cut it or raise the limit", f"{max_seconds:g}")
     LIMITS.check("seconds", seconds, "speech")
-    samples = to_speech(waveform, rate, "speech")
-    check_speech(samples, "speech")
-    return samples, "speech"
+    return Recording.of(waveform, rate, "speech", "speech")
 
 
-def _of_data_set(
-    audio: Mapping[str, Any], rate: float | None, max_seconds: float | None
-) -> tuple[npt.NDArray[np.float32], str]:
+def _of_data_set(audio: Mapping[str, Any], rate: float | None, max_seconds: float | None) -> Recording:
     """Speech as data sets of the Hugging Face hub hold it: decoded, or a file's content and name."""
     name = Path(audio["path"]).stem if audio.get("path") else "speech"
     if rate is not None:
         raise FaceDiffError(f"rate {rate:g}: belongs to an array, and the data set's audio says its own; omit it")
     if "array" in audio and "sampling_rate" in audio:
         # Channels come first there; lists come of data sets without a format.
-        return speech_of(np.asarray(audio["array"]), audio["sampling_rate"], max_seconds)[0], name
+        return replace(speech_of(np.asarray(audio["array"]), audio["sampling_rate"], max_seconds), name=name)
     if audio.get("bytes") is not None:
-        return speech_of(io.BytesIO(audio["bytes"]), None, max_seconds)[0], name
+        return replace(speech_of(io.BytesIO(audio["bytes"]), None, max_seconds), name=name)
     if audio.get("path"):
         return speech_of(audio["path"], None, max_seconds)
     raise FaceDiffError(

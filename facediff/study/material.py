@@ -19,9 +19,8 @@ from facediff.evaluation.figures.gather import gather
 from facediff.evaluation.figures.material import few
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, NamePattern
 from facediff.mesh import read_mesh
-from facediff.speech.audio import CONTAINERS, SUFFIXES, read_speech
+from facediff.speech.audio import CONTAINERS, SUFFIXES, read_sound_to_play
 from facediff.study.design import STILL, TRUTH
-from facediff.utils import SAMPLE_RATE
 
 ANIMATIONS = (".npz", ".npy")
 UNEQUAL = 0.1
@@ -336,6 +335,6 @@ def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int
             raise FaceDiffError(f"{path}: holds no speech; give a folder of recordings with --speech")
         speech, rate = animation.speech, animation.sample_rate
     else:
-        speech, rate = read_speech(path), SAMPLE_RATE
+        speech, rate = read_sound_to_play(path)
     length = round(seconds * rate)
     return np.pad(speech[:length], (0, max(0, length - len(speech)))).astype(np.float32), rate

@@ -23,7 +23,7 @@ from facediff.models import DiffPoseTalk, DualPathDiffusion, import_checkpoint, 
 from facediff.models.published.importing import save_model
 from facediff.pipelines.trained import TrainedPipeline
 from facediff.spaces.rotations import convert
-from facediff.speech.audio import read_speech
+from facediff.speech.audio import read_speech, speech_of
 from facediff.synthetic.known_faces import built_in_rig
 from tests.fakes import published_parameters
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
@@ -45,7 +45,7 @@ def checkpoint(
 
 def animate(checkpoint: Path, **options: object) -> Animation:
     pipeline = TrainedPipeline(AnimationOptions(checkpoint=str(checkpoint), seed=3, quiet=True, **options))  # type: ignore[arg-type]
-    with pipeline.animations(SPEECH, "speech") as (animation,):
+    with pipeline.animations(speech_of(SPEECH, 16_000)) as (animation,):
         return animation
 
 
@@ -93,7 +93,7 @@ def test_a_stream_gives_what_the_file_has(checkpoint: Path) -> None:
     """Pauses, decoded vertices and the turning head, however the speech is cut."""
     speech = np.concatenate([SPEECH, 0 * SPEECH, *[SPEECH] * 9])
     pipeline = TrainedPipeline(AnimationOptions(checkpoint=str(checkpoint), seed=3, quiet=True, window=1, overlap=0.4))
-    with pipeline.animations(speech, "speech") as (animation,):
+    with pipeline.animations(speech_of(speech, 16_000)) as (animation,):
         assert animation.values is not None
         stream = pipeline.stream()
         pieces = [stream.feed(piece) for piece in np.split(speech, [1, 20_000, 20_001])]

@@ -19,6 +19,7 @@ from facediff.runtime.site import make_site
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
 from facediff.spaces.layouts import layout
 from facediff.spaces.rotations import convert
+from facediff.speech.audio import speech_of
 from tests.fakes.exported import CHANNELS, STATE, fit_sizes, write_exported
 from tests.runtime.test_runtime import sound
 
@@ -32,7 +33,7 @@ def test_a_folder_animates_in_channels(folder: Path) -> None:
     """Files, streams and streams of channels have the same frames, pauses included."""
     speech = np.concatenate([sound(6.0), np.zeros(32_000, np.float32), sound(4.0)])
     pipeline = ExportedPipeline(AnimationOptions(checkpoint=folder, seed=2, quiet=True))
-    with pipeline.animations(speech, "speech") as (animation,):
+    with pipeline.animations(speech_of(speech, 16_000)) as (animation,):
         assert animation.values is not None
         assert animation.space == CHANNELS
         assert animation.head is not None
@@ -58,7 +59,7 @@ def test_the_command_writes_weights_as_they_are(folder: Path, tmp_path: Path) ->
     assert main([*arguments, str(tmp_path / "out.csv")]) == 0
     clip = read_parameters(tmp_path / "out.csv")
     pipeline = ExportedPipeline(AnimationOptions(checkpoint=folder, seed=1, quiet=True))
-    with pipeline.animations(sound(1.0), "speech") as (animation,):
+    with pipeline.animations(speech_of(sound(1.0), 16_000)) as (animation,):
         assert animation.values is not None
         written = clip.values[: len(animation.values)]
         jaw, head = clip.space.index("jawOpen"), list(clip.space.head)

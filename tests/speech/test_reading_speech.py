@@ -24,7 +24,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_open_files_and_audio_of_data_sets_are_the_recording(recording: Path) -> None:
-    expected, _ = speech_of(recording)
+    expected = speech_of(recording)
     content = recording.read_bytes()
     samples, rate = soundfile.read(recording)
     with recording.open("rb") as file:
@@ -36,9 +36,10 @@ def test_open_files_and_audio_of_data_sets_are_the_recording(recording: Path) ->
             "decoded audio of a data set": ({"array": samples.T, "sampling_rate": rate, "path": None}, "speech"),
         }
         for form, (speech, name) in forms.items():
-            found, found_name = speech_of(speech)  # type: ignore[arg-type]
-            assert found_name == name, form
-            np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7, err_msg=form)
+            found = speech_of(speech)  # type: ignore[arg-type]
+            assert (found.name, found.rate) == (name, 22050), form
+            np.testing.assert_allclose(found.speech, expected.speech, rtol=0, atol=2e-7, err_msg=form)
+            np.testing.assert_allclose(found.sound, 0.25 * TONE, rtol=0, atol=1 / 32768, err_msg=form)
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ from facediff.export.viewer.packing import (
 )
 from facediff.export.viewer.posing import acted_curves, moods, pose_fields, sounds
 from facediff.registry import export_format
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.pages import fill, hash_source, script_data
 
@@ -157,7 +158,9 @@ def check_page(animations: Sequence[Animation], truth: int | None) -> None:
 def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs) -> dict[str, Any]:
     """The JSON that the script reads: numbers, names, and the numbers of arrays among the blobs."""
     speaking = next((animation for animation in animations if animation.speech is not None), None)
-    sound = None if speaking is None else speech_wav(speaking)
+    sound = None
+    if speaking is not None:  # it is stored as it is, three times as large at 48 kHz
+        sound = speech_wav(replace(speaking, speech=speaking.heard(), sample_rate=SAMPLE_RATE))
     compared: list[int] = []
     heat = None
     if truth is not None:

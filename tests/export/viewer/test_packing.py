@@ -140,6 +140,16 @@ def test_page_keeps_each_mesh_and_equal_parts_once(tmp_path: Path) -> None:
     assert page.facts["heat"] is None
 
 
+def test_page_keeps_speech_of_a_finer_rate_at_16_khz(tmp_path: Path) -> None:
+    tone = 0.5 * np.sin(2 * np.pi * 440 * np.arange(48_000) / 48_000).astype(np.float32)
+    write_page(tmp_path / "a.html", [replace(random_animation(0, frames=30), speech=tone, sample_rate=48_000)])
+    page = Written(tmp_path / "a.html")
+    with wave.open(io.BytesIO(page.blob(page.facts["sound"]))) as file:
+        assert (file.getframerate(), file.getnframes()) == (16_000, 16_000)  # a second
+        sound = np.frombuffer(file.readframes(8000), "<i2") / 32768
+    np.testing.assert_allclose(sound[200:], tone[: 3 * 8000 : 3][200:], atol=1e-3)
+
+
 def test_page_sound_and_curve_show_the_clicks_at_their_frames(tmp_path: Path) -> None:
     write_page(tmp_path / "a.html", [clicks(speech=False), clicks()])
     page = Written(tmp_path / "a.html")
