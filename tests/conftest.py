@@ -3,6 +3,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 
 import pytest
 from jaxtyping import install_import_hook
@@ -11,6 +12,11 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
 os.environ["WANDB_SILENT"] = "true"
 os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what they are
+
+# Where no bytecode is to be written, as in many containers, all tests would be compiled anew each time, and the package
+# by each of the hundreds of processes that they start. Nobody means this folder, which git ignores, by that.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C, which some test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
