@@ -239,7 +239,7 @@ def _decoded(file: Any, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
 
 
 def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
-    """The first sound track of a video, (S,) mono."""
+    """The first sound track of a video, (S,) mono, from the time of its first picture on."""
     with needs_extra("av", "prepare", f"extracting the sound of {path.suffix} files"):
         import av
         from av.audio.resampler import AudioResampler
@@ -254,15 +254,26 @@ def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float
             if track.duration and track.time_base:
                 length.check(float(track.duration * track.time_base) * rate, rate)
             plain = AudioResampler(format="fltp", layout="mono", rate=rate)
-            decoded = 0
+            decoded, late = 0, None
             for frame in chain(container.decode(audio=0), [None]):  # at None, what the resampler still holds comes out
+                if late is None and frame is not None:
+                    late = round(_seconds_after_picture(container, frame.time) * rate)
+                    decoded += max(0, late)
                 for part in plain.resample(frame):
                     parts.append(part.to_ndarray()[0])
                     decoded += len(parts[-1])
                 length.check(decoded, rate)
     except (av.FFmpegError, AttributeError, ValueError, TypeError, OSError) as error:  # a track may lack its rate
         raise FaceDiffError(f"{path}: its sound cannot be read ({_reason(path, error)}); convert it to .wav") from error
-    return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
+    if not parts or not late:
+        return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
+    return np.concatenate([np.zeros(max(0, late), np.float32), *parts])[max(0, -late) :], rate
+
+
+def _seconds_after_picture(container: Any, sound: float | None) -> float:  # noqa: ANN401 - PyAV's
+    """How long after the first picture of a video its sound begins; the picture may also come after it."""
+    start = next((track.start_time * track.time_base for track in container.streams.video if track.start_time), 0)
+    return 0.0 if sound is None or not container.streams.video else float(sound - start)
 
 
 def read_stretch(
