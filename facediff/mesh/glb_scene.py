@@ -137,21 +137,27 @@ def read_glb(data: bytes, source: object) -> Mesh:
 
 
 def _colours(glb: Glb, part: Placed) -> Any:  # noqa: ANN401 - sRGB bytes (V, 3) or (3,), or None
-    if "material" in part.primitive:  # it tints the colours of vertices, which then are not the face's
-        look = part.material.get("pbrMetallicRoughness")
-        factor = look.get("baseColorFactor") if isinstance(look, dict) and "baseColorTexture" not in look else None
-        if not isinstance(factor, list) or len(factor) != 4:
-            return None
-        if not all(type(value) in (int, float) and 0 <= value <= 1 for value in factor):
-            return None
-        return np.rint(255 * to_srgb(factor[:3])).astype(np.uint8)
     color = attributes(part.primitive).get("COLOR_0")
+    tint: list[float] | None = None
+    if "material" in part.primitive:  # its colour is multiplied with the vertices', as light
+        look = part.material.get("pbrMetallicRoughness", {})
+        if not isinstance(look, dict) or "baseColorTexture" in look:
+            return None
+        tint = look.get("baseColorFactor", None if color is None else [1, 1, 1, 1])
+        if not isinstance(tint, list) or len(tint) != 4:
+            return None
+        if not all(type(value) in (int, float) and 0 <= value <= 1 for value in tint):
+            return None
+        if color is None:
+            return np.rint(255 * to_srgb(tint[:3])).astype(np.uint8)
     if color is None:
         return None
     form = "VEC4" if glb.entry("accessors", color).get("type") == "VEC4" else "VEC3"
     values = glb.numbers(color, form, ("f4", "u1", "u2"), len(part.local))[:, :3]
     scale = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
-    return np.rint(255 * np.clip(np.nan_to_num(values / scale), 0, 1)).astype(np.uint8)
+    shares = np.clip(np.nan_to_num(values / scale), 0, 1)
+    # Without a material they were written by tools such as trimesh, which leave them as screens show them.
+    return np.rint(255 * (shares if tint is None else to_srgb(shares * tint[:3]))).astype(np.uint8)
 
 
 def _shown(glb: Glb, nodes: dict[int, Array | None]) -> list[tuple[int, int]]:

@@ -18,8 +18,12 @@ from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
 from facediff.export.format import normals_of, outward
 from facediff.export.glb import compress
+from facediff.mesh import read_mesh
+from facediff.mesh.glb import Glb
 from facediff.synthetic.arkit import puppet_shapes
+from facediff.utils.colours import to_linear, to_srgb
 from tests.fakes.glb_reader import COMPONENTS, WIDTHS, Reader
+from tests.fakes.glb_targets import pack
 
 
 @pytest.mark.parametrize("unit", ["m", "mm", "normalised (about 185 mm)"])
@@ -132,6 +136,19 @@ def test_glb_face_is_whole_and_its_colours_are_linear(animation: Animation, tmp_
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     reader = Reader(tmp_path / "a.glb")
     np.testing.assert_allclose(reader.values(reader.primitive.attributes.COLOR_0), linear, atol=1e-6)
+
+
+@pytest.mark.parametrize("tint", [None, [0.5, 1.0, 0.25, 1.0]])
+def test_colours_of_a_glb_come_back_multiplied_by_its_materials(
+    animation: Animation, tmp_path: Path, tint: list[float] | None
+) -> None:
+    write_animations(tmp_path / "a.glb", [animation])
+    glb = Glb((tmp_path / "a.glb").read_bytes(), "a.glb")
+    if tint is not None:
+        glb.content["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = tint
+        (tmp_path / "a.glb").write_bytes(pack(glb.content, glb.binary))
+    expected = to_srgb(to_linear(animation.colours / 255) * np.array((tint or [1, 1, 1])[:3]))  # type: ignore[operator]
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.glb").colours, 255 * expected, atol=0.51)
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
