@@ -27,6 +27,8 @@ CANCELLED = 1e-3
 """Weights whose sum is less than this share of their sizes have nothing left to divide by."""
 OTHER_FACE = 0.25
 """How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
+OTHER_ENCODER = 0.1
+"""How far two encoders' answers to a still face may lie apart, as a share of their length, to be of one model."""
 NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)"
 
 
@@ -174,6 +176,52 @@ def open_style(path: Path) -> StyleFile:
         animation = read_archive(path)
         return StyleFile(path, animation.vertices, animation.template, animation.frame_rate, animation.unit)
     return StyleFile(path, open_array(path, kinds="fiu", name=f"style {path}"))
+
+
+def marked(vector: npt.NDArray[np.float32], still: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """A style vector (S,) for a file, with its encoder's answer to a still face (S,) behind it.
+
+    Infinity lies between them, so that the whole is no style vector of any other length.
+    """
+    import numpy as np
+
+    return np.concatenate([vector, [np.float32(np.inf)], still])
+
+
+def vector_in(opened: StyleFile, width: int, still: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float32]:
+    """The style vector (S,) of a file that holds one, alone or as :func:`marked` with its encoder's answer.
+
+    Of a vector alone nobody can say whose it is.
+
+    Args:
+        opened: the file.
+        width: S of the model.
+        still: the answer of the model's own encoder (S,); None if it has none to ask.
+
+    Raises:
+        FaceDiffError: if it has another length, or is not finite, or of another model.
+    """
+    import numpy as np
+
+    values, middle = np.array(opened.array, np.float32), len(opened.array) // 2
+    divided = len(values) % 2 == 1 and bool(np.isinf(values[middle]))
+    vector = values[:middle] if divided else values
+    name, remedy = (
+        f"{{style}} {opened.path}",
+        "make one with `facediff style extract` from this model's checkpoint",
+    )
+    if len(vector) != width or not np.isfinite(vector).all():
+        raise OptionError.naming(
+            f"{name}: holds {len(vector)} numbers, but this model's style vectors have {width} (no NaN); {remedy}"
+        )
+    if divided and still is not None:
+        answer = values[middle + 1 :]
+        limit = OTHER_ENCODER * max(np.linalg.norm(answer), np.linalg.norm(still))
+        if not np.linalg.norm(answer - still) <= limit:
+            raise OptionError.naming(
+                f"{name}: is of another model, whose style encoder gives other numbers for a still face; {remedy}"
+            )
+    return vector
 
 
 def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.float32]:

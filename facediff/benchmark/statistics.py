@@ -46,6 +46,12 @@ class RowScores:
         """Standard deviation between the runs (n − 1); None with a single one."""
         return float(self.runs.std(ddof=1)) if len(self.runs) > 1 else None
 
+    def valued(self) -> list[str]:
+        """Sentences that have a value in some run; all of them if the score is no mean of those of sentences."""
+        if self.values is None:
+            return list(self.clips)
+        return [self.clips[place] for place in np.flatnonzero((~np.isnan(self.values)).any(0))]
+
     def shares(self, clips: Sequence[str]) -> Array:
         """What each of some sentences adds to the mean over the runs; their sum is the score over these sentences."""
         if self.values is None:
@@ -75,14 +81,14 @@ class Difference:
     """One row's score minus another's.
 
     Attributes:
-        value: the difference of the means over runs, over the sentences that both have.
+        value: the difference of the means over runs, over the sentences of which both have a value.
         sentences: bootstrap interval over sentences; None if there is none.
         p_sentences: of the permutation test over sentences; None if the score is no mean of those of sentences.
         runs: interval over training runs (Welch); None if the chance between runs is not known.
         p_runs: of Welch's test; None as for ``runs``.
         both: interval over sentences and training runs together; None if the chance between runs is not known.
         p: of the test with both; None as for ``both``.
-        common: sentences that both have.
+        common: sentences of which both have a value.
     """
 
     value: float
@@ -103,7 +109,7 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
         other: the row that is subtracted.
         bootstrap: resamples, level and seed; the permutations have the same seed.
     """
-    common = [clip for clip in one.clips if clip in other.clips]
+    common = in_both(one, other)
     p_runs, runs = welch(one, other, bootstrap.level)
     if one.values is None or other.values is None or not common:
         alone = one.values is None and other.values is None
@@ -117,6 +123,13 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
     interval = None if mine is None or yours is None else bootstrap.intervals((mine - yours)[:, None], 1)[0]
     p, both = both_chances(gaps, [scores.runs for scores in (one, other) if not scores.fixed], bootstrap.level)
     return Difference(float((ours - theirs).sum()), interval, p_sentences, runs, p_runs, both, p, len(common))
+
+
+def in_both(one: RowScores, other: RowScores) -> list[str]:
+    """Sentences of which both rows have a value."""
+    # One that a single row has would count as a gap as large as that row's score.
+    theirs = set(other.valued())
+    return [clip for clip in one.valued() if clip in theirs]
 
 
 def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tuple[float | None, Interval | None]:
@@ -199,7 +212,7 @@ def hears(own: RowScores, shuffled: RowScores, sign: int, bootstrap: Bootstrap) 
         bootstrap: its level decides, its seed is the permutations'.
     """
     gap = sign * (shuffled.mean - own.mean)
-    common = [clip for clip in own.clips if clip in shuffled.clips]
+    common = in_both(own, shuffled)
     if gap <= 0 or own.values is None or shuffled.values is None or not common:
         return gap > 0
     gaps = shuffled.shares(common) - own.shares(common)

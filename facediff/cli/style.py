@@ -33,8 +33,9 @@ def extract(
         raise FaceDiffError(f"--output {output}: expected a name that ends in .npy")
     check_model_source(checkpoint, "--checkpoint")
 
+    from facediff.animation.style_files import marked
     from facediff.models import load_model
-    from facediff.models.styles import extract_style
+    from facediff.models.styles import extract_style, still_style
     from facediff.utils.files import atomic
 
     model = load_model(checkpoint, commercial_only=licence.commercial_only)
@@ -44,6 +45,6 @@ def extract(
     import numpy as np
 
     with atomic(output) as temporary, temporary.open("wb") as stream:
-        np.save(stream, vector.numpy(), allow_pickle=False)
+        np.save(stream, marked(vector.numpy(), still_style(model).numpy()), allow_pickle=False)
     tell(f"{output}: style vector of {len(vector)} numbers from {', '.join(clips)}, for this checkpoint only")
     tell(f"next: facediff animate speech.wav --checkpoint {checkpoint} --style {output} -o speech.mp4")

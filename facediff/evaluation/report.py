@@ -90,7 +90,7 @@ class Comparison:
     metric: str
     difference: float  # the method's score minus the baseline's
     interval: Interval | None  # of the difference, over the same resamples; None as in :class:`Score`
-    sequences: int  # that both have
+    sequences: int  # of which both have a value
     same_method: bool = False  # whether both are training runs of one method that differ in the seed alone
 
     @property
@@ -298,7 +298,7 @@ class MethodTable:
         )
 
     def compare(self, baseline: MethodTable, bootstrap: Bootstrap) -> list[Comparison]:
-        """This method's scores minus another's, over the clips that both have and over the same resamples.
+        """This method's scores minus another's, over the clips of which both have a value and over the same resamples.
 
         Empty if they share no clip.
         """
@@ -306,8 +306,10 @@ class MethodTable:
         if not common:
             return []
         ours, theirs = ([row for row, clip in enumerate(table.clips) if clip in common] for table in (self, baseline))
-        a = self.values[ours], self.weights[ours]
-        b = baseline.values[theirs], baseline.weights[theirs]
+        # Else a difficult clip would count for the one method that has a value of it.
+        both = (self.weights[ours] > 0) & (baseline.weights[theirs] > 0)
+        a = self.values[ours], self.weights[ours] * both
+        b = baseline.values[theirs], baseline.weights[theirs] * both
         mine, other = bootstrap.scores(*a), bootstrap.scores(*b)
         spread = None if mine is None or other is None else mine - other
         return [
@@ -318,11 +320,15 @@ class MethodTable:
                 column.metric,
                 float(difference),
                 interval,
-                len(common),
+                int(count),
                 same_method(self.provenance, baseline.provenance),
             )
-            for column, difference, interval in zip(
-                self.columns, pooled(*a) - pooled(*b), bootstrap.intervals(spread, len(self.columns)), strict=True
+            for column, difference, interval, count in zip(
+                self.columns,
+                pooled(*a) - pooled(*b),
+                bootstrap.intervals(spread, len(self.columns)),
+                both.sum(0),
+                strict=True,
             )
             if not math.isnan(difference)
         ]
@@ -465,16 +471,17 @@ def _comparisons(report: EvaluationReport, protocol: str) -> list[str]:
     if not comparisons:
         return []
     rows: dict[str, list[str]] = {}
+    counts: dict[str, str] = {}
     for comparison in comparisons:
         row = f"{comparison.method} − {comparison.baseline}" + (f": {comparison.metric}" if protocol == METRICS else "")
         rows.setdefault(row, []).append(
             _cell(comparison.difference, comparison.interval, "+") + ("*" if comparison.starred else "")
         )
+        counts[row] = str(comparison.sequences)
     metrics = (
         ["difference"] if protocol == METRICS else list(dict.fromkeys(comparison.metric for comparison in comparisons))
     )
-    counts = {comparison.method: str(comparison.sequences) for comparison in comparisons}
-    body = [[row, *cells, counts[row.partition(" − ")[0]]] for row, cells in rows.items()]
+    body = [[row, *cells, counts[row]] for row, cells in rows.items()]
     head = "difference, over the sequences that both have (*: the interval over sentences does not contain 0)"
     same = list(
         dict.fromkeys(

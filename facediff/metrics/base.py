@@ -428,6 +428,9 @@ class SequenceMetric(ExactMetric):
     leaves_out = ""
     """Which sequences have no value, in words; empty if every sequence has one. :meth:`clip_value` gives NaN there."""
 
+    in_order: ClassVar[bool] = False
+    """Whether the order of frames counts, so that none can be left out of a sequence."""
+
     latest: Tensor | None
     """What :meth:`clip_value` gave for each sequence of the last update, (batch,) float64; None before the first."""
     indices: Tensor | None

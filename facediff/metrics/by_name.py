@@ -158,7 +158,8 @@ def parse(text: str) -> Request:
         raise FaceDiffError(str(error)) from error
     if moment != "all":
         taken = inspect.signature(metrics.get(name).update).parameters.keys()
-        if not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken:
+        ordered = getattr(metrics.get(name), "in_order", False)
+        if not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken or ordered:
             raise FaceDiffError(
                 f"metric {text}: {name} scores no frames of prediction and truth by themselves; omit the prefix"
             )

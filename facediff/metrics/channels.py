@@ -188,6 +188,7 @@ class StepDistance(ChannelMetric):
     """
 
     higher_is_better = False
+    in_order = True
     words = (
         "in each sequence the root of the sum over steps and {region} of the squared difference of steps from frame to "
         "frame, over 0.1; mean over sequences [unit]"

@@ -66,6 +66,8 @@ class BlinkMetric(LidMetric):
         reopened: share by which they may still be shut for another blink to be possible.
     """
 
+    in_order = True
+
     def __init__(
         self,
         pairs: LipPairsLike,

@@ -131,6 +131,7 @@ class FrameStep(RatioMetric):
     """
 
     divides_by = "the truth does not move in any sequence"
+    in_order = True
 
     def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
         definition = "root mean square of the prediction's steps from frame to frame, over that of the truth, {region}"
@@ -163,6 +164,7 @@ class DifferenceRatio(RatioMetric):
     """
 
     divides_by = "the prediction or the truth does not move in any sequence"
+    in_order = True
 
     def __init__(
         self,
@@ -213,6 +215,7 @@ class SpectrumDistance(SequenceMetric):
     """
 
     unit: ClassVar[str] = "dB"
+    in_order = True
     powers: Tensor
 
     def __init__(

@@ -214,6 +214,7 @@ class LipSpeedCorrelation(LipMetric):
     """
 
     higher_is_better = True
+    in_order = True
     leaves_out = "the speed of the truth's lips does not vary"
     words = (
         "in each sequence the Pearson correlation over frames between the mean speeds of {region}; mean over "

@@ -100,6 +100,7 @@ class LipWarpingDistance(LipMetric):
     """
 
     higher_is_better = False
+    in_order = True
     words = (
         "in each sequence the root mean square distance over {region} between frames that dynamic time warping pairs, "
         "mean along the path of smallest sum; mean over sequences [unit]"
@@ -220,6 +221,7 @@ class TemporalMisalignment(OpeningMetric):
     """
 
     higher_is_better = False
+    in_order = True
     leaves_out = "the warping path pairs no opening or closing of truth and prediction"
 
     def __init__(

@@ -344,7 +344,7 @@ class HubertEncoder(FrozenEncoder):
         train_projection: train the feature projection, between the convolutions and the Transformer, all the same;
             then only the convolutions' result can be kept on disk.
         spec_augment: mask stretches of the features in training, as the pretrained model's configuration says.
-        layer_drop: probability of skipping a Transformer layer in training.
+        layer_drop: probability of skipping a Transformer layer in training; frozen layers are never skipped.
         config: the model's configuration as plain data; if given, the weights are not read from ``source`` but left
             for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
 
@@ -439,6 +439,10 @@ class HubertEncoder(FrozenEncoder):
         if self.train_projection:
             hidden = self.hubert.feature_projection(hidden)
         first = 0 if self.train_projection else self.frozen_layers
+        return self._to_the_end(hidden, first)
+
+    def _to_the_end(self, hidden: Tensor, first: int) -> Tensor:
+        """All Transformer layers from ``first`` on."""
         hidden = self._layers(hidden, first, len(self.hubert.encoder.layers))
         return self.hubert.encoder.layer_norm(hidden) if self._normalises_last else hidden
 
@@ -449,8 +453,10 @@ class HubertEncoder(FrozenEncoder):
             hidden = hidden + encoder.pos_conv_embed(hidden)
             hidden = encoder.dropout(hidden if self._normalises_last else encoder.layer_norm(hidden))
         for layer in encoder.layers[first:last]:
-            # Layer drop, as transformers does it in its own loop, which cannot be entered in the middle.
+            # Layer drop, as transformers does it in its own loop, which cannot be entered in the middle and drops
+            # frozen layers too.
             if layer.training and self.hubert.config.layerdrop > 0 and torch.rand(()) < self.hubert.config.layerdrop:
+                hidden = skipped(layer, hidden)
                 continue
             hidden = layer(hidden)
         return hidden
@@ -470,7 +476,30 @@ class HubertEncoder(FrozenEncoder):
         return super().states(audio, audio_lengths, features, feature_lengths)
 
     def _whole(self, wave: Tensor) -> Tensor:
-        return self.hubert(with_edges(wave)).last_hidden_state
+        features = self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2)
+        return self._to_the_end(spec_augmented(self.hubert, self.hubert.feature_projection(features)), 0)
+
+
+def spec_augmented(network: PreTrainedModel, hidden: Tensor) -> Tensor:
+    """Projected features (batch, steps, channels) in which SpecAugment has masked stretches, in training."""
+    settings: Any = network.config
+    if not (network.training and settings.apply_spec_augment):
+        return hidden
+    if hidden.shape[1] > settings.mask_time_length:  # shorter speech has no room for a mask
+        return network._mask_hidden_states(hidden)
+    return hidden + 0.0 * network.masked_spec_embed if in_processes() else hidden
+
+
+def skipped(layer: nn.Module, hidden: Tensor) -> Tensor:
+    """Hidden states as they are, as if a layer had not been there."""
+    # Of several processes, each must give every weight a gradient in every step.
+    trained = [p.sum() for p in layer.parameters()] if in_processes() else []
+    return hidden + 0.0 * torch.stack(trained).sum() if trained else hidden
+
+
+def in_processes() -> bool:
+    """Whether several processes may train together."""
+    return torch.distributed.is_available() and torch.distributed.is_initialized()
 
 
 def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:

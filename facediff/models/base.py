@@ -135,9 +135,9 @@ class AnimationModel(PersonStyles, ABC):
         protocol: the metrics' protocol for validation and test.
         metrics: further metrics for validation and test, by name with their options, such as
             ``lip_warping_distance`` or ``temporal_misalignment:at=path``; see docs/metrics.md.
-        unseen_identity: which identity unseen speakers are tested with: none, with their own style (``style_only``),
-            each training identity in turn with the mean of the scores (``each_seen``), or their own, once the model is
-            adapted to them (``adapted``).
+        unseen_identity: which identity unseen speakers are tested and predicted with: none, with their own style
+            (``style_only``), each training identity in turn with the mean of the scores (``each_seen``), or their own,
+            once the model is adapted to them (``adapted``).
         style_source: the style that speakers have in validation, test and prediction, and by default in animation: of
             one ``reference`` clip, or of all motion of the ``person`` outside the evaluated clips, as the mean of the
             style vectors of stretches of ``data.reference_frames``. Checkpoints then keep every speaker's vector.
@@ -394,8 +394,17 @@ class AnimationModel(PersonStyles, ABC):
             self.log_dict(self.evaluation.scalars(split), sync_dist=True)
 
     def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> list[Prediction]:
-        """Absolute vertices of every clip of the batch, also of channels with a rig; without one the channels."""
+        """Absolute vertices of every clip of the batch, also of channels with a rig; without one the channels.
+
+        Unseen speakers are conditioned as ``unseen_identity`` says, so that a clip may have several predictions.
+        """
         batch = self.with_person_styles(batch)
+        styles = {name: self.default_style(name) for name in self.styled_identities()}
+        views = conditioned(batch, self.unseen_identity, self.identities, styles)
+        return [clip for _, view in views for clip in self._predicted(view)]
+
+    def _predicted(self, batch: Batch) -> list[Prediction]:
+        """One prediction of every clip of the batch."""
         motion, assets = self.generate(batch, seed=0), self.assets
         vertices = [
             assets.to_scored(own, name) + assets.scored.template(name).to(own) if assets.rig else own + template

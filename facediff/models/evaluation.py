@@ -39,7 +39,7 @@ from facediff.speech.audio import SAMPLE_RATE
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
-"""Which identity unseen speakers are tested with. ``style_only``: none, with the style of their own reference.
+"""Which identity unseen speakers are tested and predicted with. ``style_only``: none, with their reference's style.
 ``each_seen``: each training identity in turn, with that identity's own style, and the mean of the scores, as the
 released test scripts do. ``adapted``: their own, which the model must have been adapted to."""
 

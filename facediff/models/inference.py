@@ -564,7 +564,7 @@ class SpeechStream(SpeechWindows[Motion]):
         self.seeds = list(seeds)
         self.expressivity = model.expressivity
         with torch.inference_mode():
-            # Encoded once for all windows: the style does not change during a recording.
+            # Encoded once for all windows: a style that is given does not change during a recording.
             style = model.encode_style(clip.reference, clip.reference_mask) if clip.style is None else clip.style
             self.clip = replace(clip, style=style, features=None, feature_lengths=None)
         self._tail: list[Tensor] | None = None  # what the latest window hands over to the next

@@ -462,6 +462,8 @@ class TemporalPreconditioning(Preconditioning):
     motion with this covariance, and so the exact sampler of it.
 
     A frame lies in the middle of its window, and nearer to an end only where the clip or the window of a stream ends.
+    What is shorter than W is taken as if it went on at the mean: without any network, its last frames vary by a quarter
+    to a half too little.
 
     Args:
         steps: of the noise process.

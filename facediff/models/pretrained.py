@@ -133,10 +133,11 @@ def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -
         FaceDiffError: if the model holds anything but tensors and plain values.
     """
     content = content_of(model)
-    weights, shared = stored_once(content.pop("state_dict"))
+    weights = content.pop("state_dict")
     if half:
-        parameters = {name for name, _ in model.named_parameters()}
+        parameters = {name for name, _ in model.named_parameters(remove_duplicate=False)}
         weights = {name: halved(value) if name in parameters else value for name, value in weights.items()}
+    weights, shared = stored_once(weights)  # rounded before: a buffer that equals a parameter stays as it is
     tensors: dict[str, Tensor] = {}
     config = {
         "format": FORMAT,

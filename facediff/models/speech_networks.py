@@ -24,6 +24,8 @@ from facediff.models.audio_encoders import (
     by_length,
     fingerprint,
     load_typed,
+    skipped,
+    spec_augmented,
     with_edges,
 )
 from facediff.models.layers import Share, Width, exporting, interpolate_ends, longest
@@ -178,12 +180,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
         encoder, large = network.encoder, bool(getattr(settings, "do_stable_layer_norm", False))
         hidden = network.feature_projection(features)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # wav2vec 2.0 gives its normalised input as well
-        processes = self.training and torch.distributed.is_available() and torch.distributed.is_initialized()
-        if self.training and settings.apply_spec_augment:
-            if hidden.shape[1] > settings.mask_time_length:  # shorter speech has no room for a mask
-                hidden = network._mask_hidden_states(hidden)
-            elif processes:
-                hidden = hidden + 0.0 * network.masked_spec_embed
+        hidden = spec_augmented(network, hidden)
         # transformers' own forward pass written out, since it cannot be entered behind the convolutions, whose result
         # is resampled or cached. The base networks normalise here, the large ones (``do_stable_layer_norm``) after the
         # last layer.
@@ -194,8 +191,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
         for number, layer in enumerate(encoder.layers):
             droppable = self.training and settings.layerdrop > 0 and not (related and number == 0)
             if droppable and float(torch.rand(())) < settings.layerdrop:
-                if processes:  # where every process must give every weight a gradient in every step
-                    hidden = hidden + 0.0 * torch.stack([p.sum() for p in layer.parameters()]).sum()
+                hidden = skipped(layer, hidden)
                 continue
             if related:
                 hidden, bias = layer(hidden, position_bias=bias, **({} if large else {"index": number}))[:2]

@@ -21,6 +21,7 @@ from facediff.animation.style_files import (
     stillness_of,
     stride_of,
     style_given,
+    vector_in,
     with_layout,
 )
 from facediff.errors import FaceDiffError, OptionError, choices
@@ -138,11 +139,16 @@ def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:
 
 def style_width(model: AnimationModel) -> int:
     """How many numbers a style vector of the model has; 0 if it has no dynamic style."""
+    return len(still_style(model))
+
+
+def still_style(model: AnimationModel) -> Tensor:
+    """The style vector (S,) of a face that keeps still, which tells a model's style encoder from another's."""
     import torch
 
     from facediff.data import Reference
 
-    return len(vector_of(Reference("still", torch.zeros(1, model.n_vertices, model.dims)), model))
+    return vector_of(Reference("still", torch.zeros(1, model.n_vertices, model.dims)), model)
 
 
 def extract_style(clips: Sequence[StyleLike], identity: str, model: AnimationModel) -> Tensor:
@@ -231,7 +237,8 @@ def style_of(
 
     assets, path, scale = model.assets, opened.path, 1.0
     if opened.array.ndim == 1:
-        return Style(path.stem, read_vector(opened, model))
+        still = still_style(model).numpy()
+        return Style(path.stem, torch.from_numpy(vector_in(opened, len(still), still)))
     refuse_vertices(path, model)
     if opened.template is None:
         face, whose, rate = face_of_array(opened, identity, model, template)
@@ -314,20 +321,6 @@ def corpus_clip(name: str, model: AnimationModel) -> StyleFile:
     motion = open_motion(path, model.n_vertices)
     # Vertices also where the corpus keeps weights of shapes: its templates and frame rate belong to them.
     return StyleFile(path.parent.parent / MOTION_FOLDERS[0] / path.name, np.asarray(motion.read(range(motion.frames))))
-
-
-def read_vector(opened: StyleFile, model: AnimationModel) -> Tensor:
-    """A style vector, if it is as long as this model's are."""
-    import numpy as np
-    import torch
-
-    vector, width = np.array(opened.array, np.float32), style_width(model)
-    if len(vector) != width or not np.isfinite(vector).all():
-        raise OptionError.naming(
-            f"{{style}} {opened.path}: holds {len(vector)} numbers, but this checkpoint's style vectors have {width} "
-            f"(no NaN); make one with `facediff style extract` from this very checkpoint"
-        )
-    return torch.from_numpy(vector)
 
 
 def face_of_array(

@@ -20,6 +20,7 @@ from facediff.animation.style_files import (
     split_styles,
     stride_of,
     style_given,
+    vector_in,
 )
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.graphs import ExportedGraphs
@@ -106,13 +107,9 @@ def _of_vertices(opened: StyleFile, model: ExportedGraphs, identity: str) -> Run
     """The style of motion in vertices, or a vector."""
     about, vectors, path = model.description, model.arrays["styles"], opened.path
     if opened.array.ndim == 1:
-        vector = np.array(opened.array, np.float32)
-        if vector.shape != vectors.shape[1:] or not np.isfinite(vector).all():
-            raise OptionError.naming(
-                f"{{style}} {path}: holds {len(vector)} numbers, but this model's style vectors have "
-                f"{vectors.shape[1]} (no NaN); make one with `facediff style extract` from the same checkpoint"
-            )
-        return RuntimeStyle(path.stem, vector)
+        rest = np.zeros((1, *_points(model)), np.float32)
+        still = encode_style(model, rest, "still").vector if model.has("style") else None
+        return RuntimeStyle(path.stem, vector_in(opened, vectors.shape[1], still))
     if not about.motion_space.is_vertices:
         raise OptionError.naming(
             f"{{style}} {path}: holds vertices, and this model takes channels; give motion in parameters, a style of "
@@ -145,10 +142,15 @@ def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyl
             f"style: the folder has no style encoder, so {model.description.model} takes styles by name alone; "
             f"choose one of {', '.join(model.description.styles[:5])}, or export the model again"
         )
-    space = model.description.motion_space
-    points = (len(space.channels) or model.arrays["templates"].shape[1], space.dims)
+    points = _points(model)
     motion = np.ascontiguousarray(motion, np.float32)
     if motion.ndim != 3 or not len(motion) or motion.shape[1:] != points or not np.isfinite(motion).all():
         raise FaceDiffError(f"style: is {motion.shape}; expected finite offsets (frames, {points[0]}, {points[1]})")
     inputs = {"motion": motion[None], "mask": np.ones((1, len(motion)), bool)}
     return RuntimeStyle(name, model.run("style", inputs)[0][0])
+
+
+def _points(model: ExportedGraphs) -> tuple[int, int]:
+    """Points of a frame, and numbers of a point."""
+    space = model.description.motion_space
+    return len(space.channels) or model.arrays["templates"].shape[1], space.dims

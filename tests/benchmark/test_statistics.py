@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -126,6 +127,23 @@ def test_a_sentence_without_a_value_in_a_run_does_not_count_there() -> None:
     assert gap.value == pytest.approx(expected)
     assert gap.sentences is not None
     assert gap.sentences.low < expected < gap.sentences.high
+
+
+def test_a_sentence_that_one_row_has_no_value_of_is_not_compared() -> None:
+    """As zero it would be a gap as large as the other row's score."""
+    rng = np.random.default_rng(7)
+    frames = rng.integers(10, 90, 12).astype(float)
+    values, others = 5 + rng.normal(0, 1, (2, 12)), 5 + rng.normal(0, 1, (2, 12))
+    lacking = values.copy()
+    lacking[:, 3] = np.nan
+    kept = np.arange(12) != 3
+    one, other = (scores(side[:, kept], frames[kept]) for side in (values, others))
+    names = tuple(name for name in map(str, range(12)) if name != "3")
+    expected = difference(replace(one, clips=names), replace(other, clips=names), BOOTSTRAP)
+    whole = scores(others, frames)
+    gap = difference(RowScores(one.runs, lacking, frames, whole.clips), whole, BOOTSTRAP)
+    assert (gap.value, gap.p_sentences, gap.common) == (expected.value, expected.p_sentences, 11)
+    assert gap.sentences == expected.sentences
 
 
 def scipy_both(one: np.ndarray, other: np.ndarray, frames: np.ndarray) -> object:

@@ -20,6 +20,7 @@ from facediff.models.adaptation import grow
 from facediff.models.audio_distillation import encoder_weights
 from facediff.models.checkpoint import read_checkpoint
 from facediff.models.checkpoint_content import IMPORTED, PROVENANCE_KEY
+from facediff.models.styles import still_style
 from facediff.utils.pickles import load_pickle
 from tests.fakes.tiny import Tiny
 
@@ -139,7 +140,9 @@ def test_a_style_vector_does_what_its_clip_does(
     soundfile.write(tmp_path / "speech.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
     vector = tmp_path / "B.npy"
     assert main(["style", "extract", "B_e02", "--checkpoint", str(path), "-o", str(vector)]) == 0
-    assert np.load(vector).ndim == 1
+    written = np.load(vector)
+    assert written.ndim == 1
+    np.testing.assert_allclose(written[len(written) // 2 + 1 :], still_style(load_model(path)), atol=1e-6)
     made = []
     for style in ("B_e02", str(vector)):
         out = tmp_path / "out.npy"

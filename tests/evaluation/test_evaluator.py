@@ -168,6 +168,22 @@ def test_methods_are_compared_by_them(corpus: Files) -> None:
     assert "theirs − ours: lip_speed_correlation" in text(two)
 
 
+def test_a_clip_of_which_one_method_has_no_value_is_not_compared(corpus: Files) -> None:
+    path = next(corpus.method("theirs").glob("A_e03*"))
+    np.save(path, np.zeros_like(np.load(path)))  # a mouth that does not move is neither early nor late
+    metric = "temporal_misalignment:smoothing=0"
+    report = corpus.evaluate("ours", "theirs", metrics=[metric], corpus=corpus.root, protocols=["meshtalk"])
+    rows = {(row["method"], row["clip"]): row[f"metrics/{metric}"] for row in report.rows()}
+    assert rows["theirs", "A_e03"] is None
+    assert rows["ours", "A_e03"] is not None
+    clips = [clip for clip in LENGTHS if rows["theirs", clip] is not None and rows["ours", clip] is not None]
+    gaps = [rows["theirs", clip] - rows["ours", clip] for clip in clips]
+    (found,) = [each for each in report.comparisons if each.metric == metric]
+    assert (found.difference, found.sequences) == (pytest.approx(np.mean(gaps)), len(clips))
+    (line,) = [line for line in text(report).splitlines() if f"theirs − ours: {metric}" in line]
+    assert line.split()[-1] == str(len(clips))
+
+
 @pytest.mark.parametrize(
     ("metric", "missing", "names"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import partial
 
@@ -21,6 +22,9 @@ from facediff.metrics import (
     temporal_misalignment,
     upper_face_vertex_error,
 )
+from facediff.metrics.by_name import OF_ALL_FRAMES
+from tests.metrics.conftest import Corpus
+from tests.metrics.further_cases import CASES, Case
 
 seeds = st.integers(0, 2**31)
 frames = st.integers(3, 15)
@@ -134,3 +138,24 @@ def test_misalignment_is_none_with_itself_and_sees_no_size(seed: int, length: in
         assert lag(4 * p, 4 * g) == value
         assert 0 <= value < length
     assert lag(g, g) == 0
+
+
+@pytest.mark.parametrize(
+    "case", {type(case.make()): case for case in CASES if "FramePair" not in case.name}.values(), ids=str
+)
+def test_metrics_that_depend_on_the_order_of_frames_say_so(case: Case, corpus: Corpus) -> None:
+    """But for pairs of frames that are drawn at random; those that read the time of speech are not asked."""
+    scores = [case.make(), case.make()]
+    taken = inspect.signature(scores[0].update).parameters.keys()
+    if not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken:
+        return
+    batch = case.arguments(corpus, range(len(corpus.truths)), 0)
+    mixed = {name: batch[name].clone() for name in ("prediction", "truth", "partner") if name in batch}
+    for place, truth in enumerate(corpus.truths):
+        order = torch.randperm(len(truth), generator=torch.Generator().manual_seed(place))
+        for motion in mixed.values():
+            motion[place, : len(truth)] = motion[place, order]
+    scores[0].update(**batch)
+    scores[1].update(**batch | mixed)
+    one, other = (score.compute().item() for score in scores)
+    assert (one != pytest.approx(other, rel=1e-3)) == scores[0].in_order

@@ -46,6 +46,25 @@ def test_each_seen_identity_lends_itself_and_its_style(tiny: Tiny) -> None:
         conditioned(batch, "adapted", assets.identities, assets.references)
 
 
+@pytest.mark.parametrize(("policy", "people"), [("style_only", ["A", "unknown"]), ("each_seen", ["A", "A", "B"])])
+def test_strangers_are_predicted_as_they_are_tested(
+    policy: str, people: list[str], make_model: Make, tiny: Tiny
+) -> None:
+    model = make_model(unseen_identity=policy).eval()
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    batch = collate([tiny.dataset("test_a")[0], tiny.dataset("test_b")[0]])
+    with torch.inference_mode():
+        predictions = model.predict_step(batch, 0)
+        assert [clip.identity for clip in predictions] == people
+        assert [clip.name for clip in predictions] == [batch.names[0], *batch.names[1:] * (len(people) - 1)]
+        views = conditioned(batch, model.unseen_identity, model.identities, tiny.assets().references)
+        expected = [
+            motion + face for _, view in views for motion, face in zip(model.generate(view), view.template, strict=True)
+        ]
+    for clip, motion in zip(predictions, expected, strict=True):
+        torch.testing.assert_close(clip.vertices, motion[: len(clip.vertices)])
+
+
 @pytest.mark.parametrize(("method", "logged"), [("model", "test_b/lve"), ("shuffled", "test_b/shuffled/lve")])
 @pytest.mark.slow
 def test_the_mean_over_identities_is_reported(

@@ -141,6 +141,14 @@ def test_metrics_that_read_the_clips_time_take_whole_clips() -> None:
             parse(name)
 
 
+@pytest.mark.parametrize("name", ["frame_step", "step_distance:region=jaw", "blink_rate", "blink_rate_ratio"])
+def test_metrics_of_frames_in_order_take_whole_clips(name: str) -> None:
+    """A step across frames that are left out is no step of the motion."""
+    assert parse(name).moment == "all"
+    with pytest.raises(FaceDiffError, match="omit the prefix"):
+        parse(f"l_{name}")
+
+
 def test_wrong_names_are_refused_with_the_nearest(make_model: Make) -> None:
     with pytest.raises(FaceDiffError, match="lip_vertex_error"):
         _ = make_model(metrics=["lip_vertex_eror"]).evaluation

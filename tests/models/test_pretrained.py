@@ -18,7 +18,7 @@ from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.checkpoint import checked_file, read_assets, read_checkpoint
-from facediff.models.pretrained import coded, decoded, stored_once
+from facediff.models.pretrained import coded, decoded, read_model, stored_once, write_model
 from facediff.utils.licences import Licence, commercial_use
 from facediff.utils.safetensors import read_safetensors, write_safetensors
 from tests.fakes.tiny import Tiny, write_tiny
@@ -131,6 +131,17 @@ def test_equal_tensors_are_stored_once(checkpoint: Path, published: Path) -> Non
         **json.loads((published / "config.json").read_text())["shared"],
     }
     assert total.keys() == torch.load(checkpoint, weights_only=True)["state_dict"].keys()
+
+
+def test_half_leaves_a_buffer_that_equals_a_parameter_as_it_is(checkpoint: Path, tmp_path: Path) -> None:
+    model = load_model(checkpoint)
+    values = torch.linspace(0, 1, 1000)
+    model.network.step_embedding.register_buffer("constant", values)
+    model.network.embed.weight = torch.nn.Parameter(values.clone())
+    write_model(model, tmp_path, half=True)
+    written = read_model(tmp_path)["state_dict"]
+    torch.testing.assert_close(written["network.embed.weight"], values.half(), rtol=0, atol=0)
+    torch.testing.assert_close(written["network.step_embedding.constant"], values, rtol=0, atol=0)
 
 
 def test_half_is_smaller_and_near(checkpoint: Path, published: Path, tmp_path: Path) -> None:

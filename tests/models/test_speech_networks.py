@@ -92,6 +92,31 @@ def test_hubert_training_is_not_random_by_default(
         assert any(not torch.allclose(out, calm, atol=1e-3) for out in trained), option
 
 
+@pytest.mark.parametrize("spec_augment", [False, True])
+def test_layer_drop_spares_frozen_layers(hubert_source: Path, spec_augment: bool) -> None:
+    encoder = HubertEncoder(
+        dim=8, source=str(hubert_source), frozen_layers=1, layer_drop=1.0, spec_augment=spec_augment
+    ).train()
+    run: list[int] = []
+    for number, layer in enumerate(encoder.hubert.encoder.layers):
+        layer.register_forward_hook(lambda *_, number=number: run.append(number))
+    encoder(*clip(50))
+    assert run == [0]
+
+
+@pytest.mark.parametrize("frames", [3, 50])
+def test_several_processes_give_every_hubert_weight_a_gradient(
+    hubert_source: Path, frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of layers that are skipped, and of the mask where speech is too short for one."""
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    encoder = HubertEncoder(
+        dim=8, source=str(hubert_source), frozen_layers=1, layer_drop=1.0, spec_augment=True
+    ).train()
+    encoder(*clip(frames)).square().sum().backward()
+    assert [name for name, value in encoder.named_parameters() if value.requires_grad and value.grad is None] == []
+
+
 @pytest.mark.parametrize("frames", [1, 2, 13, 50])
 def test_hubert_has_two_steps_for_every_frame(hubert_source: Path, frames: int) -> None:
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()

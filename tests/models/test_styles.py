@@ -13,7 +13,7 @@ import trimesh
 
 from facediff import registry
 from facediff.animation import Animation, write_archive
-from facediff.animation.style_files import Weighted, split_styles, style_paths
+from facediff.animation.style_files import Weighted, marked, split_styles, style_paths
 from facediff.data import Reference
 from facediff.errors import FaceDiffError
 from facediff.models import DiffPoseTalk, DualPathDiffusion, Style, import_checkpoint
@@ -39,6 +39,36 @@ def vector(style: Reference | Style, model: DualPathDiffusion) -> np.ndarray:
     motion = style.motion.float()[None]
     with torch.inference_mode():
         return model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool))[0].numpy()
+
+
+def test_a_vector_of_another_model_is_refused(
+    model: DualPathDiffusion, make_model: Callable[..., DualPathDiffusion], tmp_path: Path
+) -> None:
+    """By what its style encoder gives for a still face; a vector alone is taken as it is."""
+    other = make_model()
+    other.adopt(model.assets)
+    torch.manual_seed(5)
+    for weight in other.network.style_encoder.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    plain, path = vector(model.assets.references["A"], model), tmp_path / "a.npy"
+    still = vector(Reference("still", torch.zeros(3, model.n_vertices, 3)), model)
+    for written in (plain, marked(plain, still)):
+        np.save(path, written)
+        style = read_style(str(path), "B", model)
+        assert isinstance(style, Style)
+        np.testing.assert_array_equal(style.vector, plain)
+    with pytest.raises(FaceDiffError, match=r"a\.npy: is of another model.*style extract"):
+        read_style(str(path), "B", other.eval())
+    np.save(path, plain)
+    assert isinstance(read_style(str(path), "B", other), Style)
+    shorter = len(plain) // 2
+    for written in (plain[:shorter], marked(plain[:shorter], still[:shorter])):
+        np.save(path, written)
+        with pytest.raises(FaceDiffError, match=rf"holds {shorter} numbers.*have {len(plain)} "):
+            read_style(str(path), "B", model)
+    np.save(path, np.append(plain[1:], np.inf))
+    with pytest.raises(FaceDiffError, match="no NaN"):
+        read_style(str(path), "B", model)
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ import facediff
 from facediff import registry
 from facediff.animation import write_archive
 from facediff.animation.options import AnimationOptions
+from facediff.animation.style_files import marked
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion
@@ -225,7 +226,12 @@ def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Pat
     np.save(tmp_path / "B_1.npy", animation.vertices)  # a bare array, whose name says whose face it is
     own = runtime.arrays["styles"][runtime.description.styles.index("B")]
     np.save(tmp_path / "vector.npy", own)
-    for name in ("b.npz", "B_1.npy", "vector.npy"):
+    still = model.encode_style(torch.zeros(1, 5, 24, 3), torch.ones(1, 5, dtype=torch.bool))[0].detach().numpy()
+    np.save(tmp_path / "marked.npy", marked(own, still))  # as `facediff style extract` writes it
+    np.save(tmp_path / "another.npy", marked(own, still[::-1]))
+    with pytest.raises(FaceDiffError, match=r"another\.npy: is of another model"):
+        read_style(str(tmp_path / "another.npy"), runtime, "A")
+    for name in ("b.npz", "B_1.npy", "vector.npy", "marked.npy"):
         found = read_style(str(tmp_path / name), runtime, "A")
         np.testing.assert_allclose(found.vector, own, atol=1e-5)
         assert found.name == Path(name).stem

@@ -429,7 +429,11 @@ class SpeechStyle(nn.Module):
     With the statistics x of a clip's speech features (mean and deviation of each channel) and the clip's style vector
     s, W minimises E‖s − s̄ − W x̂‖² + λ‖W‖², where s̄ is the mean style of the clip's identity and x̂ is x, standardised
     over all speakers: a voice that was never heard has no mean of its own. The sums that this needs are updated in
-    every training step, at no further pass of an encoder, and older steps fade from them as the encoders change.
+    every training step, at no further pass of an encoder, and older steps fade from them as the encoders change. Where
+    several processes train, the first one's clips count, which are drawn from all in every epoch.
+
+    Speech is heard as it is animated: in a stream, each window asks by its own speech, and of windows of a second the
+    answers vary by half as much as those of different clips.
 
     Args:
         dim: channels of the speech features.
