@@ -8,7 +8,7 @@ from facediff.animation.options import LicenceOptions
 from facediff.cli.options import Checkpoint, Identity, Output
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
-from facediff.utils.hub import check_model_source
+from facediff.utils.hub import check_model_source, split_face
 from facediff.utils.option import Option
 
 
@@ -34,7 +34,7 @@ def extract(
     check_model_source(checkpoint, "--checkpoint")
 
     from facediff.animation.style_files import marked
-    from facediff.models import load_model
+    from facediff.models import ManyFaces, load_model
     from facediff.models.styles import extract_style, still_style
     from facediff.utils.files import atomic
 
@@ -44,7 +44,11 @@ def extract(
         raise FaceDiffError(f"{checkpoint}: was trained without a dynamic style, so it has no style vectors")
     import numpy as np
 
+    numbers = vector.numpy()
+    # Faces of one model take each other's styles, but each has its own encoder of meshes: they answer differently.
+    if not isinstance(model, ManyFaces) and split_face(checkpoint)[1] is None:
+        numbers = marked(numbers, still_style(model).numpy())
     with atomic(output) as temporary, temporary.open("wb") as stream:
-        np.save(stream, marked(vector.numpy(), still_style(model).numpy()), allow_pickle=False)
+        np.save(stream, numbers, allow_pickle=False)
     tell(f"{output}: style vector of {len(vector)} numbers from {', '.join(clips)}, for this checkpoint only")
     tell(f"next: facediff animate speech.wav --checkpoint {checkpoint} --style {output} -o speech.mp4")

@@ -23,6 +23,7 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
 from facediff.models.dual_path.network import TRUNK
+from facediff.models.styles import read_styles, vector_of
 from tests.fakes.channels import TinyChannels, write_channels
 from tests.fakes.tiny import VERTICES, Tiny, tiny_model_options, write_tiny
 
@@ -158,6 +159,13 @@ def test_each_face_is_a_model_of_its_own_by_its_name(
     one, other = (model.eval().animate(speech, identity="B", seed=1) for model in (own, head))
     assert torch.equal(one.vertices, other.vertices)
     assert whole.animate(speech, identity="B").vertices.shape[1:] == (24, 3)
+
+
+def test_faces_take_each_others_styles(roots: dict[str, Path], trained: Path, tmp_path: Path) -> None:
+    clip, vector = roots["halved"] / "vertices_npy" / "A_e02.npy", tmp_path / "style.npy"
+    assert main(["style", "extract", str(clip), "--checkpoint", f"{trained}:halved", "-o", str(vector)]) == 0
+    model = load_model(trained)
+    np.testing.assert_array_equal(vector_of(read_styles(str(vector), "B", model), model), np.load(vector))
 
 
 def test_a_name_of_no_face_is_refused(trained: Path) -> None:
