@@ -250,14 +250,6 @@ class Animation:
         wanted = round(self.seconds * self.sample_rate)
         return np.pad(self.speech[:wanted], (0, max(0, wanted - len(self.speech)))).astype(np.float32)
 
-    def heard(self) -> npt.NDArray[np.float32] | None:
-        """The speech (S,) at 16 kHz, as models hear it; None for a silent animation."""
-        if self.speech is None or self.sample_rate == SAMPLE_RATE:
-            return self.speech
-        from facediff.speech.audio import to_speech
-
-        return to_speech(self.speech, self.sample_rate, self.name)
-
     @with_options(ExportOptions, ExportKeywords)
     def save(self, path: str | Path, **options: Unpack[ExportKeywords]) -> list[Path]:
         """Write a file of any export format; all of it, or nothing.

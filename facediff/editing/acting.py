@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from facediff.editing.hearing import heard
 from facediff.errors import OptionError
 from facediff.registry import UnknownComponentError, acting, checks_arguments
 from facediff.speech.prosody import ProsodicEvent, ProsodyTracker
@@ -89,7 +90,7 @@ def acted(kind: Acting, speech: Wave, frames: int, frame_rate: float, seed: int)
 
 def act(kind: Acting, animation: Animation, seed: int) -> Acted:
     """The values (T, 5) for an animation with its speech."""
-    speech = animation.heard()
+    speech = heard(animation)
     if speech is None:
         raise OptionError.naming(f"{animation.name}: {{acting}}: has no speech to act on; give it with {{speech}}")
     return acted(kind, speech, len(animation.vertices), animation.frame_rate, seed)

@@ -509,12 +509,13 @@ class AnimationPipeline(ABC):
         alignment, transcript = self.options.alignment, self.options.transcript
         from facediff.animation.animation import PHONEMES
         from facediff.editing.closures import BUDGET, close_lips
+        from facediff.editing.hearing import heard
         from facediff.speech.phonemes import closed_times, phonemes_text, read_alignment
 
         if self._phonemes is None:
             if alignment is not None:
                 self._phonemes = read_alignment(Path(alignment))
-            elif transcript is not None and (speech := animation.heard()) is not None:
+            elif transcript is not None and (speech := heard(animation)) is not None:
                 from facediff.editing.transcripts import align_transcript
 
                 self._phonemes = align_transcript(transcript, speech)

@@ -18,6 +18,7 @@ from facediff.animation.files import FORMAT as ARCHIVE
 from facediff.animation.options import ExportOptions
 from facediff.editing import direction
 from facediff.editing.expressiveness import ALL, region_factors
+from facediff.editing.hearing import heard
 from facediff.editing.procedural import neck
 from facediff.errors import FaceDiffError
 from facediff.export.format import Format, check_animation, outward, speech_wav
@@ -160,7 +161,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
     speaking = next((animation for animation in animations if animation.speech is not None), None)
     sound = None
     if speaking is not None:  # it is stored as it is, three times as large at 48 kHz
-        sound = speech_wav(replace(speaking, speech=speaking.heard(), sample_rate=SAMPLE_RATE))
+        sound = speech_wav(replace(speaking, speech=heard(speaking), sample_rate=SAMPLE_RATE))
     compared: list[int] = []
     heat = None
     if truth is not None:
