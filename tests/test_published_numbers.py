@@ -16,6 +16,7 @@ import yaml
 
 from facediff.cli.app import main
 from facediff.data import Biwi, Mead3D, SpeechMotionDataModule, Vocaset
+from facediff.metrics import ShannonIndex
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder
 from facediff.models.losses import huber
@@ -122,6 +123,7 @@ DEFAULTS: list[tuple[Callable[..., Any], str, Any]] = [
     (TcnGruTransformer, "dilations", (1, 2, 4, 8, 16)),
     (TcnGruTransformer, "num_layers", 2),
     (HubertEncoder, "frozen_layers", 2),
+    (ShannonIndex, "clusters", 40),
     (HubertEncoder, "source", "facebook/hubert-base-ls960"),
     (Biwi, "batch_size", 1),
     (Vocaset, "batch_size", 1),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -52,3 +54,16 @@ def test_a_head_that_pauses_on_the_beat_is_aligned_and_one_between_the_beats_is_
         head_beat_alignment(still, still, waveform=torch.zeros(64_000), frames_per_second=FPS)
     with pytest.raises(ValueError, match="frames_per_second"):
         head_beat_alignment(still, still, waveform=torch.zeros(64_000))
+
+
+def test_speed_need_not_be_smoothed_and_sound_has_16_khz_unless_it_is_said() -> None:
+    head, sound = torch.randn(100, 1, 1, generator=torch.Generator().manual_seed(1)), clicks([0.6, 2.1])
+    options = {"waveform": sound, "frames_per_second": FPS, "smoothing": 0.0}
+    # Onset by onset the nearest minimum of the speed, which is that between two frames.
+    speed = head.flatten().diff().abs().tolist()
+    rests = [i + 0.5 for i in range(1, len(speed) - 1) if speed[i] < speed[i - 1] and speed[i] <= speed[i + 1]]
+    beats = [min(abs(rest - time * FPS) for rest in rests) for time in onsets(sound, RATE).tolist()]
+    expected = sum(math.exp(-(away**2) / 18) for away in beats) / len(beats)
+    assert head_beat_alignment(head, head, **options).item() == pytest.approx(expected, abs=1e-6)
+    assert head_beat_alignment(head, head, **options) == head_beat_alignment(head, head, sample_rate=RATE, **options)
+    assert head_beat_alignment(head, head, **options) != head_beat_alignment(head, head, sample_rate=15_000, **options)

@@ -76,6 +76,14 @@ def test_a_label_of_its_own_is_found_but_does_not_ask() -> None:
         alone.compute()
 
 
+def test_labels_are_whole_numbers_of_any_size() -> None:
+    metric = StyleRetrievalAccuracy(closeness="euclidean")
+    metric.update(torch.tensor([[0.0], [0.5], [5.0], [6.0]]), [2**24, 2**24, 2**24 + 1, 2**24 + 1])  # one in float32
+    metric.update(torch.tensor([[2.0]]), [2**24 + 1])
+    # The one at 2 is nearest to the other label's at 0.5, all others to their own.
+    assert metric.compute().item() == pytest.approx(4 / 5)
+
+
 def test_cosine_sees_no_length_and_euclid_does() -> None:
     embeddings = torch.tensor([[1.0, 0.0], [50.0, 1.0], [1.0, 1.2], [40.0, 41.0]])
     assert style_retrieval_accuracy(embeddings, [0, 0, 1, 1]).item() == 1.0

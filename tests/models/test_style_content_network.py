@@ -135,6 +135,12 @@ def test_the_speech_branch_asks_with_the_middle_step(window: int, ratio: float, 
         np.testing.assert_allclose(made[frame], expected, rtol=1e-4, atol=1e-4)
 
 
+def test_a_layer_of_windows_widens_twice_in_its_feed_forward_part() -> None:
+    part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=3, num_heads=2, num_layers=1)
+    weights = part.layers[0].feed_forward.parameters()
+    assert {tuple(weight.shape) for weight in weights if weight.ndim == 2} == {(16, 8), (8, 16)}
+
+
 @pytest.mark.parametrize("rate", [None, 25.0, 50.0, 60.0, 12.5])
 def test_speech_is_encoded_at_its_own_rate(tiny: Tiny, rate: float | None) -> None:
     """The audio encoder is asked for ``speech_rate`` steps a second, the windows lie as many apart as fit a frame."""
