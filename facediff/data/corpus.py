@@ -348,11 +348,18 @@ class Corpus:
         path = self.root / file
         if not path.is_file():
             return None
+        remedy = "expected one pair of vertex indices a line, such as 12, 34"
+        rows: list[list[int]] = []
+        for number, row in enumerate(read_table(path, remedy=remedy), 1):
+            try:
+                upper, lower = map(int, row)
+            except ValueError:
+                raise FaceDiffError(f"{path}: row {number} is {','.join(row)!r}; {remedy}") from None
+            rows.append([upper, lower])
         try:
-            table = read_table(path, remedy="expected one pair of vertex indices a line")
-            pairs = torch.tensor([[int(a), int(b)] for a, b in table])
-        except (ValueError, OverflowError, RuntimeError) as error:
-            raise FaceDiffError(f"{path}: {error}; expected one pair of vertex indices a line") from error
+            pairs = torch.tensor(rows)
+        except (OverflowError, RuntimeError) as error:
+            raise FaceDiffError(f"{path}: {error}; {remedy}") from error
         if pairs.numel() == 0 or int(pairs.min()) < 0 or int(pairs.max()) >= self.n_vertices:
             raise FaceDiffError(f"{path}: expected pairs of vertex indices 0 to {self.n_vertices - 1}")
         return pairs

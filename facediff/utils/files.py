@@ -27,8 +27,19 @@ ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then eve
 
 
 def cache_dir() -> Path:
-    """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    return Path(os.environ.get("FACEDIFF_CACHE") or Path.home() / ".cache" / "facediff")
+    """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``.
+
+    Raises:
+        FaceDiffError: without that variable, of a user who has no home directory.
+    """
+    if named := os.environ.get("FACEDIFF_CACHE"):
+        return Path(named)
+    try:
+        return Path.home() / ".cache" / "facediff"
+    except RuntimeError:
+        raise FaceDiffError(
+            "this user has no home directory; set the variable FACEDIFF_CACHE to a folder for what can be made again"
+        ) from None
 
 
 def config_dir() -> Path:

@@ -133,3 +133,10 @@ def test_parameters_that_lie_in_another_file_or_declare_gigabytes_are_refused(tm
     for name in ("group", "soft", "huge", "complex"):
         with pytest.raises(FaceDiffError, match=rf"{name}\.h5"):
             read_parameters(tmp_path / f"{name}.h5")
+
+
+@pytest.mark.parametrize("row", ["0 6 7", "0, 6, 7", "upper, lower"])
+def test_pairs_of_vertices_that_are_none_are_named_with_their_row(row: str, tmp_path: Path) -> None:
+    (tmp_path / "pairs.txt").write_text(f"0, 6\n{row}\n")
+    with pytest.raises(FaceDiffError, match=rf"pairs\.txt: row 2 is '{row}'; expected .* such as 12, 34"):
+        Corpus(tmp_path, n_vertices=9, frame_rate=25.0).read_pairs("pairs.txt")

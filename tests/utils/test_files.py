@@ -22,6 +22,7 @@ from facediff.utils.checksums import describe_files, same_sizes, sha256
 from facediff.utils.files import (
     atomic,
     atomic_folder,
+    cache_dir,
     check_writable,
     discard,
     locked,
@@ -434,3 +435,15 @@ def test_a_file_a_thousand_folders_deep_is_written(tmp_path: Path, monkeypatch: 
     assert (Path("a/" * 1200) / "x.txt").read_text() == "x"
     (Path("a/" * 1200) / "x.txt").unlink()
     os.removedirs("a/" * 1200)  # pytest's tidying up would call itself for each
+
+
+def test_a_user_without_a_home_directory_is_told_of_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.setenv("FACEDIFF_CACHE", "elsewhere")
+    assert cache_dir() == Path("elsewhere")
+    monkeypatch.delenv("FACEDIFF_CACHE")
+    with pytest.raises(FaceDiffError, match="no home directory; set the variable FACEDIFF_CACHE"):
+        cache_dir()
