@@ -209,6 +209,11 @@ def _clips(opened: Corpus | None, view: CorpusView, folder: CorpusFolder, findin
         with findings.guard("clips_table", folder.root / "clips.csv", folder.root):
             read = opened.clips
             clips = {name: read.get(name, clip) for name, clip in clips.items()}
+            from facediff.data.corpus import read_clip_table
+
+            if strangers := sorted(set(read_clip_table(folder.root)) - set(folder.names)):
+                message = f"has rows of clips that are not here: {few(strangers)}; a misspelt name loses its attributes"
+                findings.note("clips_table", "clips.csv", message)
     return clips
 
 

@@ -97,6 +97,7 @@ def wide(array: np.ndarray) -> np.ndarray:
 def remove_training_clips(root: Path) -> None:
     for path in (*root.glob("wav/[AB]_e0[1-4].wav"), *root.glob("vertices_npy/[AB]_e0[1-4].npy")):
         path.unlink()
+    (root / "clips.csv").unlink()  # its rows would be of clips that are not here
 
 
 def silent_header(root: Path) -> None:

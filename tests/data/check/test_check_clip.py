@@ -232,6 +232,12 @@ HARMLESS: list[tuple[str, Plant, set[str], str]] = [
     ("leftover", lambda r: (r / "wav" / ".A_e01.partial-7.wav").write_text(""), {"leftover"}, "half-written"),
     ("failed clips", lambda r: write_manifest(r, failed={"A_e09": "no sound"}), {"prepare_failed"}, "A_e09: no sound"),
     ("raw data incomplete", lambda r: write_manifest(r, missing={"A_e09": "?"}), {"prepare_missing"}, "A_e09"),
+    (
+        "table with a misspelt clip",
+        lambda r: (r / "clips.csv").write_text((r / "clips.csv").read_text().replace("A_e01", "A_eO1")),
+        {"clips_table"},
+        "not here: A_eO1; a misspelt name",
+    ),
     ("stray file", lambda r: (r / "wav" / "A_e01.mp3").write_text(""), {"stray_file"}, "wav/A_e01.mp3"),
     ("index named twice", lambda r: write_region(r, "1,2,2"), {"region_repeats"}, "1 index of lips"),
     (
