@@ -341,13 +341,13 @@ class Bench:
     def person(self, voice: str) -> dict[str, float]:
         """Closures of all test sentences in a voice without clips; faces and styles of test A take turns."""
         speaker, gaps, chances = open_voice(voice), [], []
-        spoken = list(zip(TEST, cycle(self.samples["test_a"][::3]), strict=False))
-        for draw, (text, sample) in product(range(DRAWS), spoken):
+        for text, sample in zip(TEST, cycle(self.samples["test_a"][::3]), strict=False):
             said = speaker.speak(text)
-            opened = self.opening(self.animate(0.6 * said.samples / np.abs(said.samples).max(), sample, draw))
             rest = self.opening(sample.template.double().numpy()[None] * 1000)
             times = closures((TimedPhoneme(*astuple(each)) for each in said.phonemes), self.model.frame_rate)
-            for start, end in times:
+            speech = 0.6 * said.samples / np.abs(said.samples).max()
+            draws = [self.opening(self.animate(speech, sample, draw)) for draw in range(DRAWS)]
+            for opened, (start, end) in product(draws, times):
                 if end <= len(opened):
                     gaps.append(float((opened[start:end] - rest).min()))
                     chances.append(_chance(opened - rest < 1, end - start))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -188,7 +188,9 @@ def marked(vector: npt.NDArray[np.float32], still: npt.NDArray[np.float32]) -> n
     return np.concatenate([vector, [np.float32(np.inf)], still])
 
 
-def vector_in(opened: StyleFile, width: int, still: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float32]:
+def vector_in(
+    opened: StyleFile, width: int, still: Callable[[], npt.NDArray[np.float32]] | None
+) -> npt.NDArray[np.float32]:
     """The style vector (S,) of a file that holds one, alone or as :func:`marked` with its encoder's answer.
 
     Of a vector alone nobody can say whose it is.
@@ -196,7 +198,7 @@ def vector_in(opened: StyleFile, width: int, still: npt.NDArray[np.float32] | No
     Args:
         opened: the file.
         width: S of the model.
-        still: the answer of the model's own encoder (S,); None if it has none to ask.
+        still: gives the answer of the model's own encoder (S,); None if it has none to ask.
 
     Raises:
         FaceDiffError: if it has another length, or is not finite, or of another model.
@@ -206,18 +208,16 @@ def vector_in(opened: StyleFile, width: int, still: npt.NDArray[np.float32] | No
     values, middle = np.array(opened.array, np.float32), len(opened.array) // 2
     divided = len(values) % 2 == 1 and bool(np.isinf(values[middle]))
     vector = values[:middle] if divided else values
-    name, remedy = (
-        f"{{style}} {opened.path}",
-        "make one with `facediff style extract` from this model's checkpoint",
-    )
+    name = f"{{style}} {opened.path}"
+    remedy = "make one with `facediff style extract` from this model's checkpoint"
     if len(vector) != width or not np.isfinite(vector).all():
         raise OptionError.naming(
             f"{name}: holds {len(vector)} numbers, but this model's style vectors have {width} (no NaN); {remedy}"
         )
     if divided and still is not None:
-        answer = values[middle + 1 :]
-        limit = OTHER_ENCODER * max(np.linalg.norm(answer), np.linalg.norm(still))
-        if not np.linalg.norm(answer - still) <= limit:
+        answer, own = values[middle + 1 :], still()
+        limit = OTHER_ENCODER * max(np.linalg.norm(answer), np.linalg.norm(own))
+        if not np.linalg.norm(answer - own) <= limit:
             raise OptionError.naming(
                 f"{name}: is of another model, whose style encoder gives other numbers for a still face; {remedy}"
             )

@@ -238,7 +238,7 @@ def style_of(
     assets, path, scale = model.assets, opened.path, 1.0
     if opened.array.ndim == 1:
         still = still_style(model).numpy()
-        return Style(path.stem, torch.from_numpy(vector_in(opened, len(still), still)))
+        return Style(path.stem, torch.from_numpy(vector_in(opened, len(still), lambda: still)))
     refuse_vertices(path, model)
     if opened.template is None:
         face, whose, rate = face_of_array(opened, identity, model, template)

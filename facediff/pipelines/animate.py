@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
     from facediff.spaces.decoding import ChannelDecoder
-    from facediff.speech.audio import Recording
+    from facediff.speech.audio import SpeechRecording
     from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.stream import AnimationStream, VertexGenerator
     from facediff.speech.voice_activity import MouthAtRest
@@ -256,7 +256,7 @@ class AnimationPipeline(ABC):
         return seconds, 12 * frames * len(self.facts["template"])
 
     def write(
-        self, recording: Recording, output: Path, export: ExportOptions, *, seed: int | None = None
+        self, recording: SpeechRecording, output: Path, export: ExportOptions, *, seed: int | None = None
     ) -> tuple[list[Path], Animation]:
         """Animate a recording and write the animations.
 
@@ -304,7 +304,7 @@ class AnimationPipeline(ABC):
 
     @contextmanager
     def animations(
-        self, recording: Recording, output: Path | None = None, *, seed: int | None = None
+        self, recording: SpeechRecording, output: Path | None = None, *, seed: int | None = None
     ) -> Iterator[list[Animation]]:
         """Finished samples of a recording; long ones are on disk as long as the context lasts.
 
@@ -443,7 +443,7 @@ class AnimationPipeline(ABC):
             writer.close()
         return [open_array(writer.path) for writer in writers]
 
-    def _animation(self, vertices: Array, recording: Recording, name: str, seed: int) -> Animation:
+    def _animation(self, vertices: Array, recording: SpeechRecording, name: str, seed: int) -> Animation:
         from facediff.animation import Animation
         from facediff.version import __version__
 

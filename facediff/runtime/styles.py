@@ -107,9 +107,12 @@ def _of_vertices(opened: StyleFile, model: ExportedGraphs, identity: str) -> Run
     """The style of motion in vertices, or a vector."""
     about, vectors, path = model.description, model.arrays["styles"], opened.path
     if opened.array.ndim == 1:
-        rest = np.zeros((1, *_points(model)), np.float32)
-        still = encode_style(model, rest, "still").vector if model.has("style") else None
-        return RuntimeStyle(path.stem, vector_in(opened, vectors.shape[1], still))
+
+        def still() -> Array:
+            return encode_style(model, np.zeros((1, *_points(model)), np.float32), "still").vector
+
+        vector = vector_in(opened, vectors.shape[1], still if model.has("style") else None)
+        return RuntimeStyle(path.stem, vector)
     if not about.motion_space.is_vertices:
         raise OptionError.naming(
             f"{{style}} {path}: holds vertices, and this model takes channels; give motion in parameters, a style of "

@@ -83,8 +83,10 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
 
 
 def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
-    """Read a recording as :func:`read_speech` does, for :func:`to_sound`'s samples and rate."""
-    return to_sound(*_read(path, None), str(path))
+    """Read a recording as :func:`read_speech` does, at its own rate from 16 to 48 kHz; the samples and the rate."""
+    samples, rate = _read(path, None)
+    own = _rate_to_play(rate)
+    return _resampled(_checked(samples, str(path)), rate, own), own
 
 
 def _read(path: Path, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
@@ -128,10 +130,9 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
     return _resampled(_checked(samples, name), rate, SAMPLE_RATE)
 
 
-def to_sound(samples: npt.NDArray[np.floating], rate: float, name: str) -> tuple[npt.NDArray[np.float32], int]:
-    """Such samples as (S',) float32 mono at their own rate, from 16 to 48 kHz; the samples and the rate."""
-    own = int(min(max(rate, SAMPLE_RATE), PLAYED))
-    return _resampled(_checked(samples, name), rate, own), own
+def _rate_to_play(rate: float) -> int:
+    """The sample rate at which sound is kept for playing: its own, from 16 to 48 kHz."""
+    return int(min(max(rate, SAMPLE_RATE), PLAYED))
 
 
 def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
@@ -321,7 +322,7 @@ def samples_for(frames: int, frame_rate: float) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class SpeechRecording:
     """A recording to animate.
 
     Attributes:
@@ -337,16 +338,17 @@ class Recording:
     rate: int
 
     @classmethod
-    def of(cls, samples: npt.NDArray[np.floating], rate: float, name: str, source: str) -> Recording:
+    def of(cls, samples: npt.NDArray[np.floating], rate: float, name: str, source: str) -> SpeechRecording:
         """Of samples (S,), full scale 1, at any rate; ``source`` is what errors call them."""
-        speech = to_speech(samples, rate, source)
+        mono, own = _checked(samples, source), _rate_to_play(rate)
+        speech = _resampled(mono, rate, SAMPLE_RATE)
         check_speech(speech, source)
-        return cls(name, speech, *((speech, SAMPLE_RATE) if rate <= SAMPLE_RATE else to_sound(samples, rate, source)))
+        return cls(name, speech, speech if own == SAMPLE_RATE else _resampled(mono, rate, own), own)
 
 
-def read_recording(path: Path, max_seconds: float | None = None) -> Recording:
+def read_recording(path: Path, max_seconds: float | None = None) -> SpeechRecording:
     """A wav, flac, ogg, mp3 or video file, to animate."""
-    return Recording.of(*_read(path, max_seconds), path.stem, str(path))
+    return SpeechRecording.of(*_read(path, max_seconds), path.stem, str(path))
 
 
 def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
@@ -356,7 +358,7 @@ def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
         raise FaceDiffError(f"{name}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
 
 
-def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | None = None) -> Recording:
+def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | None = None) -> SpeechRecording:
     """A recording to animate, from whatever it may be given as.
 
     Args:
@@ -374,7 +376,7 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
             return read_recording(Path(speech), max_seconds)
         file = cast("IO[bytes]", speech)
         path = file.name if isinstance(getattr(file, "name", None), str) else "speech"
-        return Recording.of(*_read_open(file, path, max_seconds), Path(path).stem, path)
+        return SpeechRecording.of(*_read_open(file, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
         if rate is not None or len(speech) != 2:
             raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
@@ -390,10 +392,10 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
     if max_seconds is not None and seconds > max_seconds:
         raise OptionError("max_seconds", f"speech lasts {seconds:.0f} s; cut it or raise the limit", f"{max_seconds:g}")
     LIMITS.check("seconds", seconds, "speech")
-    return Recording.of(waveform, rate, "speech", "speech")
+    return SpeechRecording.of(waveform, rate, "speech", "speech")
 
 
-def _of_data_set(audio: Mapping[str, Any], rate: float | None, max_seconds: float | None) -> Recording:
+def _of_data_set(audio: Mapping[str, Any], rate: float | None, max_seconds: float | None) -> SpeechRecording:
     """Speech as data sets of the Hugging Face hub hold it: decoded, or a file's content and name."""
     name = Path(audio["path"]).stem if audio.get("path") else "speech"
     if rate is not None:
