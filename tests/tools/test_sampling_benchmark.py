@@ -45,6 +45,9 @@ def test_the_ratios_follow_from_the_parts(output: Output) -> None:
     shorter = by_default["total"] - (by_default["steps"] - full["steps"]) * by_default["per_step"]
     assert ratios["peer_to_default"] == pytest.approx(peer / shorter)
     assert ratios["vertices_5023"] > 0
+    student = numbers["student"]
+    assert student["peer"] == pytest.approx(peer / student["measured"])
+    assert student["real_time_factor"] == pytest.approx(student["measured"] / numbers["seconds"])
 
 
 def test_the_printed_table_holds_the_same_numbers(output: Output) -> None:

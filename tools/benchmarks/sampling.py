@@ -3,6 +3,8 @@
 Run ``python tools/benchmarks/sampling.py``: 10 s of noise as speech, 23 370 vertices as in BIWI, HuBERT base and the
 dual-path network at width 512, all with random weights, so nothing is downloaded. The default sampler is run from
 start to end. A step's cost does not depend on its number, so for the others a few steps are timed and multiplied.
+A student, with the mel encoder that ``facediff adapt --low-latency --audio-encoder mel`` puts in HuBERT's place and a
+few steps, is run too; how good it is, random weights cannot tell (docs/streaming.md, docs/generation.md).
 The quickest of the repeats counts, since other programs make work slower but never quicker, and steps that are
 compared take turns, so that whatever else the machine does meets them alike.
 """
@@ -23,6 +25,7 @@ from facediff import registry
 from facediff.speech.audio import SAMPLE_RATE
 
 PEER_STEPS = 500
+STUDENT_STEPS = 3
 SAMPLERS = ("ddpm", "ddim", "dpm_solver")
 FLAME = 5023
 CONFIGURATIONS = (("ddpm", 1000), ("ddim", 50), ("ddim", 25), ("ddim", 10), ("dpm_solver", 20), ("dpm_solver", 10))
@@ -76,6 +79,19 @@ def sizes(args: argparse.Namespace, bench: Bench) -> dict[str, float]:
         f"{args.vertices}: ratio {large / small:.3f}"
     )
     return found
+
+
+def student(args: argparse.Namespace, seconds: float, peer: float) -> dict[str, Any]:
+    """The student from start to end, and how many times as long a peer takes that encodes the speech in each step."""
+    bench = build(args, args.vertices, tiny_encoder=args.tiny_encoder, student=True)
+    bench.model.choose_sampler(steps=STUDENT_STEPS)
+    took = bench.quickest(lambda: bench.model.generate(bench.batch))
+    print(
+        f"  (f) the mel encoder in place of HuBERT and {STUDENT_STEPS} steps, in full: {took:.4f} s, real-time factor "
+        f"{took / seconds:.4f}; the {PEER_STEPS} steps of (c) take {peer / took:.0f} times as long",
+        flush=True,
+    )
+    return {"steps": STUDENT_STEPS, "measured": took, "real_time_factor": took / seconds, "peer": peer / took}
 
 
 def options() -> argparse.Namespace:
@@ -134,6 +150,8 @@ def main(args: argparse.Namespace) -> None:
     print(text, flush=True)
     relations |= {"vertices_" + name: value for name, value in sizes(args, bench).items()}
     found = {"seconds": seconds, "costs": asdict(costs), "rows": rows, "ratios": relations, "full": full}
+    if full is not None:
+        found["student"] = student(args, seconds, relations["peer_seconds"])
     if full is not None:
         print(f"  the default sampler in full: measured / extrapolated {full['measured'] / usual['total']:.3f}")
     print(f"peak memory with sampling on vertices: {peak_memory(args.device)}")

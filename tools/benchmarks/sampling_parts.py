@@ -14,7 +14,7 @@ from torch import Tensor
 
 from facediff.data import Assets, Batch, Sample, collate
 from facediff.models import DualPathDiffusion
-from facediff.models.audio_encoders import HubertEncoder
+from facediff.models.audio_encoders import HubertEncoder, MelEncoder
 from facediff.models.decoders import StyleTransformer
 from facediff.models.dual_path.network import Conditions
 from facediff.models.folding import ConditionalDenoiser, SamplingSpace, fold
@@ -199,8 +199,15 @@ class Bench:
         return costs
 
 
-def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Bench:
-    """The model with random weights, its assets, and one clip of noise as speech."""
+def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool, student: bool = False) -> Bench:
+    """The model with random weights, its assets, and one clip of noise as speech.
+
+    Args:
+        args: its sizes, as attributes.
+        vertices: of the face.
+        tiny_encoder: a tiny HuBERT instead of HuBERT base.
+        student: the mel encoder, as ``adapt --low-latency --audio-encoder mel`` puts it in HuBERT's place.
+    """
     from transformers import HubertConfig
 
     torch.manual_seed(0)
@@ -217,7 +224,7 @@ def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool) -> Ben
         identities=IDENTITIES,
         frame_rate=FRAME_RATE,
         dim=args.dim,
-        audio_encoder=partial(HubertEncoder, config=config),
+        audio_encoder=partial(MelEncoder) if student else partial(HubertEncoder, config=config),
         style_encoder=partial(TcnGruTransformer, num_heads=args.heads),
         fusion=partial(BidirectionalCrossAttention, num_heads=args.heads),
         decoder=partial(StyleTransformer, num_layers=args.layers, num_heads=args.heads),
