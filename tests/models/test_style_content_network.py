@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import StyleContentDisentanglement
 from facediff.models.style_content.losses import pair_up, relative_distance
 from facediff.models.style_content.network import WindowedTransformer
+from facediff.pipelines.export_model import quiet
 from facediff.speech.cepstra import align_features, cepstra
 from tests.fakes.style_content import make
 from tests.fakes.tiny import VERTICES, Tiny
@@ -139,6 +141,25 @@ def test_a_layer_of_windows_widens_twice_in_its_feed_forward_part() -> None:
     part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=3, num_heads=2, num_layers=1)
     weights = part.layers[0].feed_forward.parameters()
     assert {tuple(weight.shape) for weight in weights if weight.ndim == 2} == {(16, 8), (8, 16)}
+
+
+def test_windows_of_any_number_of_clips_become_a_graph() -> None:
+    """The exporter must not take the number of clips that it was shown for a constant."""
+
+    class Windows(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=3, num_heads=2, num_layers=1)
+
+        def forward(self, features: Tensor, lengths: Tensor) -> Tensor:
+            return self.part.windows(features, features.shape[1] // 2, 2.0, lengths)
+
+    module, any_size = Windows().eval(), torch.export.Dim.DYNAMIC
+    example, axes = (torch.randn(2, 8, 6), torch.tensor([8, 6])), ({0: any_size, 1: any_size}, {0: any_size})
+    with quiet():
+        graph = torch.export.export(module, example, dynamic_shapes=axes).module()
+    other = torch.randn(3, 10, 6), torch.tensor([8, 6, 4])
+    torch.testing.assert_close(graph(*other), module(*other))
 
 
 @pytest.mark.parametrize("rate", [None, 25.0, 50.0, 60.0, 12.5])
