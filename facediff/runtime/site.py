@@ -26,7 +26,7 @@ from facediff.runtime.onnxruntime_web import LICENCE
 from facediff.speech.audio import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
 from facediff.speech.windows import LOW_LATENCY_AHEAD
-from facediff.utils.files import atomic_folder
+from facediff.utils.files import atomic_folder, valid_text
 from facediff.utils.server import HEADERS as SERVED
 from facediff.utils.server import names_of, own_page_only, require_server, run_server
 
@@ -138,6 +138,7 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
     facts: dict[str, Any] = {
         "format": FORMAT,
         "archive": ARCHIVE,
+        "checkpoint": valid_text(title),
         "millimetres": millimetres(face),
         "inward": not np.array_equal(outward(face), face.triangles),
         "delays": DELAYS,

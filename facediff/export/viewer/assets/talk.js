@@ -422,6 +422,7 @@ class TalkingPage {
     const steps = windows?.quick && about.quick_steps.length ? about.quick_steps : about.steps;
     const found = {
       generator: `facediff ${about.facediff}, in a browser`,
+      checkpoint: this.facts.checkpoint,
       model: `${about.model}, exported in ${about.precision}`,
       corpus: about.synthetic ? `${about.corpus} (synthetic)` : about.corpus,
       ...about.licences,
