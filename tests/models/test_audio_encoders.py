@@ -32,6 +32,15 @@ def test_mel_filters_are_not_empty(encoder: MelEncoder) -> None:
     assert (encoder.filters.sum(1) > 0).all()
 
 
+def test_mel_bands_lie_between_60_and_7600_hertz() -> None:
+    """As documented, 64 of them: triangles between neighbours of evenly spaced mels, of unit area."""
+    first, last = (2595 * math.log10(1 + hertz / 700) for hertz in (60, 7600))
+    edges = 700 * (10 ** (np.linspace(first, last, 66) / 2595) - 1)
+    hertz = np.arange(257) * RATE / 512
+    expected = [np.interp(hertz, edges[i : i + 3], [0, 2 / (edges[i + 2] - edges[i]), 0]) for i in range(64)]
+    np.testing.assert_allclose(MelEncoder(dim=1).filters.numpy(), expected, rtol=1e-4, atol=1e-9)
+
+
 def test_mel_spectrum_of_a_tone_is_in_its_band(encoder: MelEncoder) -> None:
     for hertz in (200.0, 1000.0, 5000.0):
         audio = torch.sin(2 * math.pi * hertz * torch.arange(RATE) / RATE)[None]
