@@ -8,7 +8,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from facediff.models.layers import Attention, FeedForward, RotaryEmbedding, frame_mask, interpolate_frames
+from facediff.models.layers import (
+    Attention,
+    FeedForward,
+    RotaryEmbedding,
+    frame_mask,
+    interpolate_frames,
+    recurrent_nodes,
+)
+from tests.fakes.onnx_nodes import recurrent_node
 
 Array = NDArray[np.float64]
 
@@ -140,3 +148,16 @@ def test_feed_forward_against_numpy() -> None:
     hidden = linear(block[0], x.numpy())
     gelu = hidden * 0.5 * (1 + np.vectorize(erf)(hidden / np.sqrt(2)))
     np.testing.assert_allclose(block(x).detach().numpy(), linear(block[3], gelu), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
+@pytest.mark.parametrize("bidirectional", [False, True])
+def test_recurrent_networks_are_nodes_of_a_graph(
+    kind: type[nn.GRU | nn.LSTM], bidirectional: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the format's own definition of the nodes they are PyTorch's networks, of several layers too."""
+    torch.manual_seed(0)
+    network = kind(5, 3, num_layers=2, batch_first=True, bidirectional=bidirectional).double()
+    x = torch.randn(4, 6, 5, dtype=torch.float64)
+    monkeypatch.setattr("torch.onnx.ops.symbolic", recurrent_node)
+    torch.testing.assert_close(recurrent_nodes(network, x), network(x)[0], rtol=0, atol=1e-12)
