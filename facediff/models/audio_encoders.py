@@ -163,6 +163,7 @@ class AudioEncoder(nn.Module, ABC):
 class FrozenEncoder(AudioEncoder):
     """Base of encoders with a frozen part, whose features can be kept on disk."""
 
+    takes_padding = False  # such networks attend to all of a clip, see :func:`by_length`
     out: nn.Linear | None
 
     def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
@@ -353,7 +354,6 @@ class HubertEncoder(FrozenEncoder):
         MissingExtraError: if transformers is not installed.
     """
 
-    takes_padding = False
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
 
     def __init__(
@@ -554,7 +554,6 @@ class CtcEncoder(FrozenEncoder):
         MissingExtraError: if transformers is not installed.
     """
 
-    takes_padding = False
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
 
     def __init__(

@@ -106,7 +106,8 @@ class Graphs:
 
     Attributes:
         parts: the graphs.
-        equal_lengths: whether all clips of a batch must be of one length, since a part of the model knows no padding.
+        equal_lengths: whether all clips of a batch must be of one length, since a part of the model knows no padding;
+            reference motions of a batch always must.
         blending: how windows of long speech are joined.
         clock: how the model counts its frames.
         style: what a style is.

@@ -68,7 +68,7 @@ class Description:
         styles: names of the style vectors, in the order of the array ``styles``; a name of an identity is its default.
         windows: how long speech is cut, as :class:`~facediff.speech.windows.WindowPlan` takes it.
         epsilon: added to the variance of speech before it is standardised.
-        equal_lengths: whether all clips of a batch must be of one length.
+        equal_lengths: whether all clips of a batch must be of one length; reference motions of one always must.
         state: numbers in a frame of noisy motion.
         kept: numbers in a frame by which windows of long speech are blended.
         sampler: its name.

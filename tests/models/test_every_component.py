@@ -16,6 +16,7 @@ from facediff import registry
 from facediff.models.dual_path.network import StyleTokens
 from facediff.models.mesh_encoders import SpiralDown
 from facediff.models.style_content.network import WindowedTransformer
+from tests.fakes.onnx_nodes import recurrent_node
 
 Make = Callable[..., nn.Module]
 Call = Callable[..., tuple[Tensor, ...]]
@@ -45,6 +46,25 @@ def test_padding_changes_nothing(kind: str, name: str, make: Make, call: Call) -
         torch.testing.assert_close(row, alone, rtol=0, atol=1e-5)
         if kind == "audio_encoder":
             assert not together[i, LENGTHS[i] :].any()
+
+
+GRAPHED = [(kind, name) for kind in ("audio_encoder", "decoder") for name in registry.KINDS[kind].names()]
+
+
+@pytest.mark.parametrize("part", GRAPHED, ids="-".join)
+def test_a_part_says_whether_its_graph_takes_padding(
+    part: tuple[str, str], make: Make, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A graph cannot look at lengths: it is right on clips of one length, and on padded ones where the part says so."""
+    kind = part[0]
+    module = make(*part).eval()
+    expected = module(*call(kind, (1,)))[0]
+    monkeypatch.setattr("torch.compiler.is_exporting", lambda: True)
+    monkeypatch.setattr("torch.onnx.ops.symbolic", recurrent_node)
+    torch.testing.assert_close(module(*call(kind, (1, 1)))[1], expected, rtol=0, atol=1e-5)
+    padded = module(*call(kind, (1, 3)))[0, : LENGTHS[1]]
+    takes_padding = module.takes_padding if kind == "audio_encoder" else module.graph_takes_padding
+    assert torch.allclose(padded, expected, rtol=0, atol=1e-5) == takes_padding
 
 
 def test_gradient_reaches_every_parameter(
