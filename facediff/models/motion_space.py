@@ -323,12 +323,12 @@ class ComponentMotion(MotionSpace):
         Args:
             covariance: of the components, each of unit variance, over the frames of a window.
         """
-        deviations = self.components.deviations.cpu().double()[:, None]
+        deviations = self.components.deviations.cpu().double()
         variances, vectors = torch.linalg.eigh(covariance.double())
         variances = variances.clamp_min(0)
         shown = vectors[:, self.prior_frames // 2].square() * variances
-        sizes = self._sizes(deviations[:, 0])[:, None]
-        return (variances * sizes.square()).flatten(), (shown * deviations.square()).flatten()
+        noised = variances * self._sizes(deviations).square()[:, None]
+        return noised.flatten(), (shown * deviations.square()[:, None]).flatten()
 
     def _sizes(self, deviations: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         # In proportion to the largest, so that the unit of the corpus drops out; floored, since a corpus with fewer

@@ -227,6 +227,32 @@ def smooth(process: NoiseProcess, frames: int) -> TemporalPreconditioning:
     return scales
 
 
+def test_movements_over_a_window_add_up_to_what_noise_lets_show() -> None:
+    """Σ d² cᵀ (C + I / (b s)²)⁻¹ c, with the column c of the middle frame; as a frame of each component is smoothed."""
+    space = components(motion(), count=3, whitening=0.3, prior_frames=5)
+    places = torch.arange(5)
+    covariance = over_time(places[:, None] - places) / VARIANCES.double().view(-1, 1, 1)
+    noised, shares = (x.numpy() for x in space.modes(covariance))
+    own = space.components.deviations.double().numpy()
+    sizes = own[0] * (own / own[0]) ** 0.7
+    for scale in (0.03, 0.5, 8.0):
+        shown = [
+            d**2 * (c[2] @ np.linalg.solve(c + np.eye(5) / (scale * size) ** 2, c[2]))
+            for c, d, size in zip(covariance.numpy(), own, sizes, strict=True)
+        ]
+        gains = scale**2 * noised / (scale**2 * noised + 1)
+        assert float(shares @ gains) == pytest.approx(sum(shown), rel=1e-6)
+
+
+def test_movements_that_a_window_does_not_have_are_the_smallest_there_are() -> None:
+    """One that stands still within it has a single movement; the others' deviations are 1e-4 of its own."""
+    scales = TemporalPreconditioning(10, 2, 5)
+    covariance = torch.tensor([9.0, 0.04]).view(2, 1, 1) * torch.ones(5, 5)
+    scales.fit_covariance(NoiseProcess(10).signal, covariance, torch.ones(2))
+    deviations = scales.variances.sqrt() / torch.tensor([[3.0], [0.2]])
+    torch.testing.assert_close(deviations, 5**0.5 * torch.tensor([1e-4, 1e-4, 1e-4, 1e-4, 1.0]).expand(2, -1))
+
+
 @pytest.mark.parametrize("step", [0, 300, 999])
 def test_a_silent_network_smooths_by_the_frames_of_its_window(step: int) -> None:
     """The posterior mean by a linear system, in the middle and at both ends; padding changes nothing."""
