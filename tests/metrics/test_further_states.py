@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -15,10 +17,16 @@ from facediff.metrics import (
     ClipSpeechLipCorrelation,
     Coverage,
     FaceDynamicsDeviation,
+    FrechetDistance,
     IdentityDiversity,
     LipOpeningCorrelation,
     LipSpeedCorrelation,
+    LipWarpingDistance,
+    MotionLiveliness,
     MouthOpeningDifference,
+    RealTimeFactor,
+    SpectrumDistance,
+    StyleRetrievalAccuracy,
     TemporalMisalignment,
     face_dynamics_deviation,
     mouth_opening_difference,
@@ -93,6 +101,54 @@ def test_a_metric_says_what_it_is(case: Case) -> None:
     assert "{" not in words
     regions = [str(getattr(metric, name)) for name in ("region", "pairs") if hasattr(metric, name)]
     assert any(name in words for name in regions if name != "None") or "all vertices" in words
+
+
+def moving(frames: int, **more: Any) -> dict[str, Any]:  # noqa: ANN401
+    """A clip as arguments of a metric."""
+    clips = torch.randn(2, 1, frames, 5, 3, generator=torch.manual_seed(frames))
+    return {"prediction": clips[0], "truth": clips[1]} | more
+
+
+STILL = moving(40, truth=torch.zeros(1, 40, 5, 3))
+
+
+@pytest.mark.parametrize(
+    ("make", "too_little", "enough", "message"),
+    [
+        (partial(LipWarpingDistance, [0, 1]), {}, moving(40), "no sequence"),
+        (partial(MotionLiveliness, [0, 1]), STILL, moving(40), "divide by zero"),
+        (partial(SpectrumDistance, [0, 1]), STILL, moving(40), "divide by zero"),
+        (partial(FrechetDistance, [0, 1], dims=3), moving(1), moving(40), "one frame"),
+        (partial(RealTimeFactor, "this machine"), {}, {"computing": 2.0, "speech": 3.0}, "no clip"),
+        (
+            StyleRetrievalAccuracy,
+            {"embeddings": torch.eye(3), "labels": [0, 1, 2]},
+            {"embeddings": torch.eye(3) + 1, "labels": [0, 0, 3]},
+            "0 of them with another of the same label",
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:The ``compute`` method")  # torchmetrics' own, of compute before update
+def test_a_metric_goes_on_after_processes_had_too_little(
+    make: Callable[..., Any], too_little: dict[str, Any], enough: dict[str, Any], message: str
+) -> None:
+    """It leaves the states of all processes; here of two, of which one has nothing."""
+
+    def gathered(state: torch.Tensor, group: object) -> list[torch.Tensor]:
+        grows = make is StyleRetrievalAccuracy and state.numel() > 1
+        return [state, state[:0] if grows else torch.zeros_like(state)]
+
+    alone, one_of_two = (
+        make(dist_sync_fn=gathered, distributed_available_fn=lambda several=several: several)
+        for several in (False, True)
+    )
+    for metric in (alone, one_of_two):
+        if too_little:
+            metric.update(**too_little)
+        with pytest.raises(ValueError, match=message):
+            metric.compute()
+        metric.update(**enough)
+    assert one_of_two.compute().item() == pytest.approx(alone.compute().item(), rel=1e-12)
 
 
 def test_definitions_differ_wherever_numbers_do() -> None:
