@@ -14,7 +14,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from facediff import registry
-from facediff.data import collate
+from facediff.data import Batch, collate
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
@@ -174,6 +174,21 @@ def test_training_steps_follow_from_what_noise_hides(make_model: Make, make_trai
     assert model.motion_space.preconditioning is not None
     expected = model.process.even_in_log_snr(model.motion_space.preconditioning.hidden())
     torch.testing.assert_close(drawn[0], expected)
+
+
+def test_training_steps_do_not_follow_what_a_validation_sees(make_model: Make, tiny: Tiny, batch: Batch) -> None:
+    """Weight averages, swapped in there, bring tables of their own."""
+    model = make_model(motion_space=partial(ComponentMotion, count=4), timestep_sampling="log_snr")
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    scales = model.motion_space.preconditioning
+    drawn: list[Tensor] = []
+    model.process.draw_steps = lambda *_, weights, **__: drawn.append(weights)
+    model.losses_at = lambda *_: {}
+    for training, size in ((False, 9.0), (True, 0.1), (False, 9.0), (True, 0.1), (True, 0.1)):
+        scales.fit(model.process.signal, torch.full((4,), size), torch.ones(4))
+        model.train(training).losses(batch)
+        torch.testing.assert_close(drawn[-1], model.process.even_in_log_snr(scales.hidden()))
+    assert not torch.allclose(drawn[0], drawn[1])
 
 
 @pytest.mark.parametrize("options", [{}, {"motion_space": partial(ComponentMotion, count=4), "min_snr": 5.0}])
