@@ -391,7 +391,10 @@ class Workshop:
             self.tests |= {name: Test(**test) for name, test in stored[file]["tests"].items() if test["passed"]}
 
     def chosen(self, mutant: Mutant) -> list[str]:
-        """The tests for a mutant: those that killed its neighbours, then one variant of every test, then the others."""
+        """The tests for a mutant: those that killed its neighbours, then one variant of every test, then the others.
+
+        All that may read a changed default come before those.
+        """
         killers = self.killers[mutant.file]
         touching = {name: test for name, test in self.tests.items() if test.touches(mutant)}
         variants: collections.Counter[str] = collections.Counter()
@@ -401,7 +404,9 @@ class Workshop:
             turn[name] = variants[function]
             variants[function] += 1
         found, spent = [], 0.0
-        for name in sorted(touching, key=lambda name: (turn[name], touching[name].seconds)):
+        for name in sorted(
+            touching, key=lambda name: (not touching[name].reads(mutant), turn[name], touching[name].seconds)
+        ):
             spent += touching[name].seconds
             if found and spent > self.seconds:
                 break
