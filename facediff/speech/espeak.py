@@ -15,6 +15,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,7 +96,10 @@ def speak(text: str, voice: EspeakVoice) -> Utterance:
         The waveform at 16 kHz and the phonemes with their times.
     """
     library, _ = _paths()
-    return _finish(*(_speak_elsewhere if _is_loaded(library) else _speak_here)(text, voice))
+    way = _speak_elsewhere if _is_loaded(library) else _speak_here
+    # ctypes prints and drops what a callback raises. Signals, such as Ctrl-C, raise in the main thread only.
+    with ThreadPoolExecutor(1) as thread:
+        return _finish(*thread.submit(way, text, voice).result())
 
 
 def _paths() -> tuple[str, str]:

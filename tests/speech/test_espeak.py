@@ -1,6 +1,9 @@
 """Speech repeats bit for bit, has its phonemes in time, and every sound has a mouth shape."""
 
+import ctypes
+import signal
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +41,22 @@ def test_a_library_that_is_loaded_already_is_left_alone(monkeypatch: pytest.Monk
     expected = espeak.speak("Bob mops.", VOICE)
     monkeypatch.setattr(espeak, "_is_loaded", lambda library: True)
     assert np.array_equal(espeak.speak("Bob mops.", VOICE).samples, expected.samples)
+
+
+def test_ctrl_c_while_speaking_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    read = ctypes.string_at
+
+    def interrupt(pointer: Any, count: int) -> bytes:
+        signal.raise_signal(signal.SIGINT)
+        return read(pointer, count)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        monkeypatch.setattr(ctypes, "string_at", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            espeak.speak("Bob mops.", VOICE)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_phonemes_follow_one_another_and_the_sound() -> None:
