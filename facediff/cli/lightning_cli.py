@@ -20,7 +20,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from traceback import walk_tb
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, get_args, get_type_hints
 
 import yaml
 from jsonargparse import set_parsing_settings
@@ -37,7 +37,7 @@ from facediff import registry
 from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, locked_run, resumable, share_folder
-from facediff.cli.configs import guard_configs
+from facediff.cli.configs import PARTS, guard_configs
 from facediff.cli.trainer_options import explained, raised_in, sentence_of
 from facediff.data import SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
@@ -213,26 +213,34 @@ def explain(message: str) -> str:
     flag = re.search(r"NestedArg\(key='([\w.]+)'", message)
     option = ".".join([keys[0], flag[1]] if keys and flag else keys)
     owner, _, last = option.rpartition(".")
-    if match := re.search(r"dot import path string: (\S+)", message):
+    if (match := re.search(NO_CLASS, message)) and not (match[match.lastindex or 0]).endswith((".yaml", ".yml")):
+        path = match[match.lastindex or 0]
+        name = path.rpartition(".")[2]
         if last in registry.COMPONENTS:
-            return registry.COMPONENTS[last].unknown(match[1])
+            return registry.COMPONENTS[last].unknown(path)
         bases: dict[str, tuple[str, type]] = {
             "model": ("model", AnimationModel),
             "data": ("corpus", SpeechMotionDataModule),
         }
         if last not in bases:
-            return f"--{option} {match[1]}: there is no such class; expected its import path"
+            names = [entry for base in trainer_classes(last) for entry in subclasses(base) if entry[0] != "_"]
+            named = f", or a name: {choices(name, dict.fromkeys(names))}" if names else ""
+            return f"--{option} {path}: there is no such class; expected its import path{named}"
         kind, base = bases[last]
-        return f'there is no {kind} "{match[1]}": {choices(match[1], subclasses(base))}'
+        return f'there is no {kind} "{path}": {choices(name, subclasses(base))}'
     chosen = owner if owner.startswith(("model", "data")) else ""
     see = f"`--{chosen}.help=NAME` lists the options" if chosen else "`facediff fit --help` lists the options"
+    if match := re.search(NO_OPTION, message):
+        outer, inner = (match[1], match[2]) if match[2] else (match[3].split(".") + [""])[:2]
+        if outer == "trainer":
+            names = list(inspect.signature(Trainer.__init__).parameters)[1:]
+            return f"--trainer.{inner}: there is no such option; {choices(inner, names)}"
+        if outer not in PARTS:
+            return f"--{outer}: there is no such option; {choices(outer, (*PARTS, 'name', 'seed_everything'))}"
     if match := re.search(r"Option '([\w.]+)' is not accepted", message):
         names = component_options(message)
         wrong = option if flag else f"{option}.{match[1]}"
         return f"--{wrong}: there is no such option; {choices(match[1], names) if names else see}"
-    if match := re.search(r"[Uu]nrecognized arguments: --trainer\.(\w+)", message):
-        names = list(inspect.signature(Trainer.__init__).parameters)[1:]
-        return f"--trainer.{match[1]}: there is no such option; {choices(match[1], names)}"
     if match := re.search(r"arguments? (?:is|are) required: (.*)", message):
         missing = [f"--{option}.{name}" if option else f"--{name.partition('.')[2]}" for name in match[1].split(", ")]
         return f"{' and '.join(missing)} must be given, as an option or in a file with --config; {see}"
@@ -247,10 +255,43 @@ def explain(message: str) -> str:
     return f"{' '.join(message.split())}; {see}"
 
 
+NO_OPTION = (
+    r"Group '(\w+)' does not accept option '(\w+)|"
+    r"(?:nrecognized arguments: --|^Subcommand '\w+' does not accept option '|^Option ')([\w.]+)"
+)
+"""What jsonargparse says of an option, on the command line or in a config, that is none of model, data or trainer."""
+
+NO_CLASS = (
+    r"dot import path string: (\S+)|class_path '(\S+)':\s+(?:module \S+ has no attribute|No module named)"
+    r"|Import path (\S+) does not correspond to a subclass"
+)
+"""What jsonargparse says of a name or an import path that leads to no class of the right kind."""
+
+
+def trainer_classes(option: str) -> list[type]:
+    """The classes that an option of the trainer takes, by its type; empty for other options."""
+
+    def inside(hint: Any) -> list[type]:  # noqa: ANN401
+        if parts := get_args(hint):
+            return [base for part in parts for base in inside(part)]
+        return [hint] if inspect.isclass(hint) and hint.__module__.startswith("lightning.") else []
+
+    return inside(get_type_hints(Trainer.__init__).get(option))
+
+
 def component_options(message: str) -> list[str]:
-    """The options of the innermost class that an error of jsonargparse names; empty if there is none."""
-    named = re.findall(r"class_path(?: |=)'([\w.]+)'", message)
-    module, _, name = (named or [""])[-1].rpartition(".")
+    """The options of the classes that refuse one, as an error of jsonargparse says; empty if none has options.
+
+    A list's last entry and the base class of its entries both refuse an option of the command line.
+    """
+    refusing = re.findall(r"class_path '([\w.]+)':\s+Option '", message)
+    refusing = refusing or re.findall(r"class_path(?: |=)'([\w.]+)'", message)[-1:]
+    return list(dict.fromkeys(option for path in refusing for option in options_of(path)))
+
+
+def options_of(path: str) -> list[str]:
+    """The options of a class by its import path; empty if it is not imported."""
+    module, _, name = path.rpartition(".")
     if module.startswith("facediff.registry."):
         kind = registry.COMPONENTS[module.rpartition(".")[2]]
         return list(registry.defaults(kind.get(name)))

@@ -169,6 +169,41 @@ def test_a_wrong_name_lists_the_right_ones(words: list[str], sentence: str, caps
     assert len(error.splitlines()) == 1
 
 
+CALLBACK = "trainer: {{callbacks: [{{class_path: {0}, init_args: {{monitor: a}}}}]}}"
+
+
+@pytest.mark.parametrize(
+    ("config", "words", "sentence"),
+    [
+        ("trainer: {max_epoch: 1}", [], '--trainer.max_epoch: there is no such option; did you mean "max_epochs"?'),
+        ("trainr: {max_epochs: 1}", [], '--trainr: there is no such option; did you mean "trainer"?'),
+        (CALLBACK.format("lightning.pytorch.callbacks.ModelCheckpont"), [], 'did you mean "ModelCheckpoint"?'),
+        (CALLBACK.format("ModelCheckpont"), [], "--trainer.callbacks ModelCheckpont: there is no such class"),
+        (
+            CALLBACK.format("facediff.data.Puppet"),
+            [],
+            "--trainer.callbacks facediff.data.Puppet: there is no such class",
+        ),
+        ("model: {class_path: facediff.models.DualPathDiffuson}", [], 'did you mean "DualPathDiffusion"?'),
+        (
+            "trainer: {logger: {class_path: lightning.pytorch.loggers.WandbLoger, init_args: {project: x}}}",
+            [],
+            'did you mean "WandbLogger"?',
+        ),
+        (CALLBACK.format("ModelCheckpoint"), ["--trainer.callbacks.monitr=x"], 'did you mean "monitor"?'),
+    ],
+)
+def test_a_wrong_name_in_a_config_names_the_nearest(
+    config: str, words: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.yaml").write_text(config)
+    files = ["--config", "configs/experiment/puppet.yaml", "--config", str(tmp_path / "own.yaml")]
+    assert main(["fit", *files, *words]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert len(error.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [

@@ -3,7 +3,6 @@
 import ctypes
 import signal
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -46,9 +45,9 @@ def test_a_library_that_is_loaded_already_is_left_alone(monkeypatch: pytest.Monk
 def test_ctrl_c_while_speaking_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     read = ctypes.string_at
 
-    def interrupt(pointer: Any, count: int) -> bytes:
+    def interrupt(pointer: object, count: int) -> bytes:
         signal.raise_signal(signal.SIGINT)
-        return read(pointer, count)
+        return read(pointer, count)  # type: ignore[arg-type]
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
