@@ -126,7 +126,8 @@ def performing(args: argparse.Namespace, until: float) -> Running:
     command = ["live", "-", "--shapes", "puppet", *(word for address in receivers for word in ("--to", address))]
     with open(args.output / "live.log", "w") as log:
         process = start([*command], args, stdin=subprocess.PIPE, stdout=log, stderr=log)
-        threading.Thread(target=speak, args=(process, until), daemon=True).start()
+        # A minute longer than is measured: where speech ends, live ends by itself, before it is asked to.
+        threading.Thread(target=speak, args=(process, until + 60), daemon=True).start()
         yield process, lambda: (args.output / "live.log").read_text().splitlines()[-12:]
 
 
