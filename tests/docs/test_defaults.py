@@ -101,3 +101,13 @@ def test_defaults_of_published_methods(heading: str, name: str, count: int) -> N
     }
     compare(registry.model.get(name), compared)
     assert len(compared) == count, compared
+
+
+@pytest.mark.parametrize("name", registry.corpus.names())
+def test_defaults_of_corpora(name: str) -> None:
+    """As method.md and data.md say: whole clips, and up to 100 frames of another clip of the same speaker."""
+    own = registry.defaults(registry.corpus.get(name))
+    promised = {"window": None, "windows_per_clip": 1, "reference": "same_subject", "reference_frames": 100}
+    promised |= {"batch_size": 8 if name.startswith("Puppet") else 1, "augmented_share": 1.0}
+    promised |= {"Mead3D": {"split": "sentence"}, "BEAT": {"split": "order"}}.get(name, {})
+    assert {option: own[option] for option in promised} == promised

@@ -130,13 +130,32 @@ DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
         "hubert": {
             "source": "facebook/hubert-base-ls960",
             "frozen_layers": 2,
+            "train_projection": False,
             "spec_augment": False,
             "layer_drop": 0.0,
         },
         "mel": {"n_mels": 64, "hidden_dim": 128, "num_layers": 4, "dropout": 0.1},
+        "wav2vec2": {
+            "source": "facebook/wav2vec2-base-960h",
+            "frozen_layers": 0,
+            "spec_augment": False,
+            "layer_drop": 0.0,
+            "epsilon": 1e-7,
+            "edges": True,
+            "do_normalize": True,
+        },
     },
     "identity_encoder": {"hierarchical": {"level_dim": None, "unseen": "mean"}},
-    "motion_space": {"components": {"count": 64, "whitening": 0.5, "upper_face_weight": 1.0, "lips_weight": 1.0}},
+    "motion_space": {
+        "components": {
+            "count": 64,
+            "whitening": 0.5,
+            "upper_face_weight": 1.0,
+            "lips_weight": 1.0,
+            "eyelids_weight": None,
+            "prior_frames": 1,
+        }
+    },
     "mesh_encoder": {
         "components": {"count": 64},
         "spiral": {
@@ -159,6 +178,7 @@ DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
             "num_heads": 4,
             "n_positions": 64,
             "dropout": 0.1,
+            "statistics": False,
         },
     },
     "fusion": {"cross_attention": {"num_heads": 4, "rotary": True, "dropout": 0.1}},
@@ -175,7 +195,14 @@ DEFAULTS: dict[str, dict[str, dict[str, Any]]] = {
     "sampler": {
         "ddim": {"steps": 25, "eta": 0.0, "spacing": "steps", "last_noise": None, "first_noise": None},
         "ddpm": {"steps": None, "spacing": "steps", "last_noise": None, "first_noise": None},
-        "dpm_solver": {"steps": 5, "order": 2, "spacing": "steps", "last_noise": None, "first_noise": None},
+        "dpm_solver": {
+            "steps": 5,
+            "order": 2,
+            "spacing": "steps",
+            "last_noise": None,
+            "first_noise": None,
+            "spread": 1.0,
+        },
     },
 }
 
@@ -197,6 +224,8 @@ OF_EVERY_MODEL: dict[str, Any] = {
     "unseen_identity": "style_only",
     "style_source": "reference",
     "validation_samples": 2,
+    "test_samples": 1,
+    "channel_weights": "rig",
 }
 OF_MODELS: dict[str, dict[str, Any]] = {
     "DualPathDiffusion": {
@@ -207,6 +236,10 @@ OF_MODELS: dict[str, dict[str, Any]] = {
         "noise_schedule": "squaredcos_cap_v2",
         "noise_draws": 1,
         "noise_scale": 1.0,
+        "min_snr": None,
+        "timestep_sampling": "uniform",
+        "template_token": False,
+        "style_from_speech": False,
         "style_tokens": "levels",
         "identity_dropout": 0.1,
         "invented_speakers": 0.0,
