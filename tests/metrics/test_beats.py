@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -29,6 +30,27 @@ def test_onsets_are_where_sounds_begin() -> None:
         assert found.tolist() == pytest.approx(times, abs=0.02)
     assert not len(onsets(torch.zeros(RATE), RATE))
     assert not len(onsets(torch.zeros(0), RATE))
+
+
+@pytest.mark.parametrize("rate", [16_000, 22_050])
+def test_onsets_are_the_documented_peaks_of_spectral_flux(rate: int) -> None:
+    """Windows of 32 ms every 10 ms, log(1 + 100 |X|); largest within 30 ms, 0.07 above the mean of 100 ms around."""
+    rng = np.random.default_rng(0)
+    sound = rng.standard_normal(12 * rate) * np.repeat(10.0 ** rng.uniform(-3, 0, 300), rate // 25)[: 12 * rate]
+    size, hop = round(0.032 * rate), round(0.01 * rate)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
+    padded = np.pad(sound / np.abs(sound).max(), size // 2)
+    frames = np.lib.stride_tricks.sliding_window_view(padded, size)[::hop]
+    loud = np.log(1 + 100 * np.abs(np.fft.rfft(frames * window)) / window.sum())
+    flux = np.append(0, np.maximum(np.diff(loud, axis=0), 0).mean(1))
+    flux /= flux.max()
+    expected = [
+        n * hop / rate
+        for n, rise in enumerate(flux)
+        if rise == flux[max(0, n - 3) : n + 4].max() and rise > flux[max(0, n - 10) : n + 11].mean() + 0.07
+    ]
+    assert len(expected) > 50
+    assert onsets(torch.from_numpy(sound), rate).tolist() == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_head_that_pauses_on_the_beat_is_aligned_and_one_between_the_beats_is_not() -> None:
