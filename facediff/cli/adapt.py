@@ -297,7 +297,7 @@ def adaptation_data(
     if name in content["hyper_parameters"].get("identities", []):
         raise FaceDiffError(f"--person {person}: the checkpoint knows {name}; train on with `facediff fit`")
     if folder.is_dir():
-        options["people"] = [str(folder), *(options.get("people") or [])]
+        options["people"] = [str(folder.absolute()), *(options.get("people") or [])]
     else:
         options["extra_identities"] = [name, *(options.get("extra_identities") or [])]
     options["train_identities"] = [name] if mode == "finetune" else None

@@ -264,8 +264,7 @@ def prepared(data: SpeechMotionDataModule) -> SpeechMotionDataModule:
         FaceDiffError: if it is not, and is none that facediff makes.
     """
     data.prepare_data()
-    if not data.root.is_dir():
-        raise FaceDiffError(f"{data.root}: no such folder; give the corpus's folder with --data-root. {data.obtain}")
+    _ = data.corpus
     return data
 
 

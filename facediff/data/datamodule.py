@@ -346,7 +346,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     @classmethod
     def missing(cls, root: Path) -> FaceDiffError:
         """What is wrong where the corpus is not in its folder, and how to obtain it."""
-        return FaceDiffError(f"{root}: no such folder; set data.root to your copy. {cls.obtain}".rstrip())
+        advice = "set data.root to your copy (--data.root, or --data-root where a command has that)"
+        return FaceDiffError(f"{no_such_folder(root)}; {advice}. {cls.obtain}".rstrip())
 
     @cached_property
     def corpus(self) -> Corpus:
@@ -724,8 +725,16 @@ def channel_regions(space: Space) -> dict[str, Tensor]:
     return {name: torch.tensor(space.region(name) or range(len(space.channels))) for name in ("lips", "upper_face")}
 
 
+def no_such_folder(folder: Path) -> str:
+    """That a folder is missing, and where it was looked for."""
+    relative = "" if folder.is_absolute() else f"; it is relative to the working folder, {Path.cwd()}"
+    return f"{folder}: no such folder{relative}"
+
+
 def person_name(folder: Path) -> str:
     """The speaker of a folder, as ``facediff data import-person`` wrote it."""
+    if not folder.is_dir():
+        raise FaceDiffError(f"data.people: {no_such_folder(folder)}; expected one of `facediff data import-person`")
     name = read_manifest(folder).get("person")
     if not isinstance(name, str):
         raise FaceDiffError(

@@ -190,6 +190,10 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
     saved = checkpoint.get("datamodule_hyper_parameters")
     stored = {**module.former_options, **saved} if saved else {name: source[name] for name in source.keys() & {"root"}}
     options = {name: value for name, value in stored.items() if not name.startswith("_")}
+    # A folder that training was given relative to its working folder is found from another one.
+    root, trained = options.get("root"), source.get("root")
+    if isinstance(root, str) and isinstance(trained, str) and not Path(root).expanduser().exists():
+        options["root"] = trained if Path(trained).is_dir() else root
     read_options(str(path), module, options, component_finders())
     return module, options
 

@@ -25,6 +25,7 @@ import pytest
 import torch
 
 from facediff.cli.app import main
+from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.checkpoint import build_model, corpus_of, read_assets, read_checkpoint
@@ -166,6 +167,21 @@ def law(load: Callable[[], object]) -> str:
     assert time.perf_counter() - start < 60
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1.5 * 2**20  # KiB
     return text
+
+
+def test_a_folder_that_training_was_given_relative_is_there_from_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "corpus").mkdir()
+    source = {"class_path": "facediff.data.puppet.Puppet", "root": str(tmp_path / "corpus")}
+    content = {DATA_SOURCE_KEY: source, "datamodule_hyper_parameters": {"root": "corpus"}}
+    monkeypatch.chdir(tmp_path / "corpus")
+    assert corpus_of("file.ckpt", content)[1]["root"] == source["root"]
+    monkeypatch.chdir(tmp_path)
+    assert corpus_of("file.ckpt", content)[1]["root"] == "corpus"
+    source["root"] = str(tmp_path / "gone")
+    monkeypatch.chdir(tmp_path / "corpus")
+    assert corpus_of("file.ckpt", content)[1]["root"] == "corpus"
 
 
 def load_everything(tree: Tree) -> object:
