@@ -71,6 +71,13 @@ def test_channel_weights_keep_the_size_of_motion_and_lose_no_channel(channels: T
     assert torch.isfinite(torch.linalg.inv(weights)).all()
 
 
+def test_the_head_counts_as_much_as_the_mean_channel_of_the_face(channels: TinyChannels) -> None:
+    variances, covariance = statistics(channels)
+    weights = channel_weights(channels.assets(), variances, covariance, torch.ones(VERTICES, 3), "rig")
+    counted = (weights @ covariance @ weights.T).diag()
+    torch.testing.assert_close(counted[3:], counted[:3].mean().expand(3))
+
+
 @pytest.mark.parametrize("space", ["vertices", "components"])
 def test_the_dual_path_trains_tests_and_loads_in_channels(
     channels: TinyChannels, make_model: Make, make_trainer: Callable[..., Trainer], space: str, tmp_path: Path

@@ -88,6 +88,20 @@ def test_strange_speech_asks_for_no_more_than_training_speech_did(fitted: Speech
     assert change <= 1.1 * REACH * usual
 
 
+def test_statistics_count_up_to_three_deviations(fitted: SpeechStyle) -> None:
+    """By themselves, so that one strange number, such as a room's, does not decide the direction."""
+    features, mask, _, _ = clips(1, seed=5)
+    mean, deviation, *_ = fitted._fit()
+    for statistic in (1, 2):  # those that hardly tell the style, so that its longest change is not reached
+        asked = []
+        for far in (2.9, 3.0, 9.0):
+            moved = features.clone()
+            moved[..., statistic] += mean[statistic] + far * deviation[statistic] - moved[..., statistic].mean()
+            asked.append(fitted(moved, mask))
+        torch.testing.assert_close(asked[1], asked[2], rtol=1e-4, atol=1e-6)
+        assert not torch.allclose(asked[0], asked[1], rtol=1e-4, atol=1e-6)
+
+
 def test_hidden_identities_are_left_out(fitted: SpeechStyle) -> None:
     before = {name: value.clone() for name, value in fitted.named_buffers()}
     features, mask, style, _ = clips(4, seed=4)
