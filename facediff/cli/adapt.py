@@ -98,6 +98,8 @@ def adapt(
         )
     if face is not None and (corpus is not None or mode != "finetune"):
         raise FaceDiffError("--face: names the corpus, on which alone the head is trained; omit --corpus and --mode")
+    if person is None and face is None and (train is not None or mode != "finetune"):
+        raise FaceDiffError("--mode, --train: are options of --person and --face; omit them, as all of the model stays")
     train = train or ("all" if face is None else "head")
     if train == "head" and face is None:
         raise FaceDiffError("--train head: is for --face; give all or person")
@@ -124,7 +126,7 @@ def adapt(
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.cli.lightning import exit_statuses
-    from facediff.cli.trainer_options import explained
+    from facediff.cli.trainer_options import IDLE_WARNINGS, explained, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
     from facediff.models.checkpoint import build_model, read_checkpoint
     from facediff.models.checkpoint_content import IMPORTED
@@ -168,11 +170,11 @@ def adapt(
             enable_progress_bar=not quiet and on_terminal(),
             plugins=[AtomicCheckpointIO()],
         )
-    with exit_statuses():
+    with exit_statuses(), without_warnings(*IDLE_WARNINGS):
         trainer.fit(model, data)
     for parameter in model.parameters():
         parameter.requires_grad_(True)
-    trainer.save_checkpoint(output)
+    trainer.save_checkpoint(output, weights_only=False)
     seconds = sum(data.corpus.frames(clip) for clip in clips if face or clip.identity == name) / data.frame_rate
     # Pictures need a mesh, which a corpus may lack.
     target = "speech.npz" if model.assets.faces is None else "speech.mp4"
@@ -202,7 +204,7 @@ def adapt_audio_encoder(
     from facediff.utils.licences import require_cleared
 
     started = time.monotonic()
-    device = usable_device(device)
+    device = usable_device(device, "accelerator")
     content = read_checkpoint(checkpoint)
     if commercial_only:
         require_cleared(checkpoint, build_model(checkpoint, content).licences)

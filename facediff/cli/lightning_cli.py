@@ -38,7 +38,7 @@ from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, Predict
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, locked_run, resumable, share_folder
 from facediff.cli.configs import PARTS, guard_configs
-from facediff.cli.trainer_options import explained, raised_in, sentence_of
+from facediff.cli.trainer_options import IDLE_WARNINGS, explained, raised_in, sentence_of, without_warnings
 from facediff.data import SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
@@ -67,11 +67,9 @@ def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> F
     try:
         with (
             parsing([name, *arguments], lambda *, _root_: _root_[name]["name"]),
-            warnings.catch_warnings(),
+            without_warnings(*IDLE_WARNINGS, *(() if name == "fit" else RESUME_WARNINGS)),
             ExitStack() as until_end,
         ):
-            for message in IDLE_WARNINGS if name == "fit" else (*IDLE_WARNINGS, *RESUME_WARNINGS):
-                warnings.filterwarnings("ignore", message)
             return FaceDiffCLI(
                 **PARSED,
                 trainer_defaults={"callbacks": built_in_callbacks(name), "logger": logger},
@@ -169,20 +167,6 @@ def built_in_callbacks(name: str) -> list[Callback]:
         callbacks.append(PredictionWriter())
     return callbacks
 
-
-IDLE_WARNINGS = (
-    # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
-    ".*does not have many workers",
-    # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
-    ".*isinstance.treespec, LeafSpec.*",
-    # The throughput monitor is there for clips a second.
-    ".*define a `flops_per_batch` attribute",
-    # A config without a seed gets 0, and its run folder says so.
-    "No seed found, seed set to 0",
-    # Frozen layers are in evaluation mode on purpose: no dropout.
-    r"Found \d+ module\(s\) in eval mode at the start of training",
-)
-"""Warnings of Lightning's that nobody needs to act on."""
 
 RESUME_WARNINGS = (".*callbacks used to create the checkpoint need to be provided", "The dirpath has changed from")
 """They matter to training that goes on; scoring a checkpoint needs none of its callbacks."""

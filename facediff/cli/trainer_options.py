@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -40,8 +41,12 @@ PROCESSES = 4
 """Processes for each processor core that are believed to be meant."""
 
 
-def check_trainer(options: Mapping[str, Any]) -> None:
+def check_trainer(options: Mapping[str, Any], prefix: str = "trainer.") -> None:
     """Refuse numbers that no training can have.
+
+    Args:
+        options: of the trainer.
+        prefix: what stands before their names.
 
     Raises:
         ArgumentError: naming the option.
@@ -49,12 +54,12 @@ def check_trainer(options: Mapping[str, Any]) -> None:
     for name, hint in RANGES.items():
         expected = mismatch(hint, options[name]) if name in options else None
         if expected is not None:
-            raise ArgumentError({f"trainer.{name}": options[name]}, f"expected {expected}", located=True)
-    check_machine(options)
+            raise ArgumentError({f"{prefix}{name}": options[name]}, f"expected {expected}", located=True)
+    check_machine(options, prefix)
     devices, most = options.get("devices"), max(8, PROCESSES * (os.cpu_count() or 1))
     if options.get("accelerator") in ("cpu", "auto") and str(devices).isdecimal() and int(str(devices)) > most:
         raise ArgumentError(
-            {"trainer.devices": devices},
+            {f"{prefix}devices": devices},
             f"that many processes would be started; expected at most {most} on this machine's {os.cpu_count()} cores",
             located=True,
         )
@@ -64,8 +69,12 @@ SHARDED = ("fsdp", "deepspeed", "modelparallel")
 """What the names of strategies contain that spread one model over GPUs."""
 
 
-def check_machine(options: Mapping[str, Any]) -> None:
+def check_machine(options: Mapping[str, Any], prefix: str) -> None:
     """Refuse GPUs that are not there, and strategies that need them.
+
+    Args:
+        options: of the trainer.
+        prefix: what stands before their names.
 
     Raises:
         ArgumentError: naming the option.
@@ -75,9 +84,9 @@ def check_machine(options: Mapping[str, Any]) -> None:
     accelerator, strategy = options.get("accelerator"), options.get("strategy")
     if accelerator in ("gpu", "cuda") and not torch.cuda.is_available() and not torch.backends.mps.is_available():
         raise ArgumentError(
-            {"trainer.accelerator": accelerator},
-            "this machine has no GPU that PyTorch can use; give --trainer.accelerator=cpu, or look at `nvidia-smi` and "
-            "at the build of PyTorch",
+            {f"{prefix}accelerator": accelerator},
+            f"this machine has no GPU that PyTorch can use; give --{prefix}accelerator=cpu, or look "
+            f"at `nvidia-smi` and at the build of PyTorch",
             located=True,
         )
     path = strategy if isinstance(strategy, str) else getattr(strategy, "class_path", None) or type(strategy).__name__
@@ -85,7 +94,7 @@ def check_machine(options: Mapping[str, Any]) -> None:
     sharded = any(word in name.lower().replace("_", "") for word in SHARDED)
     if sharded and (accelerator == "cpu" or not torch.cuda.is_available()):
         raise ArgumentError(
-            {"trainer.strategy": name},
+            {f"{prefix}strategy": name},
             "spreads a model over GPUs, and this run has none; give --trainer.strategy=ddp, which needs none",
             located=True,
         )
@@ -102,7 +111,7 @@ def explained(options: Mapping[str, Any], prefix: str = "--trainer.") -> Iterato
     from lightning.fabric.utilities.exceptions import MisconfigurationException
 
     try:
-        check_trainer(options)
+        check_trainer(options, prefix.removeprefix("--"))
         yield
     except FaceDiffError:
         raise
@@ -136,3 +145,27 @@ def sentence_of(error: BaseException) -> str:
     """A message on one line, no longer than a sentence or two."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 300 else f"{text[:300]}…"
+
+
+IDLE_WARNINGS = (
+    # Reading is cheap (memory-mapped motion), so worker processes would only add their start-up time.
+    ".*does not have many workers",
+    # Lightning 2.6.6 calls a spelling that torch 2.13 deprecates.
+    ".*isinstance.treespec, LeafSpec.*",
+    # The throughput monitor is there for clips a second.
+    ".*define a `flops_per_batch` attribute",
+    # A config without a seed gets 0, and its run folder says so.
+    "No seed found, seed set to 0",
+    # Frozen layers are in evaluation mode on purpose: no dropout.
+    r"Found \d+ module\(s\) in eval mode at the start of training",
+)
+"""Warnings of Lightning's that nobody needs to act on."""
+
+
+@contextmanager
+def without_warnings(*messages: str) -> Iterator[None]:
+    """A context in which warnings that begin with one of these patterns are not shown."""
+    with warnings.catch_warnings():
+        for message in messages:
+            warnings.filterwarnings("ignore", message)
+        yield

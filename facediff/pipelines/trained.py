@@ -317,8 +317,13 @@ def on_processor(device: str) -> bool:
     return device == "cpu" or (device == "auto" and not torch.cuda.is_available())
 
 
-def usable_device(name: str) -> str:
-    """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere."""
+def usable_device(name: str, option: str = "device") -> str:
+    """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere.
+
+    Args:
+        name: as torch calls it, or ``auto``.
+        option: by which it is chosen.
+    """
     import torch
 
     if name == "auto":
@@ -328,5 +333,5 @@ def usable_device(name: str) -> str:
         float(torch.ones(1, device=torch.device(name)).sum())
     except Exception as error:  # each backend raises its own, down to NotImplementedError and ImportError
         reason = next(iter(str(error).splitlines()), "")[:200]
-        raise OptionError("device", f"not usable on this machine ({reason}); try {{device}} cpu", name) from error
+        raise OptionError(option, f"not usable on this machine ({reason}); try {{{option}}} cpu", name) from error
     return name

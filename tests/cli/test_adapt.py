@@ -168,6 +168,9 @@ def test_the_mean_of_several_clips(checkpoint: Path, tmp_path: Path) -> None:
         (["--person", "C", "-o", "out.pt"], "ends in .ckpt"),
         (["--person", "C", "--epochs", "0"], "--epochs 0"),
         (["--person", "C", "--data-root", "nowhere"], "nowhere"),
+        (["--person", "C", "--accelerator", "gpu"], "give --accelerator=cpu"),
+        (["--voices", "2", "--accelerator", "nope"], "--accelerator nope"),
+        (["--voices", "2", "--mode", "joint"], "--mode, --train"),
     ],
 )
 def test_what_cannot_work_is_said_before_training(
@@ -178,6 +181,7 @@ def test_what_cannot_work_is_said_before_training(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.chdir(tmp_path)
     output = [] if "-o" in words else ["-o", "out.ckpt"]
     assert main(["adapt", "--checkpoint", str(checkpoint), *output, *words]) == 2
