@@ -14,7 +14,6 @@ from typing import Any, ClassVar, Literal
 from facediff import registry
 from facediff.data.corpus import Clip, read_clip_table
 from facediff.data.datamodule import SpeechMotionDataModule
-from facediff.data.packed.stores import is_packed
 from facediff.data.person.importer import splits
 from facediff.data.recordings import USUAL_SUFFIXES, RecordingFolder
 from facediff.errors import FaceDiffError
@@ -42,11 +41,7 @@ class ParametricDataModule(SpeechMotionDataModule):
     layout_name: str | None = None
 
     def __init__(self, *, root: str, extra_identities: list[str] | None = None, **options: Any) -> None:  # noqa: ANN401
-        folder = Path(root).expanduser()
-        speakers = extra_identities or self.speakers_in(folder)
-        if not speakers and not is_packed(root):  # packed corpora are refused later
-            expected = f"holds no recordings; expected {', '.join(self.suffixes)}, each with a .wav of its name"
-            raise FaceDiffError(f"{folder}: {expected}") if folder.is_dir() else self.missing(folder)
+        speakers = extra_identities or self.speakers_in(Path(root).expanduser())
         super().__init__(root=root, extra_identities=speakers, **options)
 
     @classmethod

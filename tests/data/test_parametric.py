@@ -86,13 +86,6 @@ def test_flame_clips_need_a_layout_and_keep_the_version(tmp_path: Path) -> None:
         FlameClips(root=str(root), layout="arkit")
 
 
-def test_a_folder_without_recordings_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="nowhere: no such folder"):
-        LiveLink(root=str(tmp_path / "nowhere"))
-    with pytest.raises(FaceDiffError, match=r"holds no recordings; expected \.csv"):
-        LiveLink(root=str(tmp_path))
-
-
 def test_a_table_of_clips_decides_the_splits(tmp_path: Path) -> None:
     root = write_flame(tmp_path / "flame")
     (root / "clips.csv").write_text("clip,split\nann_s0,test_a\nann_s4,none\n")
