@@ -197,8 +197,9 @@ def explain(message: str) -> str:
     flag = re.search(r"NestedArg\(key='([\w.]+)'", message)
     option = ".".join([keys[0], flag[1]] if keys and flag else keys)
     owner, _, last = option.rpartition(".")
-    if (match := re.search(NO_CLASS, message)) and not (match[match.lastindex or 0]).endswith((".yaml", ".yml")):
-        path = match[match.lastindex or 0]
+    match = re.search(NO_CLASS, message)
+    path = match[match.lastindex or 0] if match else ""
+    if path and not path.endswith((".yaml", ".yml")):
         name = path.rpartition(".")[2]
         if last in registry.COMPONENTS:
             return registry.COMPONENTS[last].unknown(path)
@@ -207,7 +208,7 @@ def explain(message: str) -> str:
             "data": ("corpus", SpeechMotionDataModule),
         }
         if last not in bases:
-            names = [entry for base in trainer_classes(last) for entry in subclasses(base) if entry[0] != "_"]
+            names = [entry for base in trainer_classes(last) for entry in subclasses(base)]
             named = f", or a name: {choices(name, dict.fromkeys(names))}" if names else ""
             return f"--{option} {path}: there is no such class; expected its import path{named}"
         kind, base = bases[last]
@@ -284,11 +285,12 @@ def options_of(path: str) -> list[str]:
 
 
 def subclasses(base: type) -> list[str]:
-    """Names of all concrete subclasses that are imported."""
+    """Names of all concrete public subclasses that are imported."""
     names: list[str] = []
     cls: type
     for cls in base.__subclasses__():
-        names += [] if getattr(cls, "__abstractmethods__", None) else [cls.__name__]
+        hidden = getattr(cls, "__abstractmethods__", None) or cls.__name__.startswith("_")
+        names += [] if hidden else [cls.__name__]
         names += subclasses(cls)
     return names
 

@@ -95,7 +95,7 @@ def check_machine(options: Mapping[str, Any], prefix: str) -> None:
     if sharded and (accelerator == "cpu" or not torch.cuda.is_available()):
         raise ArgumentError(
             {f"{prefix}strategy": name},
-            "spreads a model over GPUs, and this run has none; give --trainer.strategy=ddp, which needs none",
+            f"spreads a model over GPUs, and this run has none; give --{prefix}strategy=ddp, which needs none",
             located=True,
         )
 

@@ -96,10 +96,11 @@ def speak(text: str, voice: EspeakVoice) -> Utterance:
         The waveform at 16 kHz and the phonemes with their times.
     """
     library, _ = _paths()
-    way = _speak_elsewhere if _is_loaded(library) else _speak_here
+    if _is_loaded(library):
+        return _finish(*_speak_elsewhere(text, voice))
     # ctypes prints and drops what a callback raises. Signals, such as Ctrl-C, raise in the main thread only.
     with ThreadPoolExecutor(1) as thread:
-        return _finish(*thread.submit(way, text, voice).result())
+        return _finish(*thread.submit(_speak_here, text, voice).result())
 
 
 def _paths() -> tuple[str, str]:

@@ -19,7 +19,8 @@ Owner = Callable[..., Any]
 
 def rows(page: str, head: str, heading: str = "") -> list[list[str]]:
     """Cells of the first table that begins so, after a heading."""
-    text = (DOCS / page).read_text().partition(heading)[2] if heading else (DOCS / page).read_text()
+    text = (DOCS / page).read_text()
+    text = text.partition(heading)[2] if heading else text
     table = text.partition(f"\n{head}")[2].partition("\n\n")[0].splitlines()[2:]
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
 

@@ -152,7 +152,6 @@ def main(args: argparse.Namespace) -> None:
     found = {"seconds": seconds, "costs": asdict(costs), "rows": rows, "ratios": relations, "full": full}
     if full is not None:
         found["student"] = student(args, seconds, relations["peer_seconds"])
-    if full is not None:
         print(f"  the default sampler in full: measured / extrapolated {full['measured'] / usual['total']:.3f}")
     print(f"peak memory with sampling on vertices: {peak_memory(args.device)}")
     if args.json:

@@ -224,7 +224,7 @@ def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool, studen
         identities=IDENTITIES,
         frame_rate=FRAME_RATE,
         dim=args.dim,
-        audio_encoder=partial(MelEncoder) if student else partial(HubertEncoder, config=config),
+        audio_encoder=MelEncoder if student else partial(HubertEncoder, config=config),
         style_encoder=partial(TcnGruTransformer, num_heads=args.heads),
         fusion=partial(BidirectionalCrossAttention, num_heads=args.heads),
         decoder=partial(StyleTransformer, num_layers=args.layers, num_heads=args.heads),

@@ -262,7 +262,7 @@ class WindowedTransformer(nn.Module):
             middles = ((torch.arange(count, device=features.device) + 0.5) * ratio).floor().long()
             # Rounding may leave a clip one feature short of its last frame's.
             last = middles.new_tensor([features.shape[1]]) if lengths is None else lengths
-            clips = torch.arange(features.shape[0], device=features.device)[:, None]  # of any number, also in a graph
+            clips = torch.arange(features.shape[0], device=features.device)[:, None]  # not len(), a constant in graphs
             around = around[clips, torch.minimum(middles, last[:, None] - 1)]
         return around.transpose(2, 3)
 
