@@ -109,8 +109,9 @@ class OptionError(FaceDiffError):
     """
 
     def __init__(self, option: str, problem: str, value: object = None, *, place: str = "") -> None:
-        self.option, self.problem, self.value, self.place = option, problem, value, place
-        self._is_sentence = not option
+        self.problem, self.value, self.place = problem, value, place
+        self.option = option or next(iter(_OPTION_NAME.findall(problem)), "")
+        self._in_front = option
         super().__init__(self._sentence(str))
 
     @classmethod
@@ -121,9 +122,7 @@ class OptionError(FaceDiffError):
             >>> OptionError.naming("face.obj: has no triangles; give {mesh}").on_command_line
             'face.obj: has no triangles; give --mesh'
         """
-        error = cls("", sentence)
-        error.option = next(iter(_OPTION_NAME.findall(sentence)), "")
-        return error
+        return cls("", sentence)
 
     @property
     def on_command_line(self) -> str:
@@ -132,19 +131,21 @@ class OptionError(FaceDiffError):
 
     def within(self, place: object) -> OptionError:
         """The same error with the place it comes from in front of the message."""
-        option = "" if self._is_sentence else self.option
-        return OptionError(option, self.problem, self.value, place=f"{place}: {self.place}")
+        return OptionError(self._in_front, self.problem, self.value, place=f"{place}: {self.place}")
+
+    def followed_by(self, hint: str) -> OptionError:
+        """The same error with a hint after it, whose options stand in braces."""
+        return OptionError(self._in_front, self.problem + hint, self.value, place=self.place)
 
     def _sentence(self, spelled: Callable[[str], str]) -> str:
         value = "" if self.value is None else f" {self.value}"
-        subject = "" if self._is_sentence else f"{spelled(self.option)}{value}: "
+        subject = f"{spelled(self._in_front)}{value}: " if self._in_front else ""
         return self.place + subject + _OPTION_NAME.sub(lambda match: spelled(match[1]), self.problem)
 
     def __reduce__(self) -> tuple[Callable[..., OptionError], tuple[str, str, str | None]]:
         """Pickling, by which worker processes hand errors over."""
         value = None if self.value is None else str(self.value)
-        option = "" if self._is_sentence else self.option
-        return partial(OptionError, place=self.place), (option, self.problem, value)
+        return partial(OptionError, place=self.place), (self._in_front, self.problem, value)
 
 
 class ArgumentError(FaceDiffError, ValueError):

@@ -136,7 +136,7 @@ def retarget(
             raise
         hint = f". A face was found in these of its parts: {', '.join(names)}; try {{part}} {names[0]}"
         if isinstance(error, OptionError):
-            raise OptionError(error.option, error.problem + hint, error.value, place=error.place) from error
+            raise error.followed_by(hint) from error
         raise OptionError.naming(f"{error}{hint}") from error
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
