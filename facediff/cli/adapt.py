@@ -41,6 +41,7 @@ def adapt(
     low_latency: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_LOW_LATENCY_STEPS)] = None,
     audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
+    transcribed: Annotated[Path | None, Option(metavar="DIR", reads=True)] = None,
     output: Output,
     mode: Mode = "finetune",
     train: Literal["all", "person", "head"] | None = None,
@@ -74,6 +75,8 @@ def adapt(
             features, such as mel or mel:num_layers=6
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md); --low-latency does not unless it is given
+        transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
+            of up to 15 s, each with its English words in NAME.txt
         output: checkpoint to write (.ckpt)
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
         train: train all weights, those of identity and style only (person), or those of the face only (head); by
@@ -105,6 +108,8 @@ def adapt(
         raise FaceDiffError("--train head: is for --face; give all or person")
     if augmentation and voices is None and low_latency is None:
         raise FaceDiffError("--augmentation: is an option of --voices and --low-latency; give one of them as well")
+    if transcribed is not None and voices is None:
+        raise FaceDiffError("--transcribed: is an option of --voices; give it as well")
     if audio_encoder is not None and low_latency is None:
         raise FaceDiffError("--audio-encoder: is an option of --low-latency; give --low-latency as well")
     check_model_source(checkpoint, "--checkpoint")
@@ -114,7 +119,7 @@ def adapt(
         if low_latency is not None:
             chosen = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
-            chosen = DistillationOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed)
+            chosen = DistillationOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed, transcribed=transcribed)
         chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
         adapt_audio_encoder(

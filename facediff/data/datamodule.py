@@ -307,6 +307,14 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """
         return None
 
+    def say(self, text: str, number: int) -> npt.NDArray[np.float32] | None:  # noqa: ARG002
+        """An English text by one of the corpus's speakers, who take turns by number, (S,) at 16 kHz.
+
+        None if they cannot say what they are told, as people cannot. An audio encoder learns from it what it should
+        hear in a person's recording of the same words (:mod:`facediff.models.transcribed`).
+        """
+        return None
+
     def default_reference(self, clips: list[Clip]) -> Clip:
         """The clip that gives an identity's style when no other is chosen."""
         return clips[0]

@@ -27,7 +27,7 @@ from facediff.synthetic import corpus as puppet_corpus
 from facediff.synthetic import second_edition
 from facediff.synthetic.cast import MOST_DRAWN, SEEN, UNSEEN, drawn_names
 from facediff.synthetic.face import build_face
-from facediff.synthetic.further_speech import further_speech
+from facediff.synthetic.further_speech import further_speech, said
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.known_faces import built_in_rig as built_in_rig
 from facediff.synthetic.recordings import ALIGNED, speakers_of
@@ -80,6 +80,10 @@ class FirstEdition:
         """Random words by these speakers."""
         return partial(further_speech, identities=identities)
 
+    def say(self, text: str, number: int) -> npt.NDArray[np.float32]:
+        """A text by one of the seen speakers."""
+        return said(text, puppet.SEEN_IDENTITIES[number % len(puppet.SEEN_IDENTITIES)])
+
     def eyelid_pairs(self) -> Tensor | None:
         """Of the mesh, for folders that come from a version without such a file."""
         return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1))
@@ -113,6 +117,11 @@ class SecondEdition:
     def further_speech(self, identities: tuple[str, ...]) -> Callable[[int], npt.NDArray[np.float32]]:
         """Random words by these speakers."""
         return partial(second_edition.spoken_words, identities=identities, people=self.people)
+
+    def say(self, text: str, number: int) -> npt.NDArray[np.float32]:
+        """A text by one of the seen speakers, in neutral mood."""
+        clip = second_edition.PerformedClip(SEEN[number % len(SEEN)], "train", 1, text, "neutral")
+        return second_edition.speak_clip(clip).samples
 
     def eyelid_pairs(self) -> Tensor | None:
         """None: every folder has the file."""
@@ -330,6 +339,10 @@ class Puppet(SpeechMotionDataModule):
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
         """Random words by the training speakers."""
         return self.edition.further_speech(tuple(self.identities))
+
+    def say(self, text: str, number: int) -> npt.NDArray[np.float32]:
+        """A text by one of the seen speakers, who take turns."""
+        return self.edition.say(text, number)
 
     def stores_reference(self, identity: str) -> bool:
         """Those of the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""

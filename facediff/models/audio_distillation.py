@@ -6,7 +6,8 @@ student must reproduce the features that the teacher, the encoder as it was, com
 Seltzer, Wang, Zhao and Gong 2017, "Large-scale domain adaptation via teacher-student learning"). A step costs a small
 part of a training step, and no motion is needed. In the end the weights are interpolated between teacher and student,
 which gives back most of the accuracy on clean speech and keeps most of the robustness (Wortsman et al. 2022, "Robust
-fine-tuning of zero-shot models").
+fine-tuning of zero-shot models"). Recordings of people with their words teach it other voices than augmentations make:
+there the teacher hears the corpus's own synthesiser say the same words (:mod:`facediff.models.transcribed`).
 
 **Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
 features of the whole recording. A model whose windows reach further than what is heard animates silence there, from
@@ -22,6 +23,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +34,10 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, read_augmentations
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
+from facediff.models.transcribed import STEP_RATE, Said, read_said
 from facediff.speech.windows import QUIETEST, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
@@ -60,9 +63,6 @@ WINDOW = 4.0
 LOW_LATENCY_WINDOW = (0.6, 1.7)
 """Seconds of speech that a low-latency student gets, at least and at most."""
 
-STEP_RATE = 50
-"""Features a second at which student and teacher are compared."""
-
 
 @dataclass(frozen=True)
 class DistillationOptions:
@@ -84,6 +84,9 @@ class DistillationOptions:
         low_latency: the student hears what the model's windows hear at low latency; the teacher always hears the whole
             recording.
         whole: with ``low_latency``, the share of the pieces that the student hears as a whole all the same.
+        transcribed: folder of people's recordings with their words (:func:`facediff.models.transcribed.read_said`),
+            or None.
+        transcribed_share: of the pieces that are such recordings.
     """
 
     augmentations: Sequence[str] = ROBUST_AUGMENTATIONS
@@ -98,6 +101,8 @@ class DistillationOptions:
     workers: int = 1
     low_latency: bool = False
     whole: float = 0.3
+    transcribed: Path | None = None
+    transcribed_share: float = 0.3
 
     @property
     def goal(self) -> str:
@@ -118,7 +123,8 @@ class DistillationBatch(NamedTuple):
         clean: the teacher's input (batch, samples).
         lengths: valid samples of each clip.
         student_input: the same speech, augmented, or a part of it with silence after it (batch, samples).
-        start: the teacher's step at which the student's input begins.
+        student_lengths: valid samples of each piece of it.
+        places: the teacher's step that goes with each of the student's (batch, steps).
         steps: of the student's input.
         compared: the student's steps that are compared, as the first of each clip and the one after the last
             (batch, 2).
@@ -129,7 +135,8 @@ class DistillationBatch(NamedTuple):
     clean: Tensor
     lengths: Tensor
     student_input: Tensor
-    start: Tensor
+    student_lengths: Tensor
+    places: Tensor
     steps: Tensor
     compared: Tensor
     mean: Tensor | None = None
@@ -162,7 +169,8 @@ def distil_audio_encoder(
         last tenth of the steps.
 
     Raises:
-        FaceDiffError: if nothing of the encoder can be trained, or an augmentation is unknown.
+        FaceDiffError: if nothing of the encoder can be trained, an augmentation is unknown, or recordings with words
+            are missing, damaged or of no use to this corpus.
     """
     augmentations = read_augmentations(options.augmentations)
     # The teacher's features of the clean recording are the target: its frames must stay where they are.
@@ -175,13 +183,16 @@ def distil_audio_encoder(
     weights = [weight for weight in student.parameters() if weight.requires_grad]
     if not weights:
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
+    if options.transcribed is not None and options.low_latency:
+        raise OptionError.naming("{transcribed}: is an option of {voices}; a low-latency student has none")
     teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
     with model.choosing():
         if options.low_latency:
             model.choose_low_latency()
         windows = model.windows
-    pairs = SpeechPairs(data, Augmenter(augmentations), options, windows)
+    said = [] if options.transcribed is None else read_said(options.transcribed, data, teacher, options)
+    pairs = SpeechPairs(data, Augmenter(augmentations), options, windows, said)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
@@ -226,18 +237,19 @@ def _steps(samples: Tensor) -> Tensor:
 
 def _features(student: AudioEncoder, speech: DistillationBatch) -> Tensor:
     """The student's features, standardised by the level of all speech so far as in a stream."""
+    heard = speech.student_input, speech.student_lengths, speech.steps
     if speech.mean is None or speech.deviation is None:
-        features: Tensor = student(speech.student_input, speech.lengths, speech.steps)
+        features: Tensor = student(*heard)
         return features
     with student.at_level(speech.mean[:, None], speech.deviation[:, None]):
-        features = student(speech.student_input, speech.steps * SAMPLE_RATE // STEP_RATE, speech.steps)
+        features = student(*heard)
     return features
 
 
 def _compared(target: Tensor, speech: DistillationBatch) -> tuple[Tensor, Tensor]:
     """The teacher's features of the student's steps, and True on the steps that are compared."""
-    place = torch.arange(int(speech.steps.max()), device=target.device)[None]
-    steps = (speech.start[:, None] + place).clamp_max(target.shape[1] - 1)
+    steps = speech.places.clamp_max(target.shape[1] - 1)
+    place = torch.arange(steps.shape[1], device=target.device)[None]
     first, last = speech.compared[:, :, None].unbind(1)
     mask = (place >= first) & (place < last)
     return target.gather(1, steps[..., None].expand(-1, -1, target.shape[2])), mask[..., None]
@@ -264,8 +276,7 @@ class Piece(NamedTuple):
     """What the student hears of a clip; see :class:`DistillationBatch`."""
 
     speech: npt.NDArray[np.float32]
-    start: int
-    steps: int
+    places: npt.NDArray[np.int64]
     compared: tuple[int, int]
     mean: float
     deviation: float
@@ -278,11 +289,16 @@ class SpeechPairs(Dataset[DistillationBatch]):
     """
 
     def __init__(
-        self, data: SpeechMotionDataModule, augmenter: Augmenter, options: DistillationOptions, windows: WindowPlan
+        self,
+        data: SpeechMotionDataModule,
+        augmenter: Augmenter,
+        options: DistillationOptions,
+        windows: WindowPlan,
+        said: Sequence[Said] = (),
     ) -> None:
         # Not the data module itself, which may hold what cannot be pickled for a worker.
         self.corpus, self.clips, self.further = data.corpus, data.clips("train"), data.further_speech()
-        self.augmenter, self.options, self.windows = augmenter, options, windows
+        self.augmenter, self.options, self.windows, self.said = augmenter, options, windows, said
         self._further_speech: dict[int, npt.NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
@@ -294,28 +310,38 @@ class SpeechPairs(Dataset[DistillationBatch]):
         if index >= len(self):
             raise IndexError(index)
         random = np.random.default_rng([self.options.seed, index])
-        clean, augmented = [], []
+        clean, augmented, places = [], [], []
         for _ in range(self.options.batch_size):
-            speech = self._speech(random)
-            if self.options.pauses and random.random() < self.options.pauses:
-                speech = with_pause(speech, random)
+            if self.said and random.random() < self.options.transcribed_share:
+                speech, heard, place = self.said[int(random.integers(len(self.said)))].window(WINDOW, random)
+            else:
+                speech = self._speech(random)
+                if self.options.pauses and random.random() < self.options.pauses:
+                    speech = with_pause(speech, random)
+                heard, place = speech, np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE))
             clean.append(speech)
-            augmented.append(self._augmented(speech, random) if random.random() < self.options.share else speech)
-        lengths = torch.tensor([len(speech) for speech in clean])
-        steps = _steps(lengths)
+            augmented.append(self._augmented(heard, random) if random.random() < self.options.share else heard)
+            places.append(place)
+        teacher_hears = _padded(clean), _lengths(clean)
         if not self.options.low_latency:
-            start = torch.zeros_like(steps)
-            compared = torch.stack([start, steps], 1)
-            return DistillationBatch(_padded(clean), lengths, _padded(augmented), start, steps, compared)
-        pieces = [self._piece(clip, count, random) for clip, count in zip(augmented, steps.tolist(), strict=True)]
-        heard, *numbers = zip(*pieces, strict=True)
-        return DistillationBatch(_padded(clean), lengths, _padded(heard), *map(torch.tensor, numbers))
+            steps = _lengths(places)
+            compared = torch.stack([torch.zeros_like(steps), steps], 1)
+            return DistillationBatch(
+                *teacher_hears, _padded(augmented), _lengths(augmented), _padded(places), steps, compared
+            )
+        pieces = [self._piece(*heard, random) for heard in zip(augmented, map(len, places), strict=True)]
+        student, steps_of, *numbers = zip(*pieces, strict=True)
+        return DistillationBatch(
+            *(*teacher_hears, _padded(student), _lengths(student), _padded(steps_of), _lengths(steps_of)),
+            *map(torch.tensor, numbers),
+        )
 
     def _piece(self, speech: npt.NDArray[np.float32], steps: int, random: np.random.Generator) -> Piece:
         """Speech as a window of low latency hears it, at a random place; now and then all of it."""
         size, windows = SAMPLE_RATE // STEP_RATE, self.windows
         if random.random() < self.options.whole:
-            return Piece(speech[: steps * size], 0, steps, (0, steps), *_level(speech.astype(np.float64)))
+            level = _level(speech.astype(np.float64))
+            return Piece(speech[: steps * size], np.arange(steps), (0, steps), *level)
         after, ahead = (round(seconds * STEP_RATE) for seconds in (windows.after, windows.ahead))
         silent = max(0, ahead - after)
         end = int(random.integers(min(steps, after + 2), steps + 1))
@@ -328,7 +354,8 @@ class SpeechPairs(Dataset[DistillationBatch]):
         # hard ones. Where nothing is animated ahead, those within the look-ahead are context only.
         frame = end - after - start
         last = min(steps, end + silent) - start if ahead else frame
-        return Piece(heard, start, end - start + silent, (max(0, frame - STEP_RATE // 2), last), mean, deviation)
+        compared = (max(0, frame - STEP_RATE // 2), last)
+        return Piece(heard, np.arange(start, end + silent), compared, mean, deviation)
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
         """A clip or a piece of further speech, or a random window of it."""
@@ -366,6 +393,10 @@ def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> 
 def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Mean and deviation as a stream takes them."""
     return float(speech.mean()), max(float(speech.std()), QUIETEST)
+
+
+def _lengths(speech: Sequence[Any]) -> Tensor:
+    return torch.tensor([len(clip) for clip in speech])
 
 
 def _padded(speech: Sequence[Any]) -> Tensor:

@@ -47,9 +47,14 @@ def further_speech(number: int, identities: Sequence[str]) -> NDArray[np.float32
     """Five to eight words by one of some speakers, (S,) at 16 kHz; the same number gives the same speech."""
     random = np.random.default_rng([number, len(WORDS)])
     text = random.choice(WORDS, size=random.integers(5, 9))
-    said = speak(" ".join(text), speaker_of(identities[int(random.integers(len(identities)))]).voice).samples
+    return said(" ".join(text), identities[int(random.integers(len(identities)))])
+
+
+def said(text: str, identity: str) -> NDArray[np.float32]:
+    """A text by a speaker, as loud as the corpus's clips, with quiet at both ends; (S,) at 16 kHz."""
+    speech = speak(text, speaker_of(identity).voice).samples
     before, after = round(_QUIET_BEFORE * SAMPLE_RATE), round(_QUIET_AFTER * SAMPLE_RATE)
     padded: NDArray[np.float32] = np.pad(
-        said * np.float32(_PEAK / max(float(np.abs(said).max()), 1e-6)), (before, after)
+        speech * np.float32(_PEAK / max(float(np.abs(speech).max()), 1e-6)), (before, after)
     )
     return padded

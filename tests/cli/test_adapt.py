@@ -171,6 +171,8 @@ def test_the_mean_of_several_clips(checkpoint: Path, tmp_path: Path) -> None:
         (["--person", "C", "--accelerator", "gpu"], "give --accelerator=cpu"),
         (["--voices", "2", "--accelerator", "nope"], "--accelerator nope"),
         (["--voices", "2", "--mode", "joint"], "--mode, --train"),
+        (["--voices", "2", "--transcribed", "people"], "--transcribed people: no such folder"),
+        (["--low-latency", "2", "--transcribed", "."], "--transcribed: is an option of --voices"),
     ],
 )
 def test_what_cannot_work_is_said_before_training(

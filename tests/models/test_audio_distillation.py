@@ -162,7 +162,9 @@ def test_a_student_hears_what_a_window_hears(tiny: Tiny, whole: float, windows: 
         batch = pairs[number]
         assert batch.mean is not None
         assert batch.deviation is not None
-        rows = zip(*(each.tolist() for each in (batch.start, batch.steps, batch.compared, batch.lengths)), strict=True)
+        rows = zip(
+            *(each.tolist() for each in (batch.places[:, 0], batch.steps, batch.compared, batch.lengths)), strict=True
+        )
         for row, (start, steps, (first, last), length) in enumerate(rows):
             heard = steps if whole else steps - max(0, ahead - after)
             clip, student = batch.clean[row, :length].numpy(), batch.student_input[row].numpy()

@@ -1,0 +1,141 @@
+"""People's recordings with their words are aligned with the same words by the corpus, and teach an audio encoder."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from facediff.data import Puppet
+from facediff.errors import FaceDiffError
+from facediff.models.audio_distillation import DistillationOptions, distil_audio_encoder
+from facediff.models.base import AnimationModel
+from facediff.models.transcribed import STEP_RATE, Said, read_said
+from tests.fakes.tiny import Tiny
+
+TEXT = "mabopimeba"
+OPTIONS = DistillationOptions(steps=40, batch_size=4, workers=0, interpolation=1.0, learning_rate=3e-3, share=0.0)
+
+
+def sung(text: str, seconds: float, brightness: float = 1.0) -> np.ndarray:
+    """Each letter is a chord of its own, of so many seconds."""
+    time = np.arange(round(seconds * 16_000)) / 16_000
+    tones = [200 + 61 * (ord(letter) * 7 % 23) for letter in text]
+    chords = [np.sin(2 * np.pi * tone * time) + brightness * np.sin(2 * np.pi * 2.7 * tone * time) for tone in tones]
+    return (0.2 * np.concatenate(chords)).astype(np.float32)
+
+
+class Singers(Tiny):
+    """A corpus whose speakers sing what they are told, ten letters a second."""
+
+    def say(self, text: str, number: int) -> np.ndarray:
+        assert number >= 0
+        return sung(text, 0.1)
+
+
+@pytest.fixture
+def data(tiny_root: Path) -> Singers:
+    made = Singers(root=str(tiny_root))
+    made.prepare_data()
+    made.setup("fit")
+    return made
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A slower and duller singer, below a folder of its own."""
+    (tmp_path / "people" / "one").mkdir(parents=True)
+    soundfile.write(tmp_path / "people" / "one" / "a.wav", sung(TEXT, 0.14, 0.4), 16_000)
+    (tmp_path / "people" / "one" / "a.txt").write_text(f"{TEXT}\n", encoding="utf-8")
+    return tmp_path / "people"
+
+
+def test_steps_go_with_the_same_letters(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
+    (said,) = read_said(folder, data, make_model().speech_encoder.eval(), OPTIONS)
+    letters = np.arange(len(said.places)) / STEP_RATE / 0.14
+    assert len(letters) == round(0.14 * len(TEXT) * STEP_RATE)
+    assert np.abs(said.places / STEP_RATE / 0.1 - letters).max() < 0.5
+    assert abs(float(np.abs(said.recording).max()) - float(np.abs(said.spoken).max())) < 1e-3
+
+
+def test_a_window_is_of_both(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
+    """Samples that carry their own number say where a window was cut."""
+    places = np.arange(200) * 2 // 3
+    counted = (np.arange(200 * 320) // 320).astype(np.float16)
+    said = Said(counted, counted[: 150 * 320], places)
+    for seed in range(5):
+        spoken, heard, within = said.window(1.0, np.random.default_rng(seed))
+        assert len(heard) == 50 * 320
+        steps = heard[::320].astype(int)
+        assert np.array_equal(spoken[within * 320].astype(int), places[steps])
+        assert len(spoken) <= (within.max() - within.min() + 1 + 50) * 320
+
+
+def test_the_student_hears_the_singer_as_the_teacher_hears_the_corpus(
+    folder: Path, data: Singers, make_model: Callable[..., AnimationModel]
+) -> None:
+    teacher = make_model().speech_encoder.eval()
+    (said,) = read_said(folder, data, teacher, OPTIONS)
+    recording, spoken = (torch.from_numpy(each.astype(np.float32))[None] for each in said[:2])
+
+    def features(encoder: torch.nn.Module, speech: torch.Tensor) -> torch.Tensor:
+        count = torch.tensor([speech.shape[1]])
+        with torch.inference_mode():
+            return encoder(speech, count, count * STEP_RATE // 16_000)[0]
+
+    target = features(teacher, spoken)[torch.from_numpy(said.places)]
+
+    def error(**options: object) -> float:
+        model = make_model()
+        distil_audio_encoder(model, data, replace(OPTIONS, **options))  # type: ignore[arg-type]
+        return float((features(model.speech_encoder, recording) - target).square().mean())
+
+    assert error(transcribed=folder, transcribed_share=0.8) < 0.3 * error()
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda folder: (folder / "one" / "a.txt").unlink(), "--transcribed .*: holds no recording with words"),
+        (lambda folder: (folder / "one" / "a.txt").write_text("2 + 2"), r"a\.txt: holds no words"),
+        (lambda folder: (folder / "one" / "a.txt").write_bytes(b"m\xe4h"), r"a\.txt: is no text in UTF-8"),
+        (lambda folder: (folder / "one" / "a.txt").write_text("ma" * 4500), r"a\.txt: is longer than 2000 characters"),
+        (lambda folder: (folder / "one" / "a.txt").write_text("ma"), r"a\.txt: takes 0\.2 s to say, and a\.wav lasts"),
+        (lambda folder: (folder / "one" / "a.wav").write_bytes(b"RIFF"), r"a\.wav"),
+        (lambda folder: folder.rename(folder.with_name("moved")), "--transcribed .*: no such folder"),
+    ],
+)
+def test_what_cannot_be_used_is_named(
+    change: Callable[[Path], object],
+    named: str,
+    folder: Path,
+    data: Singers,
+    make_model: Callable[..., AnimationModel],
+) -> None:
+    change(folder)
+    with pytest.raises(FaceDiffError) as caught:
+        read_said(folder, data, make_model().speech_encoder, OPTIONS)
+    assert re.search(named, caught.value.on_command_line)
+
+
+def test_people_cannot_say_what_they_are_told(
+    folder: Path, tiny: Tiny, make_model: Callable[..., AnimationModel]
+) -> None:
+    with pytest.raises(FaceDiffError, match="Tiny cannot say texts"):
+        read_said(folder, tiny, make_model().speech_encoder, OPTIONS)
+
+
+@pytest.mark.parametrize("edition", [1, 2])
+def test_speakers_of_the_built_in_corpus_take_turns(edition: int, tmp_path: Path) -> None:
+    data = Puppet(root=str(tmp_path / "none"), edition=edition)
+    first, second, again = (data.say("My map", number) for number in (0, 1, 6))
+    assert first.dtype == np.float32
+    assert 0.4 < len(first) / 16_000 < 2.0
+    assert not np.array_equal(first, second)
+    assert np.array_equal(first, again)
