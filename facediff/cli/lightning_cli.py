@@ -40,7 +40,6 @@ from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, 
 from facediff.cli.configs import PARTS, guard_configs
 from facediff.cli.trainer_options import IDLE_WARNINGS, explained, raised_in, sentence_of, without_warnings
 from facediff.data import SpeechMotionDataModule
-from facediff.data.packed.stores import address_of
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
@@ -423,15 +422,12 @@ class FaceDiffCLI(LightningCLI):
 
 
 def refuse_missing_corpus(data: Mapping[str, Any]) -> None:
-    """Refuse a mistyped folder before the model is built, which may fetch an audio encoder's weights for minutes."""
+    """Refuse a folder without a corpus before the model is built, which may fetch an audio encoder for minutes."""
     module, _, name = str(data["class_path"]).rpartition(".")
     kind: type[SpeechMotionDataModule] = getattr(import_module(module), name)
     root = (data.get("init_args") or {}).get("root")
-    # A corpus that says how it is obtained is there before a run; others may be made by their data module.
-    if root is not None and kind.obtain and not address_of(str(root)):
-        folder = Path(str(root)).expanduser()
-        if not folder.exists():
-            raise kind.missing(folder)
+    if root is not None:
+        kind.check_root(str(root))
 
 
 class ParsedCLI(FaceDiffCLI):

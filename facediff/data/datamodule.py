@@ -357,6 +357,21 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         advice = "set data.root to your copy (--data.root, or --data-root where a command has that)"
         return FaceDiffError(f"{no_such_folder(root)}; {advice}. {cls.obtain}".rstrip())
 
+    @classmethod
+    def check_root(cls, root: str | Path) -> None:
+        """Refuse a folder that there is nothing to train on in, before a data module and a model are built.
+
+        Args:
+            root: the folder, or an address of a packed corpus, which is not looked at.
+
+        Raises:
+            FaceDiffError: if it is missing, unless the data module may make it.
+        """
+        # A corpus that says how it is obtained is there before a run; others may be made by their data module.
+        folder = Path(root).expanduser()
+        if cls.obtain and address_of(root) is None and not folder.exists():
+            raise cls.missing(folder)
+
     @cached_property
     def corpus(self) -> Corpus:
         """The corpus on disk."""

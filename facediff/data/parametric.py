@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal
 from facediff import registry
 from facediff.data.corpus import Clip, read_clip_table
 from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.data.packed.stores import is_packed
 from facediff.data.person.importer import splits
 from facediff.data.recordings import USUAL_SUFFIXES, RecordingFolder
 from facediff.errors import FaceDiffError
@@ -50,6 +51,25 @@ class ParametricDataModule(SpeechMotionDataModule):
         recordings = RecordingFolder(root, layout("arkit"), cls.frame_rate, suffixes=cls.suffixes)
         clips = (cls.parse_name(name) for name in (recordings.names() if root.is_dir() else []))
         return sorted({clip.identity for clip in clips if clip is not None})
+
+    @classmethod
+    def check_root(cls, root: str | Path) -> None:
+        """Refuse a folder without recordings, whose speakers are the model's identities.
+
+        Raises:
+            FaceDiffError: if it is missing, or holds none.
+        """
+        folder = Path(root).expanduser()
+        if is_packed(root):  # is refused when it is read
+            return
+        if not folder.exists():
+            raise cls.missing(folder)
+        if not cls.speakers_in(folder):
+            expected = f"{' or '.join(cls.suffixes)}, each with a .wav of its name"
+            raise FaceDiffError(
+                f"{folder}: holds no recordings of {cls.corpus_name}; expected {expected}: put them there, or give "
+                f"their folder as data.root (--data-root). {cls.obtain}".rstrip()
+            )
 
     def channel_folder(self) -> RecordingFolder:
         """The recordings."""

@@ -168,6 +168,8 @@ def test_the_mean_of_several_clips(checkpoint: Path, tmp_path: Path) -> None:
         (["--person", "C", "-o", "out.pt"], "ends in .ckpt"),
         (["--person", "C", "--epochs", "0"], "--epochs 0"),
         (["--person", "C", "--data-root", "nowhere"], "nowhere"),
+        (["--face", "LiveLink", "--data-root", "nowhere"], "nowhere"),
+        (["--face", "LiveLink", "--data-root", "."], "no recordings of live_link; expected .csv"),
         (["--person", "C", "--accelerator", "gpu"], "give --accelerator=cpu"),
         (["--voices", "2", "--accelerator", "nope"], "--accelerator nope"),
         (["--voices", "2", "--mode", "joint"], "--mode, --train"),
