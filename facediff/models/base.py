@@ -30,7 +30,7 @@ from facediff.models.channel_weights import ChannelWeights, channel_weights
 from facediff.models.checkpoint import checked_file
 from facediff.models.checkpoint_content import MotionScale, PersonStyles, StyleSource
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, with_usual_styles
-from facediff.models.inference import Prediction
+from facediff.models.inference import Prediction, noise_stream
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.motion_space import PrincipalComponents, Projection
 from facediff.models.pretrained import publish
@@ -357,8 +357,9 @@ class AnimationModel(PersonStyles, ABC):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss with fixed random numbers, so that epochs compare, and the protocol's metrics of generated motion."""
-        # The same steps and noise in every epoch; otherwise the curve would show their chance.
-        losses = self.losses(batch, torch.Generator(self.device).manual_seed(batch_idx))
+        # The same steps and noise in every epoch; otherwise the curve would show their chance. They follow from the
+        # clips and not from the batch's number, which is another one where several processes share the batches.
+        losses = self.losses(batch, noise_stream(" ".join(batch.names), 0, self.device))
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
         model = self.model_of(batch)

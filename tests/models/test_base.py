@@ -160,6 +160,18 @@ def test_validation_is_the_same_twice(make_model: Make, tiny: Tiny, make_trainer
     assert {"val/loss", "val/mve", "val/lve", "val/fdd", "val/reconstruction"} <= scores[0].keys()
 
 
+def test_validation_draws_by_clips_not_by_the_number_of_a_batch(
+    make_model: Make, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, logged = make_model(metrics=[]), []
+    model.adopt(tiny.assets().with_motion_scale(2.0))
+    monkeypatch.setattr(model, "log_dict", lambda values, **_: logged.append(values))
+    monkeypatch.setattr(model.evaluation, "score", lambda *_: None)
+    for number in (0, 1):
+        model.eval().validation_step(next(iter(tiny.val_dataloader())), number)
+    assert logged[0] == logged[1]
+
+
 def test_the_best_checkpoint_is_chosen_by_energy_over_a_still_faces(
     make_model: Make, tiny: Tiny, make_trainer: MakeTrainer
 ) -> None:
