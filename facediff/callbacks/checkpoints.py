@@ -237,8 +237,10 @@ class LastCheckpoint(Callback):
                 flush=True,
             )
             cluster = trainer._accelerator_connector.cluster_environment
-            if name == "SIGUSR1" and isinstance(cluster, SLURMEnvironment) and cluster.auto_requeue:
-                requeue(path.parents[1])
+            if isinstance(cluster, SLURMEnvironment):
+                note_job(path.parents[1])
+                if name == "SIGUSR1" and cluster.auto_requeue:
+                    requeue()
         raise Stopped(status)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
@@ -369,12 +371,17 @@ class DeferredSignals:
             os.write(2, b"\nfinishing the step and saving; Ctrl-C again stops immediately\n")
 
 
-def requeue(run: Path) -> None:
-    """Ask SLURM to start this job again; it then continues the run."""
-    array = os.environ.get("SLURM_ARRAY_JOB_ID")
-    job = f"{array}_{os.environ.get('SLURM_ARRAY_TASK_ID')}" if array else os.environ.get("SLURM_JOB_ID", "")
+def note_job(run: Path) -> None:
+    """Note in a run's folder which job of SLURM trained it, which continues the run when SLURM starts it again."""
+    # Also after SIGTERM: SLURM itself puts a job that has to make room for another back into the queue.
     with atomic(run / JOB_FILE) as temporary:
         temporary.write_text(os.environ.get("SLURM_JOB_ID", ""), encoding="utf-8")
+
+
+def requeue() -> None:
+    """Ask SLURM to start this job again."""
+    array = os.environ.get("SLURM_ARRAY_JOB_ID")
+    job = f"{array}_{os.environ.get('SLURM_ARRAY_TASK_ID')}" if array else os.environ.get("SLURM_JOB_ID", "")
     try:
         failed = subprocess.run(["scontrol", "requeue", job], check=False).returncode  # noqa: S603, S607
     except OSError as error:

@@ -1,15 +1,18 @@
-"""The folder of a run: what killed runs have left next to it."""
+"""The folder of a run: what killed runs have left next to it, and the job of SLURM that continues it."""
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger
 
-from facediff.callbacks.runs import locked_run
+from facediff.callbacks import LastCheckpoint, checkpoints
+from facediff.callbacks.runs import find_checkpoint, locked_run
 from facediff.utils import files
 
 
@@ -25,3 +28,23 @@ def test_what_a_run_that_was_killed_in_its_first_save_left_is_swept(tmp_path: Pa
     trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", enable_progress_bar=False)
     with locked_run(trainer, new=True):
         assert [*checkpoints.iterdir()] == [own]  # this process is at work
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1"])
+def test_a_job_of_slurm_that_was_stopped_continues_its_run(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = {"JOB_ID": 77, "JOB_NAME": "facediff", "NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0}
+    for variable, value in job.items():
+        monkeypatch.setenv(f"SLURM_{variable}", str(value))
+    asked: list[None] = []
+    monkeypatch.setattr(checkpoints, "requeue", lambda: asked.append(None))
+    trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", devices=1, enable_progress_bar=False)
+    last = LastCheckpoint()
+    last.path(trainer).parent.mkdir(parents=True)
+    with pytest.raises(SystemExit):
+        last.stop(trainer, signal.Signals[name])
+    assert len(asked) == (name == "SIGUSR1")  # a job that makes room for another is requeued by SLURM itself
+    assert find_checkpoint(trainer, None) is None
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert find_checkpoint(trainer, None) == last.path(trainer)
