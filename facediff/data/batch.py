@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.rigs import LinearRig
 from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
@@ -402,10 +402,14 @@ class Assets:
         return cast(Rig, self.rig).decode(motion, self.space, identity)
 
     def template(self, identity: str) -> Float[Tensor, "points dims"]:
-        """The neutral face of an identity."""
+        """The neutral face of an identity, in the corpus's unit.
+
+        Raises:
+            OptionError: if there is no such identity.
+        """
         if identity not in self.templates:
-            raise FaceDiffError(
-                f'identity: there is no "{identity}"; the checkpoint has {", ".join(sorted(self.templates))}'
+            raise OptionError(
+                "identity", f'there is no "{identity}"; the checkpoint has {", ".join(sorted(self.templates))}'
             )
         return self.templates[identity]
 

@@ -92,7 +92,7 @@ def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyl
     if recorded is not None:
         return _of_parameters(recorded, model, identity)
     if not name.endswith(FILES):
-        raise FaceDiffError(f'style: there is no "{name}", and it is no file: {choices(name, about.styles)}')
+        raise OptionError("style", f'there is no "{name}", and it is no file: {choices(name, about.styles)}')
     return _of_vertices(open_style(Path(name)), model, identity)
 
 

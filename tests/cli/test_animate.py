@@ -136,7 +136,7 @@ def test_a_seed_that_decides_nothing_is_refused(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--identity", "Zoe"], 'there is no "Zoe"; the checkpoint has A, B, C'),
+        (["--identity", "Zoe"], '--identity: there is no "Zoe"; the checkpoint has A, B, C'),
         (["--style", "other.npy"], "has shape (9, 31, 3); the model's faces have 24 vertices"),
         (["--style", "A_e99"], "no clip of that name"),
         (["--style", "none.npy"], "no such file"),

@@ -24,7 +24,7 @@ from facediff.animation import write_archive
 from facediff.animation.options import AnimationOptions
 from facediff.animation.style_files import marked
 from facediff.cli.app import main
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
 from facediff.models.inference import ClipNoise as ModelNoise
@@ -231,6 +231,9 @@ def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Pat
     np.save(tmp_path / "another.npy", marked(own, still[::-1]))
     with pytest.raises(FaceDiffError, match=r"another\.npy: is of another model"):
         read_style(str(tmp_path / "another.npy"), runtime, "A")
+    with pytest.raises(OptionError) as caught:
+        read_style("Zoe", runtime, "A")
+    assert caught.value.on_command_line.startswith('--style: there is no "Zoe"')
     for name in ("b.npz", "B_1.npy", "vector.npy", "marked.npy"):
         found = read_style(str(tmp_path / name), runtime, "A")
         np.testing.assert_allclose(found.vector, own, atol=1e-5)
