@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.data.corpus import MOTION_FOLDERS, find_region, read_manifest, read_templates
 from facediff.data.person.motion import MESHES, Array, Faces, FaceSequence, differing_faces, scratch_array, spans
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
 from facediff.mesh.alignment import Indices, chunks
 from facediff.speech.audio import SAMPLE_RATE
@@ -25,6 +25,7 @@ RESIDUAL_LIMIT = 0.15
 Faces of different speakers differ by some hundredths; vertices in another order by about 1.
 """
 SAME_UNIT = 1.2  # a speaker's face and the corpus's mean face differ in size by less than this factor
+MOST_SCALED = 3.0  # a scale that is given makes a face at most so many times larger or smaller than the corpus's
 MIN_STABLE = 10
 STILL = 1e-6  # of the face's size: slower motion counts as none
 SAME_SIZE = 1.1  # template and motion must agree in size to this factor
@@ -132,7 +133,17 @@ def into_coordinates(face: Array, best: Similarity, fixed_scale: float | None) -
     (millimetres, centimetres, metres), it is that power; else, as with a corpus of normalised size, it is as measured.
     ``best`` lays the speaker's neutral face onto the corpus's mean face best, and is kept but for its scale, about the
     face's centre; a scale that is given is used instead.
+
+    Raises:
+        OptionError: if that makes the face far larger or smaller than those of the corpus.
     """
+    if fixed_scale is not None and not abs(math.log(fixed_scale / best.scale)) < math.log(MOST_SCALED):
+        raise OptionError(
+            "scale",
+            f"makes a face {fixed_scale / best.scale:.3g} times as large as the corpus's; expected corpus units to a "
+            f"unit of the motion, about {best.scale:.3g} by the size of the face",
+            f"{fixed_scale:g}",
+        )
     power = round(math.log10(best.scale))
     is_unit = abs(math.log10(best.scale) - power) < math.log10(SAME_UNIT)
     scale = fixed_scale if fixed_scale is not None else 10.0**power if is_unit else best.scale

@@ -411,6 +411,7 @@ def test_a_flawed_folder_gets_one_sentence(
         (["--frame-rate", "60"], "expected the same stretch of video; check --frame-rate"),
         (["--frame-rate", "nan"], "--frame-rate nan"),
         (["--scale", "-1"], "--scale -1"),
+        (["--scale", "1000"], r"scale 1000: makes a face 1\.?\d*e\+06 times as large .* about 0\.001 by"),
         (["--clip-seconds", "0.2"], "--clip-seconds 0.2"),
         (["--corpus-frame-rate", "25"], r"--corpus-frame-rate 25: .*manifest\.json.* 30"),
         (["--corpus", "{tmp}/none"], "--corpus .*none: no such"),
