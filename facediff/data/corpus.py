@@ -143,6 +143,14 @@ class Corpus:
                 raise FaceDiffError(
                     f"{folder}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl"
                 )
+        for folder in people:
+            if (folder / "vertices_npy").is_dir() != space.is_vertices:
+                held, needed = ("channels", "vertices") if space.is_vertices else ("vertices", "channels")
+                command = "import-person" if space.is_vertices else "import-take"
+                raise FaceDiffError(
+                    f"{folder}: holds a speaker's motion in {held}; expected {needed}, as the corpus in {root} has. "
+                    f"Give a folder that `facediff data {command}` wrote, or a checkpoint of a model of {held}"
+                )
         # An imported speaker in channels is a recording as it came, in whatever order its file has.
         self._storages: dict[Path, ClipStorage] = {
             folder: ClipFolder(folder, n_vertices) if space.is_vertices else RecordingFolder(folder, space, frame_rate)

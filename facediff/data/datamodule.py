@@ -477,8 +477,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """Samples of a split: whole clips with fixed references, or in training random windows and references."""
         clips = self.clips(split)
         if not clips:
+            hint = "; trainer.limit_val_batches=0 trains without validation" if split == "val" else ""
             raise FaceDiffError(
-                f"{self.root}: no clip of split {split}; `facediff data check {self.root}` lists what is missing"
+                f"{self.root}: no clip of split {split}; `facediff data check {self.root}` lists what is missing{hint}"
             )
         policy = self.reference_policy()
         if not training or self.reference != "self":

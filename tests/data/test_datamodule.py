@@ -160,6 +160,9 @@ def test_a_persons_folder_must_be_one(tmp_path: Path) -> None:
     (other / "vertices_npy" / "Eve_s01.npy").rename(other / "vertices_npy" / "F2_e01.npy")
     with pytest.raises(FaceDiffError, match=r"its clip F2_e01 is also in"):
         _ = MiniBiwi(root=str(root), people=[str(other)]).corpus.clips
+    (other / "vertices_npy").rename(other / "recordings")
+    with pytest.raises(FaceDiffError, match=r"other: .* in channels; expected vertices, .*import-person"):
+        _ = MiniBiwi(root=str(root), people=[str(other)]).corpus
 
 
 def test_a_persons_table_may_come_from_a_spreadsheet_but_must_name_splits(tmp_path: Path) -> None:

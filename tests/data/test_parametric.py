@@ -164,6 +164,11 @@ def test_a_take_of_one_is_a_speaker_of_another_corpus(tmp_path: Path) -> None:
     jaw = data.corpus.read_motion(clip)[:, data.space.index("jawOpen"), 0].numpy()
     assert np.abs(jaw - values[:, layout("live_link").index("jawOpen")]).max() < 1e-6
     assert LiveLink(root=str(person)).identities == ["Ann"]
+    with pytest.raises(FaceDiffError, match=r"no clip of split val; .*limit_val_batches=0"):
+        LiveLink(root=str(person)).val_dataloader()
+    (person / "vertices_npy").mkdir()
+    with pytest.raises(FaceDiffError, match=r"ann: .* in vertices; expected channels, .*import-take"):
+        _ = Beat(root=str(beat), people=[str(person)]).corpus
 
 
 def test_conversations_and_speakers_who_are_not_asked_for_are_not_trained_on(tmp_path: Path) -> None:
