@@ -52,7 +52,9 @@ LIGHTNING = "2.6.0"
 """Which Lightning is said to have written the content, so that it converts nothing."""
 
 PARTS = {"format", "version", "model", "state", "shared"}
-REMEDY = "expected a folder that `facediff publish` has written; copy or download it again"
+REMEDY = (
+    "expected a folder that `facediff publish` has written; copy or download it again, in a git clone by `git lfs pull`"
+)
 MARK = "$tensor"
 MOTION_FRAMES = 8
 """From so many frames on, a (T, V, 3) tensor is stored as differences between frames."""
@@ -219,7 +221,7 @@ def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
         raise FaceDiffError(f"{path}: is no config of a model of facediff's; {REMEDY}")
     check_format(path, config["format"], FORMAT)
     if config.keys() != PARTS or not all(isinstance(config[part], dict) for part in ("model", "state", "shared")):
-        raise FaceDiffError(f"{path}: holds {quoted(sorted(config))}; expected {', '.join(sorted(PARTS))}. {REMEDY}")
+        raise FaceDiffError(f"{path}: lacks one of {', '.join(sorted(PARTS))}, or it is of another type; {REMEDY}")
     arrays = read_arrays(folder / ASSETS, remedy=REMEDY)
     content = {
         "pytorch-lightning_version": LIGHTNING,

@@ -37,7 +37,7 @@ TYPES = {
 }
 """PyTorch's name of each type of numbers, and its bytes."""
 
-DAMAGED = "the file is damaged, copy or download it again"
+DAMAGED = "the file is damaged, copy or download it again, in a git clone by `git lfs pull`"
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:

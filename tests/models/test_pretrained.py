@@ -286,9 +286,9 @@ def test_missing_files_are_named(copy: Path) -> None:
 def test_damaged_files_are_named(copy: Path) -> None:
     for name in ("config.json", "model.safetensors", "assets.npz"):
         kept = (copy / name).read_bytes()
-        for damaged in (kept[: len(kept) // 2], b"", b"x" * 100):
+        for damaged in (kept[: len(kept) // 2], b"", b"version https://git-lfs.github.com/spec/v1\noid sha256:aa"):
             (copy / name).write_bytes(damaged)
-            refused(copy, name)
+            refused(copy, f"{name}.*git lfs pull")
         (copy / name).write_bytes(kept)
 
 
