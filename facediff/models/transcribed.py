@@ -22,7 +22,6 @@ from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
-    from facediff.models.audio_distillation import DistillationOptions
     from facediff.models.audio_encoders import AudioEncoder
 
 STEP_RATE = 50
@@ -67,17 +66,15 @@ class Said(NamedTuple):
         return spoken.astype(np.float32), heard.astype(np.float32), places - first
 
 
-def read_said(
-    folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder, options: DistillationOptions
-) -> list[Said]:
+def read_said(folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder, *, most: int, seed: int) -> list[Said]:
     """People's recordings of a folder, aligned with the same words by speakers of the corpus.
 
     Args:
         folder: NAME.wav, .flac, .ogg or .mp3, each with its English words in NAME.txt, in any folders below.
         data: the corpus, whose speakers say the words (:meth:`facediff.data.SpeechMotionDataModule.say`).
         teacher: the encoder whose features are to be reproduced.
-        options: of many recordings, :attr:`~facediff.models.audio_distillation.DistillationOptions.further` are drawn
-            by its seed.
+        most: recordings; of more, so many are drawn.
+        seed: of the draw.
 
     Raises:
         FaceDiffError: if the folder holds no recording with words, one is damaged or longer than 15 s, its text is
@@ -91,8 +88,8 @@ def read_said(
     )
     if not files:
         raise OptionError("transcribed", f"holds no recording with words; {expected}", folder)
-    random = np.random.default_rng(options.seed)
-    chosen = [files[i] for i in random.permutation(len(files))[: max(1, options.further)]]
+    random = np.random.default_rng(seed)
+    chosen = [files[i] for i in random.permutation(len(files))[:most]]
     return [_read(path, data, teacher, number) for number, path in enumerate(chosen)]
 
 
