@@ -12,6 +12,8 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
 - *people kept out*: all test sentences and 48 others by voices of people that nobody is trained with, as far as they
   are installed, each with two seeds; ± is half of the 95 % interval where the sentences are drawn again. ``--people``
   names other voices.
+- *recordings*: people's own, with their words in NAME.txt (``--recordings FOLDER``). Times of p, b and m come from
+  `--transcript`'s alignment and are a few hundredths of a second off: a closure may be a frame early or late.
 - *pauses*: two sentences with 1 s of silence before, between and after them. How far the lips are open in the pauses,
   from 0.3 s after speech to 0.2 s before it, how far a lip vertex moves from a frame to the next, and the lip vertex
   error of the first 0.2 s of speech, which a gate that opens late would raise.
@@ -26,7 +28,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
 from functools import lru_cache
 from itertools import cycle, product
@@ -43,7 +45,9 @@ import facediff
 from facediff.animation.options import GROUPS
 from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
-from facediff.speech.audio import fit_length
+from facediff.editing.transcripts import align_transcript
+from facediff.models.transcribed import read_words
+from facediff.speech.audio import fit_length, read_speech
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
 from facediff.speech.pitch import HOP, SIZE, signal, spectra
 from facediff.synthetic.cast import KEPT_OUT_PEOPLE
@@ -391,23 +395,46 @@ class Bench:
         return {**_closed(closures, chances, gaps), "LVE / still": float(errors.mean() / np.concatenate(still).mean())}
 
     def person(self, voice: str) -> dict[str, float]:
-        """Closures of sentences in a voice without clips; faces and styles of test A take turns."""
-        speaker, chances = open_voice(voice), []
-        gaps: list[list[float]] = []
-        for text, sample in zip((*TEST, *FURTHER), cycle(self.samples["test_a"][::3]), strict=False):
-            said = speaker.speak(text)
+        """Closures of sentences in a voice without clips."""
+        said = map(open_voice(voice).speak, (*TEST, *FURTHER))
+        return self.strangers(
+            ((each.samples, [TimedPhoneme(*astuple(phoneme)) for phoneme in each.phonemes]) for each in said), DRAWS
+        )
+
+    def recorded(self, folder: Path) -> dict[str, float]:
+        """Closures of people's recordings, NAME.wav with NAME.txt; their times are found by alignment."""
+        files = [path for path in sorted(folder.glob("*.wav")) if path.with_suffix(".txt").is_file()]
+        speech = {path: read_speech(path) for path in files}
+        words = {path: read_words(path.with_suffix(".txt")) for path in files}
+        return self.strangers(((speech[path], align_transcript(words[path], speech[path])) for path in files), 1, 1)
+
+    def strangers(
+        self, said: Iterable[tuple[Array, Sequence[TimedPhoneme]]], draws: int, margin: int = 0
+    ) -> dict[str, float]:
+        """Closures of speech without clips; faces and styles of test A take turns.
+
+        Args:
+            said: speech with its phonemes.
+            draws: seeds of each.
+            margin: frames by which a closure may be early or late.
+        """
+        chances, gaps = [], []
+        for (samples, phonemes), sample in zip(said, cycle(self.samples["test_a"][::3]), strict=False):
             rest = self.opening(sample.template.double().numpy()[None] * 1000)
-            times = closures((TimedPhoneme(*astuple(each)) for each in said.phonemes), self.model.frame_rate)
-            speech = 0.6 * said.samples / np.abs(said.samples).max()
-            draws = [self.opening(self.animate(speech, sample, draw)) for draw in range(DRAWS)]
-            gaps.append([])
-            for opened, (start, end) in product(draws, times):
+            times = [
+                (max(0, start - margin), end + margin) for start, end in closures(iter(phonemes), self.model.frame_rate)
+            ]
+            speech = 0.6 * samples / np.abs(samples).max()
+            openings = [self.opening(self.animate(speech, sample, draw)) for draw in range(draws)]
+            of_sentence = []
+            for opened, (start, end) in product(openings, times):
                 if end <= len(opened):
-                    gaps[-1].append(float((opened[start:end] - rest).min()))
+                    of_sentence.append(float((opened[start:end] - rest).min()))
                     chances.append(_chance(opened - rest < 1, end - start))
-        every = np.concatenate([np.array(sentence) for sentence in gaps])
-        shut = [((np.array(sentence) < 1).sum(), len(sentence)) for sentence in gaps]
-        closed = {"within 1 mm": float((every < 1).mean()), "±": _half_width(np.array(shut))}
+            gaps.append(np.array(of_sentence))
+        every = np.concatenate(gaps)
+        shut = np.array([((sentence < 1).sum(), len(sentence)) for sentence in gaps])
+        closed = {"within 1 mm": float((every < 1).mean()), "±": _half_width(shut)}
         return {**closed, "chance": float(np.mean(chances)), "gap": float(np.median(every)), "closures": len(every)}
 
     def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
@@ -524,6 +551,7 @@ def measured(
     only: str = "",
     root: str | None = None,
     people: Sequence[str] = KEPT_OUT_PEOPLE,
+    recordings: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """All tables, which are printed as they are ready.
 
@@ -534,6 +562,7 @@ def measured(
         only: measure tables and rows whose name contains this.
         root: folder of the corpus; the user's cache folder if None.
         people: voices of people that nobody is trained with.
+        recordings: folders of people's recordings with their words.
     """
     bench = Bench(checkpoint, options, clips, root)
     strangers = dict.fromkeys(clip.attributes["voice"] for clip in bench.data.clips("test_c"))
@@ -542,6 +571,7 @@ def measured(
         ("voices", VOICES, bench.voice),
         ("kept out", {voice: voice for voice in strangers}, bench.kept_out),
         ("people kept out", {voice: voice for voice in people if _installed(voice)}, bench.person),
+        ("recordings", {folder.name: folder for folder in recordings}, bench.recorded),
         ("pauses, mm", PAUSES, bench.pause),
         ("nobody speaks, mm", NOTHING, bench.nothing),
     )
@@ -567,12 +597,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--clips", type=int, help="most clips of a split")
     parser.add_argument("--only", default="", metavar="WORDS", help="tables and rows whose name contains this")
     parser.add_argument("--people", nargs="*", default=KEPT_OUT_PEOPLE, metavar="VOICE", help="such as flite:slt")
+    parser.add_argument("--recordings", nargs="*", default=[], type=Path, metavar="FOLDER", help="with NAME.txt each")
     parser.add_argument("--data-root", help="folder of the corpus (default: the user's cache folder)")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)
     parameters = {name: option for group in GROUPS for name, option in parameters_of(group).items()}
     options = {name: parameters[name].read(text) for name, _, text in (word.partition("=") for word in given.options)}
-    scores = measured(given.checkpoint, options, given.clips, given.only, given.data_root, given.people)
+    scores = measured(
+        given.checkpoint, options, given.clips, given.only, given.data_root, given.people, given.recordings
+    )
     if given.json:
         with atomic(given.json) as temporary:
             temporary.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
