@@ -30,6 +30,8 @@ SOUNDS = (".wav", ".flac", ".ogg", ".mp3")
 LONGEST = 15.0
 """Seconds of a recording; longer ones are better cut at pauses."""
 MOST_CHARACTERS = 2000
+SILENT = 1e-4
+"""A recording whose loudest sample is lower holds nothing but noise."""
 OTHER_PACE = 2.5
 """Words that a speaker of the corpus says so many times faster or slower are another recording's."""
 MARGIN = STEP_RATE // 2
@@ -124,7 +126,10 @@ def _read(path: Path, data: SpeechMotionDataModule, teacher: AudioEncoder, numbe
             f"{words}: takes {len(spoken) / SAMPLE_RATE:.1f} s to say, and {path.name} lasts "
             f"{len(recording) / SAMPLE_RATE:.1f} s; expected all words of this recording"
         )
-    recording *= np.abs(spoken).max() / max(float(np.abs(recording).max()), 1e-6)
+    loudest = float(np.abs(recording).max())
+    if loudest < SILENT:
+        raise FaceDiffError(f"{path}: is silent; remove it, or record it again")
+    recording *= np.abs(spoken).max() / loudest
     places = align_features(_features(recording, teacher), _features(spoken, teacher))
     return Said(recording.astype(np.float16), spoken.astype(np.float16), places)
 

@@ -108,6 +108,7 @@ def test_the_student_hears_the_singer_as_the_teacher_hears_the_corpus(
         (lambda folder: (folder / "one" / "a.txt").write_text("ma" * 4500), r"a\.txt: is longer than 2000 characters"),
         (lambda folder: (folder / "one" / "a.txt").write_text("ma"), r"a\.txt: takes 0\.2 s to say, and a\.wav lasts"),
         (lambda folder: (folder / "one" / "a.wav").write_bytes(b"RIFF"), r"a\.wav"),
+        (lambda folder: soundfile.write(folder / "one" / "a.wav", np.zeros(22400), 16_000), r"a\.wav: is silent"),
         (lambda folder: folder.rename(folder.with_name("moved")), "--transcribed .*: no such folder"),
     ],
 )
