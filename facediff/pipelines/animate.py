@@ -458,7 +458,7 @@ class AnimationPipeline(ABC):
         if self.direction is not None:
             metadata["direction"] = self.direction.text()
         if words := options.words():
-            metadata["options"] = json.dumps(words, ensure_ascii=False)
+            metadata["options"] = json.dumps(words, ensure_ascii=False, allow_nan=False)
         for option in ("expressivity", "guidance"):
             if (scales := getattr(options, option)) is not None:
                 metadata[option] = scales_text(scales)

@@ -10,7 +10,6 @@ from torch import nn
 
 from facediff.callbacks import EmaWithWarmup
 from facediff.cli.lightning import run_cli
-from facediff.data.mead3d import VALIDATION
 from facediff.data.vocaset import TRAIN
 from facediff.data.vocaset import VALIDATION as HELD_OUT
 from facediff.models import DualPathDiffusion
@@ -25,8 +24,8 @@ CORPORA: dict[str, tuple[str, list[str], set[str]]] = {
     ),
     "mead3d": (
         "MiniMead",
-        ["M003_001_0_0", "M003_002_0_0", f"{VALIDATION[0]}_001_0_0", f"{VALIDATION[0]}_002_0_0"],
-        {"M003", VALIDATION[0]},
+        ["M003_001_0_0", "M003_002_0_0", "M003_033_0_0", "M003_034_0_0"],
+        {"M003"},
     ),
 }
 

@@ -15,6 +15,7 @@ from facediff.cli.app import main
 
 PAGE = (Path(__file__).parents[2] / "docs" / "own_data.md").read_text()
 VERTICES = 62
+FRAMES = 32  # of a clip; the prior over time of the small configs takes 25
 (SOURCE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -32,9 +33,9 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     templates = {name: rng.uniform(-1, 1, (VERTICES, 3)) for name in ("2", "13", "1")}
     for subject, numbers in {"2": (1, 40, 41, 46), "13": (2, 3, 45, 50), "1": (5, 48)}.items():
         for number in numbers:
-            motion = templates[subject].ravel() + rng.normal(0, 0.01, (8, VERTICES * 3))
+            motion = templates[subject].ravel() + rng.normal(0, 0.01, (FRAMES, VERTICES * 3))
             np.save(root / "vertices_npy" / f"{subject}_{number:02d}.npy", motion)
-            soundfile.write(root / "wav" / f"{subject}_{number:02d}.wav", rng.uniform(-0.1, 0.1, 8 * 1600), 48000)
+            soundfile.write(root / "wav" / f"{subject}_{number:02d}.wav", rng.uniform(-0.1, 0.1, FRAMES * 1600), 48000)
     (root / "templates.pkl").write_bytes(pickle.dumps(templates))
     (root / "regions" / "lve.txt").write_text("0,1,2")
     (root / "regions" / "fdd.txt").write_text("3, 4, 5")

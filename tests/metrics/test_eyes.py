@@ -1,4 +1,4 @@
-"""Blinks against series whose number is known, the built-in corpus's own count, and the nearest speaker in NumPy."""
+"""Blinks against series whose number is known."""
 
 from __future__ import annotations
 
@@ -9,10 +9,6 @@ from torch import Tensor
 
 import facediff.metrics as fm
 from facediff.metrics.eyes import count_blinks
-from facediff.synthetic import motion as puppet
-from facediff.synthetic.corpus import SyntheticClip, generate_clip, rig_of
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import eyelid_pairs
 
 LIDS = [(0, 1)]
 
@@ -124,28 +120,3 @@ def test_lids_that_wander_have_the_variance_of_blinks_and_drift() -> None:
     for limit in (0.0, 1.0, float("nan")):
         with pytest.raises(ValueError, match="reopened"):
             fm.EyelidDrift(LIDS, reopened=limit)
-
-
-def test_the_built_in_corpus_blinks_as_often_as_was_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = []
-
-    def noted(times: np.ndarray, style: object, random: np.random.Generator) -> np.ndarray:
-        shut = made(times, style, random)
-        inside = (times > 0.1) & (times < times[-1] - 0.1)
-        high = (shut > 0.5) & inside
-        drawn.append(int(high[0]) + int(np.sum(high[1:] & ~high[:-1])))
-        return shut
-
-    made = puppet._blinks
-    monkeypatch.setattr(puppet, "_blinks", noted)
-    pairs = np.stack(eyelid_pairs(build_face()), 1)
-    assert pairs.shape == (14, 2)
-    found = []
-    for number, mood in ((28, "lively"), (29, "flat"), (31, "neutral")):
-        _, weights, _ = generate_clip(SyntheticClip("F1", number, mood))
-        motion = torch.from_numpy(rig_of("F1").pose(weights))
-        metric = fm.BlinkRate(pairs.tolist(), frames_per_second=25)
-        metric.update(motion, motion)
-        found.append(round(metric.compute().item() * len(motion) / 1500))
-    assert sum(drawn) > 0
-    assert found == drawn

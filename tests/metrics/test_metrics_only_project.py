@@ -169,7 +169,7 @@ def test_a_fresh_environment_with_the_metrics_alone(files: tuple[list[str], dict
         "cv2",
     ]
     assert run("python", "-c", present, *heavy).strip() == "[]"
-    install("pytest", "hypothesis", "pytest-timeout", str(PROJECT))
+    install("pytest", "hypothesis", "pytest-timeout", "pytest-xdist", str(PROJECT))
     check(run("mouthscore", *words), scores)
     where = run("python", "-c", "import facediff; print(facediff.__file__)").strip()
     assert str(tmp_path / "fresh") in where

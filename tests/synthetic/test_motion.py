@@ -5,11 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from facediff.metrics import BlinkRate
 from facediff.speech.espeak import SpokenPhoneme
+from facediff.synthetic import motion
 from facediff.synthetic.corpus import MOODS, SyntheticClip, generate_clip, rig_of
+from facediff.synthetic.face import build_face
 from facediff.synthetic.motion import FRAME_RATE, SPEECH_CONTROLS, articulate, close_lips, segments_of
-from facediff.synthetic.rig import CONTROLS
+from facediff.synthetic.rig import CONTROLS, eyelid_pairs
 
 pytest.importorskip("espeakng_loader")
 
@@ -115,3 +119,28 @@ def test_a_lively_speaker_opens_by_one_and_a_half_to_three_centimetres() -> None
     for identity in ("F1", "M3"):
         _, weights, _ = generate_clip(SyntheticClip(identity, 1, "lively"))
         assert 0.015 < opening(rig_of(identity).pose(weights), identity).max() < 0.03
+
+
+def test_the_built_in_corpus_blinks_as_often_as_was_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+
+    def noted(times: np.ndarray, style: object, random: np.random.Generator) -> np.ndarray:
+        shut = made(times, style, random)
+        inside = (times > 0.1) & (times < times[-1] - 0.1)
+        high = (shut > 0.5) & inside
+        drawn.append(int(high[0]) + int(np.sum(high[1:] & ~high[:-1])))
+        return shut
+
+    made = motion._blinks
+    monkeypatch.setattr(motion, "_blinks", noted)
+    pairs = np.stack(eyelid_pairs(build_face()), 1)
+    assert pairs.shape == (14, 2)
+    found = []
+    for number, mood in ((28, "lively"), (29, "flat"), (31, "neutral")):
+        _, weights, _ = generate_clip(SyntheticClip("F1", number, mood))
+        vertices = torch.from_numpy(rig_of("F1").pose(weights))
+        metric = BlinkRate(pairs.tolist(), frames_per_second=25)
+        metric.update(vertices, vertices)
+        found.append(round(metric.compute().item() * len(vertices) / 1500))
+    assert sum(drawn) > 0
+    assert found == drawn
