@@ -141,7 +141,10 @@ def test_a_fresh_environment_with_the_metrics_alone(files: tuple[list[str], dict
 
     # A folder with the metrics' tests but without the package, so that the installed one is tested.
     clone = tmp_path / "clone"
-    for name in ("pyproject.toml", "docs", "tests/__init__.py", "tests/metrics"):
+    for name in (
+        *("pyproject.toml", "docs", ".github/CONTRIBUTING.md"),
+        *("tests/__init__.py", "tests/fakes", "tests/metrics"),
+    ):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
         (clone / name).parent.mkdir(parents=True, exist_ok=True)
         copy(ROOT / name, clone / name)
@@ -169,7 +172,7 @@ def test_a_fresh_environment_with_the_metrics_alone(files: tuple[list[str], dict
         "cv2",
     ]
     assert run("python", "-c", present, *heavy).strip() == "[]"
-    install("pytest", "hypothesis", "pytest-timeout", "pytest-xdist", str(PROJECT))
+    install("pytest", "hypothesis", "pytest-timeout", "pytest-xdist", "scipy", str(PROJECT))
     check(run("mouthscore", *words), scores)
     where = run("python", "-c", "import facediff; print(facediff.__file__)").strip()
     assert str(tmp_path / "fresh") in where
