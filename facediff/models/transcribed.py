@@ -113,8 +113,8 @@ def read_words(path: Path) -> str:
 
 
 def _read(path: Path, data: SpeechMotionDataModule, teacher: AudioEncoder, number: int) -> Said:
-    recording, words = read_speech(path, max_seconds=LONGEST), path.with_suffix(".txt")
-    text = read_words(words)
+    recording, transcript = read_speech(path, max_seconds=LONGEST), path.with_suffix(".txt")
+    text = read_words(transcript)
     spoken = data.say(text, number)
     if spoken is None:
         raise OptionError.naming(
@@ -123,7 +123,7 @@ def _read(path: Path, data: SpeechMotionDataModule, teacher: AudioEncoder, numbe
         )
     if not 1 / OTHER_PACE < len(recording) / len(spoken) < OTHER_PACE:
         raise FaceDiffError(
-            f"{words}: takes {len(spoken) / SAMPLE_RATE:.1f} s to say, and {path.name} lasts "
+            f"{transcript}: takes {len(spoken) / SAMPLE_RATE:.1f} s to say, and {path.name} lasts "
             f"{len(recording) / SAMPLE_RATE:.1f} s; expected all words of this recording"
         )
     loudest = float(np.abs(recording).max())
