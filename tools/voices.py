@@ -47,6 +47,7 @@ from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
 from facediff.editing.transcripts import align_transcript
 from facediff.models.transcribed import read_words
+from facediff.reporting.statistics import Bootstrap
 from facediff.speech.audio import fit_length, read_speech
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
 from facediff.speech.pitch import HOP, SIZE, signal, spectra
@@ -404,9 +405,8 @@ class Bench:
     def recorded(self, folder: Path) -> dict[str, float]:
         """Closures of people's recordings, NAME.wav with NAME.txt; their times are found by alignment."""
         files = [path for path in sorted(folder.glob("*.wav")) if path.with_suffix(".txt").is_file()]
-        speech = {path: read_speech(path) for path in files}
-        words = {path: read_words(path.with_suffix(".txt")) for path in files}
-        return self.strangers(((speech[path], align_transcript(words[path], speech[path])) for path in files), 1, 1)
+        read = ((read_speech(path), read_words(path.with_suffix(".txt"))) for path in files)
+        return self.strangers(((speech, align_transcript(words, speech)) for speech, words in read), 1, 1)
 
     def strangers(
         self, said: Iterable[tuple[Array, Sequence[TimedPhoneme]]], draws: int, margin: int = 0
@@ -421,9 +421,7 @@ class Bench:
         chances, gaps = [], []
         for (samples, phonemes), sample in zip(said, cycle(self.samples["test_a"][::3]), strict=False):
             rest = self.opening(sample.template.double().numpy()[None] * 1000)
-            times = [
-                (max(0, start - margin), end + margin) for start, end in closures(iter(phonemes), self.model.frame_rate)
-            ]
+            times = [(max(0, start - margin), end + margin) for start, end in closures(phonemes, self.model.frame_rate)]
             speech = 0.6 * samples / np.abs(samples).max()
             openings = [self.opening(self.animate(speech, sample, draw)) for draw in range(draws)]
             of_sentence = []
@@ -433,8 +431,11 @@ class Bench:
                     chances.append(_chance(opened - rest < 1, end - start))
             gaps.append(np.array(of_sentence))
         every = np.concatenate(gaps)
-        shut = np.array([((sentence < 1).sum(), len(sentence)) for sentence in gaps])
-        closed = {"within 1 mm": float((every < 1).mean()), "±": _half_width(shut)}
+        shares = np.array([[(sentence < 1).mean() if len(sentence) else 0.0] for sentence in gaps])
+        drawn = Bootstrap().scores(shares, np.array([[len(sentence)] for sentence in gaps]))
+        (interval,) = Bootstrap().intervals(drawn, 1)
+        half = (interval.high - interval.low) / 2 if interval else float("nan")
+        closed = {"within 1 mm": float((every < 1).mean()), "±": half}
         return {**closed, "chance": float(np.mean(chances)), "gap": float(np.median(every)), "closures": len(every)}
 
     def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
@@ -513,14 +514,6 @@ class Bench:
 def _chance(shut: npt.NDArray[np.bool_], length: int) -> float:
     """How often a closure of so many frames finds the mouth shut, moved to every other time of the clip."""
     return float(np.mean([shut[start : start + length].any() for start in range(len(shut) - length)]))
-
-
-def _half_width(shut: npt.NDArray[np.int64]) -> float:
-    """Half of the 95 % interval of the share of closures (sentences, closed and all) with sentences drawn again."""
-    random = np.random.default_rng(0)
-    drawn = shut[random.integers(len(shut), size=(2000, len(shut)))].sum(1)
-    low, high = np.percentile(drawn[:, 0] / drawn[:, 1], (2.5, 97.5))
-    return float(high - low) / 2
 
 
 def _closed(hits: Array, chances: Array, gaps: Array) -> dict[str, float]:

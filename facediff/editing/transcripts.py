@@ -7,18 +7,12 @@ import numpy.typing as npt
 
 from facediff.errors import OptionError
 from facediff.speech.cepstra import align_features, cepstra
-from facediff.speech.phonemes import TimedPhoneme, spoken_by_machine
+from facediff.speech.phonemes import MOST_CHARACTERS, OTHER_PACE, TimedPhoneme, spoken_by_machine
 from facediff.speech.voice_activity import EnergyGate, openness
 from facediff.utils import SAMPLE_RATE
 
 RATE = 100.0
 """Steps a second of the alignment."""
-
-OTHER_PACE = 2.5
-"""A text that espeak-ng speaks so many times faster or slower than it was recorded is another recording's."""
-
-LONGEST = 2000
-"""Characters of a transcript; a longer recording is better aligned by a program made for it."""
 
 
 def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPhoneme]:
@@ -32,9 +26,9 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPh
         FaceDiffError: if the text is empty or too long, or the recording is silent.
         MissingExtraError: if espeak-ng or the library for warping is not installed.
     """
-    if not any(letter.isalpha() for letter in text) or len(text) > LONGEST:
+    if not any(letter.isalpha() for letter in text) or len(text) > MOST_CHARACTERS:
         raise OptionError.naming(
-            f"{{transcript}}: has {len(text)} characters; expected English words, at most {LONGEST}"
+            f"{{transcript}}: has {len(text)} characters; expected English words, at most {MOST_CHARACTERS}"
         )
     synthetic, voiced = spoken_by_machine(text)
     steps = max(2, int(len(speech) / SAMPLE_RATE * RATE))

@@ -18,6 +18,7 @@ import torch
 from facediff.errors import FaceDiffError, OptionError
 from facediff.speech.audio import read_speech
 from facediff.speech.cepstra import align_features, cepstra
+from facediff.speech.phonemes import MOST_CHARACTERS, OTHER_PACE
 from facediff.utils import SAMPLE_RATE
 
 if TYPE_CHECKING:
@@ -29,11 +30,8 @@ STEP_RATE = 50
 SOUNDS = (".wav", ".flac", ".ogg", ".mp3")
 LONGEST = 15.0
 """Seconds of a recording; longer ones are better cut at pauses."""
-MOST_CHARACTERS = 2000
 SILENT = 1e-4
 """A recording whose loudest sample is lower holds nothing but noise."""
-OTHER_PACE = 2.5
-"""Words that a speaker of the corpus says so many times faster or slower are another recording's."""
 MARGIN = STEP_RATE // 2
 """Steps of the corpus's speech that the teacher hears beyond both ends of a window."""
 FEATURES = 1.4

@@ -21,6 +21,12 @@ STRESS, LENGTH = "ˈˌ", "ː"
 BILABIALS = ("p", "b", "m")
 """Phonemes for which the lips close."""
 
+OTHER_PACE = 2.5
+"""A text that a machine speaks so many times faster or slower than it was recorded is another recording's."""
+
+MOST_CHARACTERS = 2000
+"""Of a transcript; a longer recording is better aligned by a program made for it."""
+
 
 @dataclass(frozen=True)
 class TimedPhoneme:
