@@ -76,7 +76,7 @@ def adapt(
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md); --low-latency does not unless it is given
         transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
-            of up to 15 s, each with its English words in NAME.txt
+            of up to 15 s, each with its words in NAME.txt, or in NAME.de.txt if they are German
         output: checkpoint to write (.ckpt)
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
         train: train all weights, those of identity and style only (person), or those of the face only (head); by

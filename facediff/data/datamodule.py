@@ -307,8 +307,10 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """
         return None
 
-    def say(self, text: str, number: int) -> npt.NDArray[np.float32] | None:  # noqa: ARG002
-        """An English text by one of the corpus's speakers, who take turns by number, (S,) at 16 kHz.
+    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32] | None:  # noqa: ARG002
+        """A text by one of the corpus's speakers, who take turns by number, (S,) at 16 kHz.
+
+        It is in the speakers' own language, English, or in another by espeak-ng's name, such as de.
 
         None if they cannot say what they are told, as people cannot. An audio encoder learns from it what it should
         hear in a person's recording of the same words (:mod:`facediff.models.transcribed`).

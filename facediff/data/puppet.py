@@ -25,7 +25,7 @@ from facediff.mesh import Mesh
 from facediff.spaces import Rotation, Space
 from facediff.synthetic import corpus as puppet_corpus
 from facediff.synthetic import second_edition
-from facediff.synthetic.cast import MOST_DRAWN, SEEN, UNSEEN, drawn_names
+from facediff.synthetic.cast import CAST, MOST_DRAWN, SEEN, UNSEEN, drawn_names
 from facediff.synthetic.face import build_face
 from facediff.synthetic.further_speech import further_speech, said
 from facediff.synthetic.head.rig import SHAPES
@@ -33,6 +33,7 @@ from facediff.synthetic.known_faces import built_in_rig as built_in_rig
 from facediff.synthetic.recordings import ALIGNED, speakers_of
 from facediff.synthetic.rig import eyelid_pairs
 from facediff.synthetic.speakers import MOST_DRAWN as FIRST_MOST_DRAWN
+from facediff.synthetic.voices import in_language
 from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.licences import Commercial
@@ -80,9 +81,9 @@ class FirstEdition:
         """Random words by these speakers."""
         return partial(further_speech, identities=identities)
 
-    def say(self, text: str, number: int) -> npt.NDArray[np.float32]:
+    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
         """A text by one of the seen speakers."""
-        return said(text, puppet.SEEN_IDENTITIES[number % len(puppet.SEEN_IDENTITIES)])
+        return said(text, puppet.SEEN_IDENTITIES[number % len(puppet.SEEN_IDENTITIES)], language)
 
     def eyelid_pairs(self) -> Tensor | None:
         """Of the mesh, for folders that come from a version without such a file."""
@@ -118,9 +119,11 @@ class SecondEdition:
         """Random words by these speakers."""
         return partial(second_edition.spoken_words, identities=identities, people=self.people)
 
-    def say(self, text: str, number: int) -> npt.NDArray[np.float32]:
+    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
         """A text by one of the seen speakers, in neutral mood."""
-        clip = second_edition.PerformedClip(SEEN[number % len(SEEN)], "train", 1, text, "neutral")
+        speaker = SEEN[number % len(SEEN)]
+        voice = f"espeak:{in_language(CAST[speaker].voice.removeprefix('espeak:'), language)}"
+        clip = second_edition.PerformedClip(speaker, "train", 1, text, "neutral", voice)
         return second_edition.speak_clip(clip).samples
 
     def eyelid_pairs(self) -> Tensor | None:
@@ -340,9 +343,9 @@ class Puppet(SpeechMotionDataModule):
         """Random words by the training speakers."""
         return self.edition.further_speech(tuple(self.identities))
 
-    def say(self, text: str, number: int) -> npt.NDArray[np.float32]:
+    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
         """A text by one of the seen speakers, who take turns."""
-        return self.edition.say(text, number)
+        return self.edition.say(text, number, language)
 
     def stores_reference(self, identity: str) -> bool:
         """Those of the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""

@@ -70,7 +70,8 @@ def read_said(folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder,
     """People's recordings of a folder, aligned with the same words by speakers of the corpus.
 
     Args:
-        folder: NAME.wav, .flac, .ogg or .mp3, each with its English words in NAME.txt, in any folders below.
+        folder: NAME.wav, .flac, .ogg or .mp3, each with its words in NAME.txt if they are English, and otherwise in
+            NAME.LANGUAGE.txt, where LANGUAGE is espeak-ng's name of it, such as de or pt-br; in any folders below.
         data: the corpus, whose speakers say the words (:meth:`facediff.data.SpeechMotionDataModule.say`).
         teacher: the encoder whose features are to be reproduced.
         most: recordings; of more, so many are drawn.
@@ -80,17 +81,23 @@ def read_said(folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder,
         FaceDiffError: if the folder holds no recording with words, one is damaged or longer than 15 s, its text is
             empty or is not what it says, or the corpus's speakers cannot say texts.
     """
-    expected = "expected NAME.wav or .flac, each with its words in NAME.txt"
+    expected = "expected NAME.wav or .flac, each with its words in NAME.txt, or NAME.de.txt if they are German"
     if not folder.is_dir():
         raise OptionError("transcribed", f"no such folder; {expected}", folder)
-    files = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in SOUNDS and path.with_suffix(".txt").is_file()
-    )
-    if not files:
+    sounds = {path.with_suffix(""): path for path in folder.rglob("*") if path.suffix.lower() in SOUNDS}
+    transcripts = {}
+    for transcript in folder.rglob("*.txt"):
+        named = transcript.with_suffix("")
+        language = "" if named in sounds else named.suffix[1:].lower()
+        recording = sounds.get(named.with_suffix("") if language else named)
+        if recording is not None and not (language and recording.with_suffix(".txt").exists()):
+            transcripts[recording] = transcript, language
+    if not transcripts:
         raise OptionError("transcribed", f"holds no recording with words; {expected}", folder)
     random = np.random.default_rng(seed)
+    files = sorted(transcripts)
     chosen = [files[i] for i in random.permutation(len(files))[:most]]
-    return [_read(path, data, teacher, number) for number, path in enumerate(chosen)]
+    return [_read(path, *transcripts[path], data, teacher, number) for number, path in enumerate(chosen)]
 
 
 def read_words(path: Path) -> str:
@@ -110,10 +117,14 @@ def read_words(path: Path) -> str:
     return text
 
 
-def _read(path: Path, data: SpeechMotionDataModule, teacher: AudioEncoder, number: int) -> Said:
-    recording, transcript = read_speech(path, max_seconds=LONGEST), path.with_suffix(".txt")
-    text = read_words(transcript)
-    spoken = data.say(text, number)
+def _read(
+    path: Path, transcript: Path, language: str, data: SpeechMotionDataModule, teacher: AudioEncoder, number: int
+) -> Said:
+    recording, text = read_speech(path, max_seconds=LONGEST), read_words(transcript)
+    try:
+        spoken = data.say(text, number, language)
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{transcript}: {error}") from error
     if spoken is None:
         raise OptionError.naming(
             f"{{transcribed}}: the speakers of {type(data).__name__} cannot say texts, as the built-in corpus's can; "

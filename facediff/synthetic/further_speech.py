@@ -7,12 +7,14 @@ of sounds.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from facediff.speech.espeak import speak
 from facediff.synthetic.speakers import speaker_of
+from facediff.synthetic.voices import in_language
 from facediff.utils import SAMPLE_RATE
 
 # Chosen for this corpus, so that every English sound occurs in several places of a word; no content word is in the test
@@ -50,9 +52,10 @@ def further_speech(number: int, identities: Sequence[str]) -> NDArray[np.float32
     return said(" ".join(text), identities[int(random.integers(len(identities)))])
 
 
-def said(text: str, identity: str) -> NDArray[np.float32]:
+def said(text: str, identity: str, language: str = "") -> NDArray[np.float32]:
     """A text by a speaker, as loud as the corpus's clips, with quiet at both ends; (S,) at 16 kHz."""
-    speech = speak(text, speaker_of(identity).voice).samples
+    voice = speaker_of(identity).voice
+    speech = speak(text, replace(voice, name=in_language(voice.name, language))).samples
     before, after = round(_QUIET_BEFORE * SAMPLE_RATE), round(_QUIET_AFTER * SAMPLE_RATE)
     padded: NDArray[np.float32] = np.pad(
         speech * np.float32(_PEAK / max(float(np.abs(speech).max()), 1e-6)), (before, after)

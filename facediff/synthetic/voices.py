@@ -95,6 +95,19 @@ def open_voice(name: str) -> Synthesiser:
     return opened
 
 
+def in_language(voice: str, language: str) -> str:
+    """One of espeak-ng's voices, such as ``en-us+f2``, in another language; as it is if that is empty.
+
+    Raises:
+        FaceDiffError: if espeak-ng does not speak that language.
+    """
+    if not language:
+        return voice
+    if language not in Espeak.voices():
+        raise FaceDiffError(f'language "{language}": espeak-ng does not speak it; {choices(language, Espeak.voices())}')
+    return f"{language}+{voice.partition('+')[2]}"
+
+
 def installed_voices() -> dict[str, list[str]]:
     """Voices by synthesiser, where there are any."""
     return {name: voices for name in puppet_voice.names() if (voices := puppet_voice.get(name).voices())}

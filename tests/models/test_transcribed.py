@@ -32,11 +32,13 @@ def sung(text: str, seconds: float, brightness: float = 1.0) -> np.ndarray:
 
 
 class Singers(Tiny):
-    """A corpus whose speakers sing what they are told, ten letters a second."""
+    """A corpus whose speakers sing what they are told, ten letters a second, and backwards in Hebrew."""
 
-    def say(self, text: str, number: int) -> np.ndarray:
+    def say(self, text: str, number: int, language: str = "") -> np.ndarray:
         assert number >= 0
-        return sung(text, 0.1)
+        if language not in {"", "he"}:
+            raise FaceDiffError(f'language "{language}": nobody sings in it')
+        return sung(text[::-1] if language else text, 0.1)
 
 
 @pytest.fixture
@@ -62,6 +64,20 @@ def test_steps_go_with_the_same_letters(folder: Path, data: Singers, make_model:
     assert len(letters) == round(0.14 * len(TEXT) * STEP_RATE)
     assert np.abs(said.places / STEP_RATE / 0.1 - letters).max() < 0.5
     assert abs(float(np.abs(said.recording).max()) - float(np.abs(said.spoken).max())) < 1e-3
+
+
+def test_the_name_of_a_text_says_its_language(
+    folder: Path, data: Singers, make_model: Callable[..., AnimationModel]
+) -> None:
+    words = folder / "one" / "a.txt"
+    words.rename(words.with_name("a.he.txt"))
+    words.with_name("b.txt").write_text("of no recording", encoding="utf-8")
+    encoder = make_model().speech_encoder.eval()
+    (backwards,) = read_said(folder, data, encoder, most=9, seed=0)
+    assert np.array_equal(backwards.spoken, sung(TEXT[::-1], 0.1).astype(np.float16))
+    words.write_text(TEXT, encoding="utf-8")
+    (forwards,) = read_said(folder, data, encoder, most=9, seed=0)
+    assert np.array_equal(forwards.spoken, sung(TEXT, 0.1).astype(np.float16))
 
 
 def test_a_window_is_of_both(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
@@ -103,6 +119,7 @@ def test_the_student_hears_the_singer_as_the_teacher_hears_the_corpus(
     ("change", "named"),
     [
         (lambda folder: (folder / "one" / "a.txt").unlink(), "--transcribed .*: holds no recording with words"),
+        (lambda folder: (folder / "one" / "a.txt").rename(folder / "one" / "a.xx.txt"), r'a\.xx\.txt: language "xx"'),
         (lambda folder: (folder / "one" / "a.txt").write_text("2 + 2"), r"a\.txt: holds no words"),
         (lambda folder: (folder / "one" / "a.txt").write_bytes(b"m\xe4h"), r"a\.txt: is no text in UTF-8"),
         (lambda folder: (folder / "one" / "a.txt").write_text("ma" * 4500), r"a\.txt: is longer than 2000 characters"),
@@ -136,6 +153,9 @@ def test_people_cannot_say_what_they_are_told(
 def test_speakers_of_the_built_in_corpus_take_turns(edition: int, tmp_path: Path) -> None:
     data = Puppet(root=str(tmp_path / "none"), edition=edition)
     first, second, again = (data.say("My map", number) for number in (0, 1, 6))
+    assert not np.array_equal(data.say("My map", 0, "de"), first)
+    with pytest.raises(FaceDiffError, match='language "dee": .*did you mean "de"'):
+        data.say("My map", 0, "dee")
     assert first.dtype == np.float32
     assert 0.4 < len(first) / 16_000 < 2.0
     assert not np.array_equal(first, second)
