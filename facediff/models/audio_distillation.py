@@ -106,7 +106,7 @@ class DistillationOptions:
     low_latency: bool = False
     whole: float = 0.3
     transcribed: Path | None = None
-    transcribed_share: float = 0.5
+    transcribed_share: float = 0.3
 
     @property
     def goal(self) -> str:
@@ -320,6 +320,8 @@ class SpeechPairs(Dataset[DistillationBatch]):
         for _ in range(self.options.batch_size):
             if self.said and random.random() < self.options.transcribed_share:
                 speech, heard, place = self.said[int(random.integers(len(self.said)))].window(WINDOW, random)
+                if self.options.pauses and random.random() < self.options.pauses:
+                    speech, heard, place = with_pause_in_both(speech, heard, place, random)
             else:
                 speech = self._speech(random)
                 if self.options.pauses and random.random() < self.options.pauses:
@@ -389,11 +391,36 @@ class SpeechPairs(Dataset[DistillationBatch]):
 
 def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
     """Speech (S,) with a faint pause of 0.3 to 1.5 s, often at an end; what no longer fits is cut off."""
-    most = len(speech) // 2
-    count = min(round(random.uniform(0.3, 1.5) * SAMPLE_RATE), most)
-    place = round(float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (len(speech) - count))
-    pause = random.standard_normal(count).astype(np.float32) * float(np.abs(speech).max(initial=0)) * 1e-4
+    place, count = _drawn_pause(len(speech), SAMPLE_RATE, random)
+    pause = _faint(count, speech, random)
     return np.concatenate([speech[:place], pause, speech[place : len(speech) - count]])
+
+
+def with_pause_in_both(
+    spoken: npt.NDArray[np.float32],
+    heard: npt.NDArray[np.float32],
+    places: npt.NDArray[np.int64],
+    random: np.random.Generator,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """The same between the same sounds of a recording and of the corpus's speech: :meth:`Said.window` with a pause."""
+    size = SAMPLE_RATE // STEP_RATE
+    place, count = _drawn_pause(len(places), STEP_RATE, random)
+    at = int(places[min(place, len(places) - 1)])
+    pause = _faint(count * size, heard, random)
+    heard = np.concatenate([heard[: place * size], pause, heard[place * size :]])[: len(heard)]
+    spoken = np.concatenate([spoken[: at * size], pause, spoken[at * size :]])
+    return spoken, heard, np.concatenate([places[:place], at + np.arange(count), places[place:] + count])[: len(places)]
+
+
+def _drawn_pause(length: int, rate: int, random: np.random.Generator) -> tuple[int, int]:
+    """Where a pause begins in something of that length, and how long it is."""
+    count = min(round(random.uniform(0.3, 1.5) * rate), length // 2)
+    return round(float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (length - count)), count
+
+
+def _faint(count: int, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
+    """So many samples of noise far below a piece of speech."""
+    return random.standard_normal(count).astype(np.float32) * float(np.abs(speech).max(initial=0)) * np.float32(1e-4)
 
 
 def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:

@@ -14,7 +14,7 @@ import torch
 
 from facediff.data import Puppet
 from facediff.errors import FaceDiffError
-from facediff.models.audio_distillation import DistillationOptions, distil_audio_encoder
+from facediff.models.audio_distillation import DistillationOptions, distil_audio_encoder, with_pause_in_both
 from facediff.models.base import AnimationModel
 from facediff.models.transcribed import STEP_RATE, Said, read_said
 from tests.fakes.tiny import Tiny
@@ -91,6 +91,24 @@ def test_a_window_is_of_both(folder: Path, data: Singers, make_model: Callable[.
         steps = heard[::320].astype(int)
         assert np.array_equal(spoken[within * 320].astype(int), places[steps])
         assert len(spoken) <= (within.max() - within.min() + 1 + 50) * 320
+
+
+def test_a_pause_lies_between_the_same_sounds_of_both() -> None:
+    """Samples that carry their own number, and a pause in which both are faint."""
+    places = np.arange(100) * 3 // 2
+    heard = np.repeat(1 + np.arange(100), 320).astype(np.float32)
+    spoken = np.repeat(1 + np.arange(150), 320).astype(np.float32)
+    positions = set()
+    for seed in range(30):
+        quiet, still, within = with_pause_in_both(spoken, heard, places, np.random.default_rng(seed))
+        assert len(still) == len(heard)
+        steps, taught = still[::320], quiet[within * 320]
+        paused = np.abs(steps) < 0.5
+        assert 14 <= paused.sum() <= 50
+        assert np.array_equal(np.abs(taught) < 0.5, paused)
+        assert np.array_equal(taught[~paused], spoken[places[steps[~paused].astype(int) - 1] * 320])
+        positions.add(int(np.argmax(paused)))
+    assert len(positions) > 10
 
 
 def test_the_student_hears_the_singer_as_the_teacher_hears_the_corpus(
