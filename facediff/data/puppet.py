@@ -81,7 +81,7 @@ class FirstEdition:
         """Random words by these speakers."""
         return partial(further_speech, identities=identities)
 
-    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
+    def say(self, text: str, number: int, language: str) -> npt.NDArray[np.float32]:
         """A text by one of the seen speakers."""
         return said(text, puppet.SEEN_IDENTITIES[number % len(puppet.SEEN_IDENTITIES)], language)
 
@@ -119,7 +119,7 @@ class SecondEdition:
         """Random words by these speakers."""
         return partial(second_edition.spoken_words, identities=identities, people=self.people)
 
-    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
+    def say(self, text: str, number: int, language: str) -> npt.NDArray[np.float32]:
         """A text by one of the seen speakers, in neutral mood."""
         speaker = SEEN[number % len(SEEN)]
         voice = f"espeak:{in_language(CAST[speaker].voice.removeprefix('espeak:'), language)}"

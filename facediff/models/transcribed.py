@@ -84,14 +84,13 @@ def read_said(folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder,
     expected = "expected NAME.wav or .flac, each with its words in NAME.txt, or NAME.de.txt if they are German"
     if not folder.is_dir():
         raise OptionError("transcribed", f"no such folder; {expected}", folder)
-    sounds = {path.with_suffix(""): path for path in folder.rglob("*") if path.suffix.lower() in SOUNDS}
+    named = {path.with_suffix(""): path for path in sorted(folder.rglob("*.txt"))}
+    in_language = {name.with_suffix(""): (path, name.suffix[1:].lower()) for name, path in named.items()}
     transcripts = {}
-    for transcript in folder.rglob("*.txt"):
-        named = transcript.with_suffix("")
-        language = "" if named in sounds else named.suffix[1:].lower()
-        recording = sounds.get(named.with_suffix("") if language else named)
-        if recording is not None and not (language and recording.with_suffix(".txt").exists()):
-            transcripts[recording] = transcript, language
+    for path in folder.rglob("*"):
+        name = path.with_suffix("")
+        if path.suffix.lower() in SOUNDS and (name in named or name in in_language):
+            transcripts[path] = (named[name], "") if name in named else in_language[name]
     if not transcripts:
         raise OptionError("transcribed", f"holds no recording with words; {expected}", folder)
     random = np.random.default_rng(seed)

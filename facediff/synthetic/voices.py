@@ -103,8 +103,9 @@ def in_language(voice: str, language: str) -> str:
     """
     if not language:
         return voice
-    if language not in Espeak.voices():
-        raise FaceDiffError(f'language "{language}": espeak-ng does not speak it; {choices(language, Espeak.voices())}')
+    languages = Espeak.voices()
+    if languages and language not in languages:  # without espeak-ng, speaking says how to install it
+        raise FaceDiffError(f'language "{language}": espeak-ng does not speak it; {choices(language, languages)}')
     return f"{language}+{voice.partition('+')[2]}"
 
 

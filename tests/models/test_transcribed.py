@@ -17,6 +17,7 @@ from facediff.errors import FaceDiffError
 from facediff.models.audio_distillation import DistillationOptions, distil_audio_encoder, with_pause_in_both
 from facediff.models.base import AnimationModel
 from facediff.models.transcribed import STEP_RATE, Said, read_said
+from facediff.synthetic.voices import Espeak
 from tests.fakes.tiny import Tiny
 
 TEXT = "mabopimeba"
@@ -78,6 +79,12 @@ def test_the_name_of_a_text_says_its_language(
     words.write_text(TEXT, encoding="utf-8")
     (forwards,) = read_said(folder, data, encoder, most=9, seed=0)
     assert np.array_equal(forwards.spoken, sung(TEXT, 0.1).astype(np.float16))
+
+
+def test_two_recordings_share_a_text(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
+    soundfile.write(folder / "one" / "a.flac", sung(TEXT, 0.12), 16_000)
+    both = read_said(folder, data, make_model().speech_encoder.eval(), most=9, seed=0)
+    assert sorted(len(said.recording) for said in both) == [round(16_000 * each * len(TEXT)) for each in (0.12, 0.14)]
 
 
 def test_a_window_is_of_both(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
@@ -165,6 +172,12 @@ def test_people_cannot_say_what_they_are_told(
 ) -> None:
     with pytest.raises(FaceDiffError, match="Tiny cannot say texts"):
         read_said(folder, tiny, make_model().speech_encoder, most=9, seed=0)
+
+
+def test_without_espeak_a_language_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Espeak, "voices", classmethod(lambda cls: []))
+    with pytest.raises(FaceDiffError, match=r"espeak is not installed; pip install"):
+        Puppet(root=str(tmp_path / "none"), edition=2).say("My map", 0, "de")
 
 
 @pytest.mark.parametrize("edition", [1, 2])
