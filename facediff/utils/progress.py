@@ -1,13 +1,18 @@
-"""Progress bars on standard error, which are silent where no terminal would show them."""
+"""Progress on standard error: a bar in a terminal, and elsewhere, as in a cluster's log, a line now and then."""
 
 from __future__ import annotations
 
+import math
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
 Item = TypeVar("Item")
+
+BETWEEN_LINES = 60.0
+"""Seconds between two lines of a log."""
 
 
 def on_terminal() -> bool:
@@ -21,7 +26,7 @@ def progress_bar(
 ) -> Iterator[Callable[[], object]]:
     """A progress bar of ``total`` steps (None if that is not known), ``done`` of which have been done before.
 
-    Nothing is shown without a terminal.
+    Where there is no terminal, a line says every minute how far it is; what takes less says nothing.
 
     Yields:
         a function to be called after each step.
@@ -31,8 +36,11 @@ def progress_bar(
         ...     for _ in range(2):
         ...         _ = step()
     """
-    if not shown or not sys.stderr.isatty():
+    if not shown:
         yield lambda: None
+        return
+    if not sys.stderr.isatty():
+        yield _lines(description, total, done)
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -49,6 +57,28 @@ def progress_bar(
     with bar:
         task = bar.add_task(description, total=total, completed=done)
         yield lambda: bar.advance(task)
+
+
+def _lines(description: str, total: int | None, done: int) -> Callable[[], object]:
+    """What counts steps in a log."""
+    first, started, said = done, math.nan, time.monotonic()
+
+    def step() -> None:
+        nonlocal done, first, started, said
+        done, now = done + 1, time.monotonic()
+        if math.isnan(started):  # what comes before the first step says nothing of their pace
+            first, started = done, now
+        if now - said < BETWEEN_LINES or done == total:
+            return
+        said = now
+        words = str(done)
+        if total is not None:
+            words += f" of {total}"
+            if done > first:
+                words += f", {math.ceil((now - started) / (done - first) * (total - done) / 60)} min left"
+        print(f"{description}: {words}", file=sys.stderr, flush=True)
+
+    return step
 
 
 def track(items: Iterable[Item], description: str, *, total: int | None = None, shown: bool = True) -> Iterator[Item]:
