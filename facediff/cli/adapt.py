@@ -42,6 +42,7 @@ def adapt(
     audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
     transcribed: Annotated[Path | None, Option(metavar="DIR", reads=True)] = None,
+    interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE")] = None,
     output: Output,
     mode: Mode = "finetune",
     train: Literal["all", "person", "head"] | None = None,
@@ -77,6 +78,8 @@ def adapt(
             docs/voices.md); --low-latency does not unless it is given
         transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
             of up to 15 s, each with its words in NAME.txt, or in NAME.de.txt if they are German
+        interpolation: how far the audio encoder's weights go from what they were to what was distilled (0.85 with
+            --voices, 1 with --low-latency): less changes clean speech less
         output: checkpoint to write (.ckpt)
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
         train: train all weights, those of identity and style only (person), or those of the face only (head); by
@@ -108,6 +111,8 @@ def adapt(
         raise FaceDiffError("--train head: is for --face; give all or person")
     if augmentation and voices is None and low_latency is None:
         raise FaceDiffError("--augmentation: is an option of --voices and --low-latency; give one of them as well")
+    if interpolation is not None and voices is None and low_latency is None:
+        raise FaceDiffError("--interpolation: is an option of --voices and --low-latency; give one of them as well")
     if transcribed is not None and voices is None:
         raise FaceDiffError("--transcribed: is an option of --voices; give it as well")
     if audio_encoder is not None and low_latency is None:
@@ -120,7 +125,11 @@ def adapt(
             chosen = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
             chosen = DistillationOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed, transcribed=transcribed)
-        chosen = replace(chosen, augmentations=augmentation or chosen.augmentations)
+        chosen = replace(
+            chosen,
+            augmentations=augmentation or chosen.augmentations,
+            interpolation=interpolation or chosen.interpolation,
+        )
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
         adapt_audio_encoder(
             *(checkpoint, output, data_root, corpus, device, licence.commercial_only, chosen, audio_encoder),

@@ -59,24 +59,24 @@ def progress_bar(
         yield lambda: bar.advance(task)
 
 
-def _lines(description: str, total: int | None, done: int) -> Callable[[], object]:
+def _lines(description: str, total: int | None, count: int) -> Callable[[], object]:
     """What counts steps in a log."""
-    first, started, said = done, math.nan, time.monotonic()
+    first, started, last = count, math.nan, time.monotonic()
 
     def step() -> None:
-        nonlocal done, first, started, said
-        done, now = done + 1, time.monotonic()
+        nonlocal count, first, started, last
+        count, now = count + 1, time.monotonic()
         if math.isnan(started):  # what comes before the first step says nothing of their pace
-            first, started = done, now
-        if now - said < BETWEEN_LINES or done == total:
+            first, started = count, now
+        if now - last < BETWEEN_LINES or count == total:
             return
-        said = now
-        words = str(done)
+        last = now
+        line = f"{description}: {count}"
         if total is not None:
-            words += f" of {total}"
-            if done > first:
-                words += f", {math.ceil((now - started) / (done - first) * (total - done) / 60)} min left"
-        print(f"{description}: {words}", file=sys.stderr, flush=True)
+            line += f" of {total}"
+            if count > first:
+                line += f", {math.ceil((now - started) / (count - first) * (total - count) / 60)} min left"
+        print(line, file=sys.stderr, flush=True)
 
     return step
 

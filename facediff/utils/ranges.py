@@ -256,6 +256,7 @@ GuidanceScale = Annotated[float, GUIDANCE_SCALE]
 GazeAngle = Annotated[float, Range(0, 20, above=True)]
 USUAL_GAZE = 4.0
 """Degrees where no number is given."""
+Interpolation = Annotated[float, Range(0, 1, above=True)]
 KeyTolerance = Annotated[float, Range(0, 1)]
 LearningRate = Annotated[float, Range(0, 1, above=True)]
 Level = Annotated[float, Range(0.01, 0.9999)]

@@ -173,6 +173,8 @@ def test_the_mean_of_several_clips(checkpoint: Path, tmp_path: Path) -> None:
         (["--person", "C", "--accelerator", "gpu"], "give --accelerator=cpu"),
         (["--voices", "2", "--accelerator", "nope"], "--accelerator nope"),
         (["--voices", "2", "--mode", "joint"], "--mode, --train"),
+        (["--person", "A", "--interpolation", "0.5"], "--interpolation: is an option of --voices"),
+        (["--voices", "2", "--interpolation", "0"], "--interpolation 0: out of range"),
         (["--voices", "2", "--transcribed", "people"], "--transcribed people: no such folder"),
         (["--low-latency", "2", "--transcribed", "."], "--transcribed: is an option of --voices"),
     ],
@@ -252,6 +254,11 @@ def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         for name, value in before.get(key, {}).items():
             assert torch.equal(value, after[key][name]) or name in encoder or name.startswith(fitted)
     assert not all(torch.equal(before["state_dict"][name], after["state_dict"][name]) for name in encoder)
+    assert main([*words, "--voices", "2", "--augmentation", "noise:share=1", "--interpolation", "0.425"]) == 0
+    half = read_checkpoint(out)["state_dict"]
+    for name in encoder:  # half of the usual 0.85
+        middle = torch.lerp(before["state_dict"][name], after["state_dict"][name], 0.5)
+        torch.testing.assert_close(half[name], middle, atol=1e-6, rtol=1e-4)
     assert before["optimizer_states"]
     assert set(before) <= set(after)
     for wrong in ([], ["--voices", "2", "--person", "C"], ["--person", "C", "--augmentation", "noise"]):
