@@ -76,7 +76,7 @@ def newest_run(trainer: Trainer) -> Path:
     """
     logger, folder = trainer.logger, runs_folder(trainer)
     runs = [path for path in folder.glob("*") if (path / LAST).is_file() or _began_training(path / CONFIG)]
-    if logger is None or (getattr(logger, "_version", None) is not None and not isinstance(logger, WandbLogger)):
+    if logger is None or _has_version(logger):
         folder = run_folder(trainer)  # there is one only
         runs = [folder] if (folder / LAST).is_file() or (logger and folder.is_dir()) else []
     if not runs:
@@ -97,6 +97,11 @@ def newest_run(trainer: Trainer) -> Path:
             f"{other / LAST} to continue the one before, or omit --ckpt_path to start again"
         )
     return newest
+
+
+def _has_version(logger: Logger) -> bool:
+    """Whether the options say in which of the runs' folders the run is."""
+    return getattr(logger, "_version", None) is not None and not isinstance(logger, WandbLogger)
 
 
 def _began_training(config: Path) -> bool:
@@ -167,10 +172,12 @@ def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any]
         content: what is in it; empty if it is not there.
         arguments: the command line.
     """
-    run = None if path is None or trainer.logger is None else run_of(path)
+    logger = trainer.logger
+    run = None if path is None or logger is None else run_of(path)
     place = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
-    if run is not None and any(place.match(word) for word in arguments):
-        run = run if os.path.realpath(run.parent) == os.path.realpath(runs_folder(trainer)) else None
+    if run is not None and logger is not None and any(place.match(word) for word in arguments):
+        stated, found = (run_folder(trainer), run) if _has_version(logger) else (runs_folder(trainer), run.parent)
+        run = run if os.path.realpath(found) == os.path.realpath(stated) else None
     if run is not None and not content:
         print(f"{run}: was stopped before its first step; training starts from the beginning", flush=True)
     state = content.get(STATE_KEY, {})

@@ -12,7 +12,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger
 
 from facediff.callbacks import LastCheckpoint, checkpoints
-from facediff.callbacks.runs import find_checkpoint, locked_run
+from facediff.callbacks.runs import continue_run, find_checkpoint, locked_run
 from facediff.utils import files
 
 
@@ -48,3 +48,26 @@ def test_a_job_of_slurm_that_was_stopped_continues_its_run(
     assert find_checkpoint(trainer, None) is None
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     assert find_checkpoint(trainer, None) == last.path(trainer)
+
+
+@pytest.mark.parametrize(
+    ("place", "version", "name", "continues"),
+    [
+        ([], None, "small", True),
+        (["--trainer.logger.version=0"], 0, "small", True),
+        (["--trainer.logger.version=5"], 5, "small", False),
+        (["--name", "small"], None, "small", True),
+        (["--name", "other"], None, "other", False),
+    ],
+)
+def test_a_run_continues_unless_the_command_line_names_another_place(
+    place: list[str], version: int | None, name: str, continues: bool, tmp_path: Path
+) -> None:
+    logger = CSVLogger(tmp_path, name=name, version=version)
+    trainer = Trainer(logger=logger, accelerator="cpu", devices=1, enable_progress_bar=False)
+    path = tmp_path / "small" / "version_0" / "checkpoints" / "last.ckpt"
+    assert continue_run(trainer, path, {"global_step": 3}, place) == continues
+    if not continues:
+        assert trainer.logger is not None
+        assert trainer.logger.version == (version or 0)
+        assert trainer.logger.name == name
