@@ -10,6 +10,7 @@ of clips and their mean length are published, and their lengths are spread evenl
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ PUBLISHED: dict[str, tuple[type[SpeechMotionDataModule], int, float]] = {
     "mead3d": (Mead3D, 32 * (40 + 7 * 3 * 30), 4 * 25.0),
 }
 
+BY_SENTENCE = 32 * (32 + 7 * 3 * 24)
+"""Training clips of 3DMEAD where sentences of the training speakers are kept for validation and test."""
+
 
 def main(words: Sequence[str] | None = None) -> int:
     """Print the table."""
@@ -38,17 +42,19 @@ def main(words: Sequence[str] | None = None) -> int:
     print(("{:14}" + "{:>13}" * (len(head) - 1)).format(*head))
     for corpus in PUBLISHED:
         for name in (f"{corpus}_paper", corpus):
-            row = steps_of(name, lengths_of(corpus, roots.get(corpus)))
+            row = steps_of(name, lengths_of(name, roots.get(corpus)))
             print(f"{name:14}" + "".join(f"{value:>13}" for value in row.values()))
     return 0
 
 
-def lengths_of(corpus: str, root: str | None) -> list[int]:
-    """Frames of the training clips."""
-    data, clips, mean = PUBLISHED[corpus]
+def lengths_of(name: str, root: str | None) -> list[int]:
+    """Frames of an experiment's training clips."""
+    data, clips, mean = PUBLISHED[name.removesuffix("_paper")]
+    config = composed(config_dir() / "experiment" / f"{name}.yaml")
+    options = {key: value for key, value in config["data"]["init_args"].items() if key == "split"}
     if root is not None:
-        options: dict[str, Any] = {"split": "identity"} if data is Mead3D else {}
         return data(root=root, **options).dataset("train", training=True).frames()
+    clips = BY_SENTENCE if options.get("split") in ("sentence", "both") else clips
     return [round(mean * (0.5 + (i + 0.5) / clips)) for i in range(clips)]
 
 
@@ -70,7 +76,8 @@ def steps_of(name: str, lengths: list[int]) -> dict[str, str]:
     kept = ["-", "-"]
     if averaging:
         decay = averaging[0]["init_args"]["decay"]
-        kept = [f"{share_of_the_first(steps, decay, warmup):.0e}" for warmup in (10.0, 1.0)]
+        shares = [share_of_the_first(steps, decay, warmup) for warmup in (10.0, 1.0)]
+        kept = [f"{share:.0e}" if share else "0" for share in shares]
     return {
         "clips": str(len(lengths)),
         "frames": str(sum(lengths)),
@@ -89,7 +96,7 @@ def share_of_the_first(steps: int, decay: float, warmup: float) -> float:
     share = 1.0
     for k in range(1, steps):
         share *= min(decay, (1 + k) / (warmup + k))
-    return share
+    return share if share >= sys.float_info.min else 0.0  # numbers below have lost their digits
 
 
 def composed(path: Path) -> dict[str, Any]:

@@ -9,9 +9,9 @@ from tools.training_steps import PUBLISHED, lengths_of, main, share_of_the_first
 
 @pytest.mark.parametrize("corpus", PUBLISHED)
 def test_bundled_experiments_take_at_least_the_papers_steps(corpus: str) -> None:
-    lengths = lengths_of(corpus, None)
-    paper, ours = (int(steps_of(name, lengths)["steps"]) for name in (f"{corpus}_paper", corpus))
-    assert paper == 50 * len(lengths)
+    lengths = {name: lengths_of(name, None) for name in (f"{corpus}_paper", corpus)}
+    paper, ours = (int(steps_of(name, frames)["steps"]) for name, frames in lengths.items())
+    assert paper == 50 * len(lengths[f"{corpus}_paper"])
     assert paper <= ours
 
 
