@@ -96,7 +96,7 @@ def check(
         root: the corpus folder, or a packed corpus: its folder or its address
         corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, beat, live_link,
             flame_clips:LAYOUT, or package.module.Class
-        split: count the clips of one way to split the corpus only (3DMEAD: sentence, identity)
+        split: count the clips of one way to split the corpus only (3DMEAD: sentence, identity, both)
         quick: read headers only, and compare files by size
         json: machine-readable: one object
         work: where the work is done
