@@ -101,7 +101,8 @@ class JsonLines(Receiver):
             "dropped": frame.dropped,
         }
         if self.needs_weights and frame.weights is not None:
-            content["weights"] = dict(zip(self._shapes, np.round(frame.weights, 6).astype(float).tolist(), strict=True))
+            weights = np.round(frame.weights.astype(np.float64), 6).tolist()
+            content["weights"] = dict(zip(self._shapes, weights, strict=True))
         if frame.head is not None:
             content["head"] = [round(angle, 6) for angle in frame.turned.tolist()]
         if self.with_vertices:
