@@ -225,7 +225,9 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text = action.help or ""
-        quiet = action.default in (None, False, True, [], argparse.SUPPRESS) or not action.option_strings
+        # By type, since 0 and 1 equal False and True.
+        says_nothing = action.default is None or isinstance(action.default, bool)
+        quiet = says_nothing or action.default in ([], argparse.SUPPRESS) or not action.option_strings
         return text if quiet or "(default" in text else f"{text} (default: %(default)s)"
 
     def _format_action_invocation(self, action: argparse.Action) -> str:

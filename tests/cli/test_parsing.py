@@ -209,6 +209,25 @@ def test_help_shows_groups_defaults_and_plain_text(capsys: pytest.CaptureFixture
     assert "--frame_rate" not in text
 
 
+def test_help_shows_defaults_of_zero_and_one_and_no_switch(capsys: pytest.CaptureFixture[str]) -> None:
+    def command(*, count: int = 1, share: float = 0.0, quick: bool = False, name: str | None = None) -> None:
+        """Nothing.
+
+        Args:
+            count: how many
+            share: of what
+            quick: no details
+            name: of it
+        """
+
+    with pytest.raises(SystemExit):
+        arguments_of(command, "x", ["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "how many (default: 1)" in text
+    assert "of what (default: 0.0)" in text
+    assert text.count("default") == 2
+
+
 def test_costly_help_is_made_when_it_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     made: list[str] = []
 
