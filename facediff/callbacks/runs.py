@@ -176,8 +176,8 @@ def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any]
     run = None if path is None or logger is None else run_of(path)
     place = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
     if run is not None and logger is not None and any(place.match(word) for word in arguments):
-        stated, found = (run_folder(trainer), run) if _has_version(logger) else (runs_folder(trainer), run.parent)
-        run = run if os.path.realpath(found) == os.path.realpath(stated) else None
+        stated, present = (run_folder(trainer), run) if _has_version(logger) else (runs_folder(trainer), run.parent)
+        run = run if os.path.realpath(present) == os.path.realpath(stated) else None
     if run is not None and not content:
         print(f"{run}: was stopped before its first step; training starts from the beginning", flush=True)
     state = content.get(STATE_KEY, {})
