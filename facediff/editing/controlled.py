@@ -140,11 +140,12 @@ class ControlledFace:
         """Refuse, for a stream, what depends on where the animation ends."""
         for name in ("blinks", "gaze", "sway"):
             if getattr(self.controls, name) is not None:
-                raise FaceDiffError(f"--{name}: needs the whole animation; stream to .npy, then use `facediff export`")
+                raise FaceDiffError(
+                    f"--{name}: needs the whole animation; give --acting, which needs none, or animate a recording"
+                )
             if self._keys(name) and self.direction is not None:
                 raise FaceDiffError(
-                    f"{self.direction.source}: channel {name}: needs the whole animation; stream to .npy, then use "
-                    f"`facediff export`"
+                    f"{self.direction.source}: channel {name}: needs the whole animation; animate a recording"
                 )
 
     def amounts(self, frames: int, frame_rate: float, *, start: int = 0, acted: Array | None = None) -> Amounts:
