@@ -458,6 +458,7 @@ class StreamKeywords(ActingKeywords, total=False):
     condition: str | None
     style: StyleLike | None
     style_template: str | Path | None
+    expressiveness: Scales | None
     sampler: str | None
     steps: int | None
     expressivity: Scales | None

@@ -65,7 +65,7 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
 
 
 WHOLE = (
-    *("expressiveness", "blinks", "gaze", "sway", "target_mesh", "output_unit", "up"),
+    *("blinks", "gaze", "sway", "target_mesh", "output_unit", "up"),
     *RecordingOptions.defaults(),
 )
 """Options that need the whole animation."""

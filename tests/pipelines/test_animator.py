@@ -188,10 +188,13 @@ def test_what_is_no_model_is_refused(
 
 
 def test_stream_is_the_recording_by_windows_however_it_is_cut(model: facediff.Animator, tmp_path: Path) -> None:
-    samples = (0.1 * np.random.default_rng(0).normal(size=16000 * 3)).astype(np.float32)
+    bursts = np.sin(np.arange(16000 * 3) * 2 * np.pi * 3 / 16000) > 0  # a steady sound is no speech
+    samples = (0.1 * bursts * np.random.default_rng(0).normal(size=16000 * 3)).astype(np.float32)
     model.module.windows = type(model.module.windows)(seconds=1, overlap=0.25, above=2)
-    whole = model.animate(samples, 16000, identity="M2", style="F1_e03", seed=4, steps=3).vertices
-    options = {"identity": "M2", "style": "F1_e03", "seed": 4, "steps": 3}
+    options = {"identity": "M2", "style": "F1_e03", "seed": 4, "steps": 3, "expressiveness": {"lips": 1.4}}
+    whole = model.animate(samples, 16000, **options).vertices
+    plain = model.animate(samples, 16000, **{**options, "expressiveness": None}).vertices
+    assert np.ptp(whole, axis=0).max() > 1.1 * np.ptp(plain, axis=0).max()
     for chunks in ([samples], np.array_split(samples, 70), [samples[:0], torch.from_numpy(samples)]):
         parts = []
         for frames in model.stream(chunks, **options):
