@@ -188,6 +188,11 @@ class _ProsodyPerformer(Performer):
 
     def feed(self, samples: Wave) -> Acted:
         """Hear more."""
+        # By the second: the tracker forgets where there was speech, which the frames of a long piece still ask for.
+        acted = [self._hear(samples[first : first + SAMPLE_RATE]) for first in range(0, len(samples), SAMPLE_RATE)]
+        return np.concatenate([np.zeros((0, 5)), *acted])
+
+    def _hear(self, samples: Wave) -> Acted:
         self._prosody.feed(samples)
         self._plan()
         return self._up_to(math.floor((self._prosody.certain - AHEAD) * self.frame_rate))

@@ -81,6 +81,11 @@ def test_what_is_acted_does_not_depend_on_the_pieces_and_changes_with_the_seed(s
     assert not np.array_equal(acted(kind, speech, FRAMES, 25.0, 6), whole)
 
 
+def test_the_head_drifts_from_the_beginning_of_a_long_recording(speech: np.ndarray) -> None:
+    long = np.concatenate([speech, np.zeros(3 * RATE)])
+    assert acted(read_acting("prosody"), long, 2 * FRAMES, 25.0, 0)[:25, ACTED.index("head.yaw")].any()
+
+
 def test_frames_do_not_depend_on_speech_long_after_them(speech: np.ndarray) -> None:
     kind, cut = read_acting("prosody"), 2 * RATE
     other = np.concatenate([speech[:cut], speech[: len(speech) - cut]])
