@@ -32,7 +32,8 @@ class DrawnFace:
 def draw_worst_frame(path: Path, animation: Animation, shapes: ShapeSet, weights: Weights) -> None:
     """Draw the frame that blendshapes fit worst: the original, the sum of the weighted shapes, and their difference."""
     frame = int(weights.residual_rms_mm.argmax())
-    truth = np.asarray(animation.vertices[frame], np.float64)
+    animation = animation.part([frame]).still()  # the shapes leave the head's motion out
+    truth = np.asarray(animation.vertices[0], np.float64)
     built = animation.template + np.einsum("k,kvc->vc", weights.values[frame], shapes.deltas)
     label, colours = heat(np.linalg.norm(truth - built, axis=1) * millimetres(animation), "residual")
     _draw(

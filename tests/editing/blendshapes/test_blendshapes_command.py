@@ -12,7 +12,10 @@ import pytest
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
+from facediff.editing.blendshapes import solve
+from facediff.editing.procedural import move_head
 from facediff.editing.shapes import read_shapes
+from facediff.export import pictures
 from facediff.mesh import read_mesh
 from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
@@ -93,6 +96,21 @@ def test_a_table_of_known_weights(
     assert "residual: median" in said
     assert (tmp_path / "check.png").read_bytes()[:4] == b"\x89PNG"
     assert json.loads((tmp_path / "weights.json").read_text())["still"] == ["tongueOut"]
+
+
+def test_the_picture_of_the_worst_frame_leaves_the_heads_motion_out(
+    folder: Path, animation: Animation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[pictures.DrawnFace] = []
+    monkeypatch.setattr(pictures, "_draw", lambda path, panels: drawn.extend(panels))
+    shapes = read_shapes(folder, animation.template)
+    turns = np.full((len(animation.vertices), 3), 0.3)
+    turned = move_head(animation, turns, 0 * turns)
+    weights = solve(turned, shapes)
+    pictures.draw_worst_frame(Path("worst.png"), turned, shapes, weights)
+    (truth, built, residual) = drawn
+    assert np.linalg.norm(truth.vertices - built.vertices, axis=1).max() < 1e-3
+    assert f"0 to {weights.residual_max_mm[weights.residual_rms_mm.argmax()]:.2g} mm" in residual.label
 
 
 def test_a_plain_table_within_other_bounds(folder: Path, archive: Path, tmp_path: Path) -> None:
