@@ -334,7 +334,8 @@ def read_state_dict(path: Path) -> dict[str, Any]:
         raise FaceDiffError(f"{path}: not a checkpoint that can be read safely ({detail}); {AUTHORS}") from error
     tensors: dict[str, Any] = {}
     for name, stored in outlines.items():
-        numbers = torch.frombuffer(bytearray(contents[stored.key]), dtype=getattr(torch, stored.type))
+        content, kind = bytearray(contents[stored.key]), getattr(torch, stored.type)
+        numbers = torch.frombuffer(content, dtype=kind) if content else torch.zeros(0, dtype=kind)
         tensors[name.removeprefix("module.")] = numbers.as_strided(stored.shape, stored.stride, stored.offset).clone()
     return tensors
 

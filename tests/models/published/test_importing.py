@@ -18,6 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import import_checkpoint
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files
+from facediff.utils.torch_files import read_state_dict
 from tests.fakes import published
 from tests.fakes.published import IDENTITIES, VERTICES, write_author_files
 
@@ -288,6 +289,13 @@ def test_a_container_with_other_objects_is_read_without_them(tmp_path: Path) -> 
         audio_config=published.AUDIO_CONFIG,
     )
     assert torch.equal(made.state_dict()["network.motion_in.bias"], state["vertice_map.bias"])
+
+
+def test_an_empty_tensor_is_read(tmp_path: Path) -> None:
+    torch.save({"none": torch.zeros(0, 3), "two": torch.arange(2)}, tmp_path / "some.pth")
+    read = read_state_dict(tmp_path / "some.pth")
+    assert read["none"].shape == (0, 3)
+    assert read["two"].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
