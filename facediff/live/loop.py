@@ -401,7 +401,8 @@ class Loop:
                 continue
             with self._changed:
                 self._frames.popleft()
-            if self._late(frame):
+            unsolved = self._solve is not None and weights[0] != frame.index  # it was late, until the delay grew
+            if unsolved or self._late(frame):
                 self.summary.dropped += 1
             else:
                 self._send(frame, weights[1] if weights[0] == frame.index else frame.values, solving)

@@ -208,6 +208,19 @@ def test_weights_are_those_of_a_head_that_does_not_move() -> None:
         np.testing.assert_allclose(frame.vertices, moved, atol=1e-5)
 
 
+def test_no_frame_comes_without_weights_where_the_delay_grows_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept, asked = Kept(weights=True), list[int]()
+
+    def late(_loop: Loop, frame: LiveFrame) -> bool:
+        asked.append(frame.index)
+        return frame.index == 5 and asked.count(5) == 1  # not any more when it is due
+
+    monkeypatch.setattr(Loop, "_late", late)
+    Loop(fake_model(), Spoken(0.3), [kept], solve=lambda offsets: offsets[:1, 0], report=str).run()
+    assert len(kept.frames) >= 14
+    assert all(frame.weights is not None for frame in kept.frames)
+
+
 def test_receiver_that_fails_does_not_stop_the_others() -> None:
     failing, kept, reports = Kept(error=RuntimeError("gone")), Kept(), list[str]()
     Loop(fake_model(), Spoken(0.3), [failing, kept], report=reports.append).run()
