@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -133,7 +133,7 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
 
     Args:
         path: the file to write.
-        target: the avatar, whose face looks along +z as glTF has it.
+        target: the avatar, whose face looks along +z as glTF has it, or along -z as VRM 0.x has it.
         animation: of any face with ARKit's shapes, or on the avatar's mesh.
 
     Raises:
@@ -142,11 +142,20 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
     try:
         glb, writer = open_to_add(target)
         own = _own_shapes(glb)
-        weights = arkit_weights(animation) if has_arkit_weights(animation) else _solved(glb, own, animation)
+        named = has_arkit_weights(animation)
+        weights = arkit_weights(animation) if named else _solved(glb, own, animation)
+        if named and _looks_back(glb) and weights.head is not None:  # solved for, it is in the avatar's axes already
+            weights = replace(weights, head=weights.head * [-1.0, 1.0, -1.0])
         _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise _unreadable(target, error) from error
     writer.write(path)
+
+
+def _looks_back(glb: Glb) -> bool:
+    """Whether the face looks along -z: that of VRM 0.x does."""
+    extensions = glb.content.get("extensions", {})
+    return "VRM" in extensions and "VRMC_vrm" not in extensions
 
 
 def _unreadable(target: Path, error: Exception) -> FaceDiffError:
@@ -303,15 +312,16 @@ def _animate(
         for shape, bind in binds:
             rows[:, bind.target] += bind.share * tracks[shape]
         add(node, "weights", np.clip(rows, 0.0, 1.0).astype(np.float32))
-    for node, turns in _turns(own, weights):
+    for node, turns in _turns(own, weights, _looks_back(glb)):
         add(node, "rotation", _local(glb, node, turns))
     if motion["channels"]:
         glb.put_first(motion)
 
 
-def _turns(own: OwnShapes, weights: Weights) -> list[tuple[int, Array]]:
+def _turns(own: OwnShapes, weights: Weights, looks_back: bool) -> list[tuple[int, Array]]:
     """Nodes and the quaternions (T, 4) by which they turn about the scene's axes."""
     none = np.zeros(len(weights.values))
+    round_about = np.array([1.0, -1.0, 1.0, -1.0]) if looks_back else np.ones(4)
     result = []
     for bone in ("head", "neck"):
         if bone in own.bones and weights.head is not None:
@@ -321,10 +331,12 @@ def _turns(own: OwnShapes, weights: Weights) -> list[tuple[int, Array]]:
         eyes = gaze(weights.names, weights.values)
     for k, bone in enumerate(("left_eye", "right_eye")):
         if bone in own.bones and eyes is not None:
-            result.append((own.bones[bone], convert(eyes[:, 3 * k : 3 * k + 3], "euler", "quaternion")))
+            turns = convert(eyes[:, 3 * k : 3 * k + 3], "euler", "quaternion")
+            result.append((own.bones[bone], round_about * turns))
     if "jaw" in own.bones and "jawOpen" in weights.names:
         opening = JAW * weights.values[:, weights.names.index("jawOpen")]
-        result.append((own.bones["jaw"], convert(np.stack([opening, none, none], 1), "axis_angle", "quaternion")))
+        turns = convert(np.stack([opening, none, none], 1), "axis_angle", "quaternion")
+        result.append((own.bones["jaw"], round_about * turns))
     return result
 
 

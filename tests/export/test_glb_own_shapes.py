@@ -313,6 +313,28 @@ def test_bones_by_their_names(
         np.testing.assert_allclose(after["Hair"], turned, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["Head", "LeftEye", "JawJoint"])
+def test_bones_of_vrms_older_version_turn_about_a_face_that_looks_back(
+    tmp_path: Path, parts: dict[str, AvatarPart], spoken: Animation, name: str
+) -> None:
+    without = ("eyeLook", "jawOpen") if name == "JawJoint" else ("eyeLook",)
+    gone = {n: f"x{k}" for k, n in enumerate(ALPHABETICAL) if n.startswith(without)}
+    write_avatar(tmp_path / "avatar.glb", parts, names=gone)
+    glb = opened(tmp_path / "avatar.glb")
+    next(node for node in glb.content["nodes"] if node["name"] == "HeadJoint")["name"] = name
+    before = posed_at_rest(tmp_path / "avatar.glb")["Hair"] - NECK
+    after = {}
+    for version in ("VRM", "VRMC_vrm"):
+        (tmp_path / "bone.glb").write_bytes(pack({**glb.content, "extensions": {version: {}}}, glb.binary))
+        drive_avatar(tmp_path / "out.glb", tmp_path / "bone.glb", spoken)
+        after[version] = posed(tmp_path / "out.glb", 17)["Hair"] - NECK
+    assert np.abs(after["VRMC_vrm"] - before).max() > 0.01
+    # Seen from behind, the one turns as the other does seen from the front.
+    turn = Rotation.align_vectors(after["VRM"], before)[0].as_rotvec()
+    usual = Rotation.align_vectors(after["VRMC_vrm"], before)[0].as_rotvec()
+    np.testing.assert_allclose(turn, usual * [-1, 1, -1], atol=1e-5)
+
+
 def posed_at_rest(path: Path) -> dict[str, np.ndarray]:
     glb = opened(path)
     return {glb.content["nodes"][part.node]["name"]: part.points for part in placed_parts(glb)}
