@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +133,7 @@ def read_live_link(path: Path) -> ParameterClip:
         folded, header = [*folded, *(name.casefold() for name in missing)], [*header, *missing]
     columns = columns_of(path, header, space)
     at_time = folded.index("timecode")
-    times, values = [], []
+    times, values, numbers = [], [], []
     for number, row in enumerate(rows, start=2):
         LIMITS.check("frames", number, path)
         if not any(cell.strip() for cell in row[2:]):
@@ -146,8 +145,9 @@ def read_live_link(path: Path) -> ParameterClip:
                 f"hours:minutes:seconds:sixtieths"
             )
         times.append(seconds)
+        numbers.append(number)
         values.append(_numbers(path, number, [*row, *("0" for _ in missing)], columns, len(header)))
-    return _timed(path, np.array(times), _with_mirrored(np.array(values)), missing)
+    return _timed(path, np.array(times), _with_mirrored(np.array(values)), missing, numbers)
 
 
 def mirrored(rotations: Values) -> Values:
@@ -165,14 +165,14 @@ def _with_mirrored(values: Values) -> Values:
     )
 
 
-def _timed(path: Path, clock: Array, values: Values, missing: list[str]) -> ParameterClip:
+def _timed(path: Path, clock: Array, values: Values, missing: list[str], numbers: list[int]) -> ParameterClip:
     if len(clock) < 2:
         raise FaceDiffError(f"{path}: holds {len(clock)} rows; expected two at least, for their rate; record it again")
     # Past midnight the clock begins again.
     clock = clock + DAY * np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY / 2)
     steps = np.diff(clock)
     if (steps <= 0).any():
-        row = int(np.argmax(steps <= 0)) + 3
+        row = numbers[int(np.argmax(steps <= 0)) + 1]
         raise FaceDiffError(f"{path}: row {row} is no later than the one before it; sort the rows by their timecode")
     rate = rate_of(clock)
     space = layout("live_link")
@@ -233,7 +233,8 @@ def read_audio2face(path: Path) -> ParameterClip:
     at_time = folded.index("timecode")
     values = []
     times = []
-    for number, row in enumerate(islice(rows, int(LIMITS.frames)), start=2):
+    for number, row in enumerate(rows, start=2):
+        LIMITS.check("frames", number - 1, path)
         full = [*row, *("0" for _ in absent)]
         times.append(_numbers(path, number, full, [at_time], wide)[0])
         values.append(_numbers(path, number, full, columns, wide))
