@@ -412,7 +412,6 @@ class AnimationPipeline(ABC):
 
             model_speech = shifted_by_pieces(model_speech, 2 ** (self.options.voice_shift / 12))
         openness = None
-        short = self.windows.in_one_pass(self.frames_of(len(speech)), self.frame_rate)
         writers = []
         if folder is not None:
             from facediff.animation.files import MotionWriter
@@ -424,9 +423,8 @@ class AnimationPipeline(ABC):
         for motions in self.generate(model_speech, seeds):
             count = len(motions[0])
             if self.rest is not None and openness is None:
-                # In one pass, a model that counts its frames by itself has the last word.
-                frames = count if short else self.frames_of(len(model_speech))
-                openness = self.rest.openness_of(model_speech, frames)
+                # In one pass, a model that counts its frames by itself may give more.
+                openness = self.rest.openness_of(model_speech, max(count, self.frames_of(len(model_speech))))
             for i, motion in enumerate(motions):
                 if self.rest is not None and openness is not None:
                     motion = self.rest.apply(motion, openness[done : done + count])

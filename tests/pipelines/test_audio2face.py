@@ -122,6 +122,14 @@ def test_a_stream_gives_the_frames_of_the_recording(model: Audio2FaceAnimator) -
     np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-5)
 
 
+def test_mouth_rests_in_pauses_after_the_first_second(model: Audio2FaceAnimator) -> None:
+    model.frame_rate = 5.0
+    speech = np.concatenate([SPEECH[:8000], np.zeros(24_000, np.float32)])
+    parts = {gate: np.concatenate(list(model.stream([speech], voice_gate=gate))) for gate in ("energy", "off")}
+    np.testing.assert_array_equal(model.animate(speech, 16_000, voice_gate="energy").vertices, parts["energy"])
+    assert not np.array_equal(parts["energy"][6:], parts["off"][6:])
+
+
 def test_the_command_writes_vertices_and_weights(
     folder: Path, content: dict[str, Any], model: Audio2FaceAnimator, tmp_path: Path
 ) -> None:
