@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.editing import procedural
-from facediff.editing.controls import keys_of
+from facediff.editing.controls import keys_of, refuse_folder
 from facediff.editing.direction import METADATA, Direction, channel_of, curve
 from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
 from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, noted
@@ -294,6 +294,7 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     """
     if controls.is_off:
         return animation
+    refuse_folder(controls.direction)
     direction = keys_of(controls.direction, animation.frame_rate)
     if direction is not None:
         direction.refuse_model_channels()

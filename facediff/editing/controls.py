@@ -59,6 +59,12 @@ def keys_file(direction: DirectionLike | None) -> Path | None:
     return None if is_mood(direction) else Path(direction)
 
 
+def refuse_folder(direction: DirectionLike | None) -> None:
+    """Refuse a folder of keys where no recording's name says which of its files is meant."""
+    if (folder := keys_file(direction)) is not None and folder.is_dir():
+        raise OptionError("direction", "is a folder, of keys for recordings by their names; give one file", folder)
+
+
 def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) -> Direction | None:
     """The keys over time; None if there are none, or each recording of a folder has its own.
 

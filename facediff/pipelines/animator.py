@@ -21,7 +21,7 @@ from facediff.animation.options import (
     StreamKeywords,
     with_options,
 )
-from facediff.editing.controls import keys_of
+from facediff.editing.controls import keys_of, refuse_folder
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
 from facediff.pipelines.motion import Samples
@@ -230,7 +230,9 @@ class SpeechAnimator(ABC):
         with self.open(chosen) as pipeline:
             pipeline.progress = None if isinstance(progress, bool) else progress
             for recording in [speech] if several is None else several:
-                if chosen.direction is not None and isinstance(recording, str | Path):
+                if not isinstance(recording, str | Path):
+                    refuse_folder(chosen.direction)
+                elif chosen.direction is not None:
                     direction = direction_for(chosen.direction, Path(recording))
                     if direction is not chosen.direction:
                         pipeline.direct(keys_of(direction, pipeline.frame_rate))
@@ -271,7 +273,9 @@ class SpeechAnimator(ABC):
         from facediff.speech.audio import stream_piece
 
         rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
-        with self.open(self._options(dtype, **options)) as pipeline:
+        chosen = self._options(dtype, **options)
+        refuse_folder(chosen.direction)
+        with self.open(chosen) as pipeline:
             stream = pipeline.stream(rate)
 
         def frames() -> Iterator[npt.NDArray[np.float32]]:

@@ -125,6 +125,7 @@ TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
         ([TONE.astype(int), 16000], {}, "speech: is int64"),
         ([np.zeros((2, 3, 4)), 16000], {}, "speech"),
         ([TONE, 16000], {"max_seconds": 0.5}, "max_seconds"),
+        ([TONE, 16000], {"direction": "."}, "direction .: is a folder"),
         ([TONE, 16000], {"voice_gate": "energie"}, "voice_gate energie"),
         ([TONE, 16000], {"voice_gate": "energy:release=9"}, "release"),
         (["tone.wav"], {"max_seconds": 0.5}, "max_seconds"),
@@ -220,6 +221,7 @@ def test_stream_is_the_recording_by_windows_however_it_is_cut(model: facediff.An
         ([], {"rate": 3}, "rate"),
         ([], {"style": "F1_e99"}, "style F1_e99"),
         ([], {"seed": -1}, "seed -1"),
+        ([TONE], {"direction": "."}, "direction"),
     ],
 )
 def test_streams_that_cannot_be(

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -102,6 +103,13 @@ def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable
         .metadata["procedural"]
         .startswith("head sway")
     )
+
+
+def test_a_folder_of_keys_is_refused_where_no_recording_chooses(
+    make_animation: Callable[..., Animation], tmp_path: Path
+) -> None:
+    with pytest.raises(FaceDiffError, match=f"direction {tmp_path}: is a folder"):
+        apply_controls(make_animation(2), AnimationControls(direction=tmp_path))
 
 
 def test_shape_keys_add_their_displacements(make_animation: Callable[..., Animation]) -> None:
