@@ -6,6 +6,7 @@ From top to bottom: :func:`load`; :class:`SpeechAnimator`, what every model can 
 
 from __future__ import annotations
 
+import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -631,7 +632,7 @@ def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - whatever s
         from facediff.pipelines.folder import recordings
 
         return list(recordings([Path(speech)]))
-    if not isinstance(speech, list) or (speech and all(isinstance(sample, int | float) for sample in speech)):
+    if not isinstance(speech, list) or (speech and all(isinstance(sample, numbers.Real) for sample in speech)):
         return None
     if not speech:
         raise FaceDiffError("speech: is an empty list; give at least one recording")

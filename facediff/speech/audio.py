@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import mmap
+import numbers
 import os
 import struct
 from collections.abc import Callable, Iterator, Mapping
@@ -381,7 +382,8 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         if rate is not None or len(speech) != 2:
             raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
         first, second = cast("tuple[Any, Any]", speech)
-        speech, rate = (second, first) if isinstance(first, int | float) else (first, second)
+        rate_first = isinstance(first, numbers.Real)  # NumPy's as well
+        speech, rate = (second, first) if rate_first else (first, second)
     if rate is None:
         if not hasattr(speech, "detach"):  # a tensor has the models' rate, an array may have any
             raise FaceDiffError("rate: is missing; give the array's sample rate, as in animate(samples, rate=48000)")

@@ -17,6 +17,7 @@ import facediff
 from facediff.animation.options import AnimateKeywords, StreamKeywords
 from facediff.cli.app import main
 from facediff.models import Style
+from facediff.pipelines.animator import recordings_of
 from facediff.speech.audio import speech_of
 
 
@@ -78,16 +79,22 @@ def as_tensor(samples: np.ndarray) -> torch.Tensor:
         lambda path: (soundfile.read(path, dtype="int16"),),
         lambda path: (soundfile.read(path, dtype="int16")[::-1],),  # as scipy: the rate first
         lambda path: (soundfile.read(path, dtype="int32")[0], 22050.0),
+        lambda path: ((np.int64(22050), soundfile.read(path, dtype="int16")[0]),),
         lambda path: (as_tensor(soundfile.read(path, dtype="float32")[0]), 22050),
         lambda path: ((as_tensor(soundfile.read(path, dtype="int16")[0]), 22050),),
     ],
-    ids=["path", "text", "array and rate", "pair", "int16", "rate first", "int32", "tensor", "pair with a tensor"],
+    ids=["path", "text", "array and rate", "pair", "int16", "rate first", "int32", "NumPy's rate", "tensor", "tensors"],
 )
 def test_speech_is_the_same_however_it_is_given(give: Callable[[Path], tuple[object, ...]], speech: Path) -> None:
     expected = speech_of(speech).speech
     found = speech_of(*give(speech)).speech  # type: ignore[arg-type]
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7)
+
+
+def test_a_list_of_numpys_numbers_is_one_recording() -> None:
+    assert recordings_of([*np.zeros(3, np.float32)]) is None
+    assert recordings_of([np.zeros(3, np.float32)]) is not None
 
 
 def test_an_identitys_name_is_its_usual_style(model: facediff.Animator) -> None:
