@@ -149,8 +149,9 @@ def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
 def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Path]:
     """The files whose content decides the animations."""
     source = Path(options.checkpoint)
-    files = sorted(source.iterdir()) if is_exported(source) else model_files(source)
-    files = [*files, *style_paths(None if options.style is None else str(options.style))]
+    # A download from the hub or a clone leaves folders among the files.
+    inside = sorted(path for path in source.iterdir() if path.is_file()) if is_exported(source) else model_files(source)
+    files = [*inside, *style_paths(None if options.style is None else str(options.style))]
     optional = (
         options.target_mesh,
         options.eyes,

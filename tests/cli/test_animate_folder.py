@@ -15,10 +15,11 @@ import pytest
 import trimesh
 
 from facediff.animation import read_archive
+from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import load_model
-from facediff.pipelines.folder import LOCK, output_names, recordings, seed_of_recording
+from facediff.pipelines.folder import LOCK, _deciding_files, output_names, recordings, seed_of_recording
 from facediff.utils.files import locked
 from tests.fakes.batches import run
 from tests.fakes.waiting import PATIENCE, wait_until, wait_until_signalled
@@ -60,6 +61,13 @@ def test_a_damaged_file_next_to_an_output_makes_it_again(folder: Path, capsys: p
         assert times(folder).pop("a.npy") != before.pop("a.npy")
         before = times(folder)
         assert "a.sound is missing or damaged" in capsys.readouterr().out
+
+
+def test_a_model_folder_may_hold_folders(tmp_path: Path) -> None:
+    (tmp_path / "model" / ".cache").mkdir(parents=True)
+    (tmp_path / "model" / "model.json").write_text("{}")
+    found = _deciding_files(AnimationOptions(checkpoint=tmp_path / "model"), ExportOptions())
+    assert found == [tmp_path / "model" / "model.json"]
 
 
 def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
