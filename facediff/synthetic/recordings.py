@@ -44,7 +44,8 @@ class Aligned(Synthesiser):
         """The recording, whatever the text and the delivery."""
         stem = Path(self.voice)
         stem = stem.with_suffix("") if stem.suffix.lower() in (*SOUNDS, ".textgrid") else stem
-        sound = next((path for suffix in SOUNDS if (path := Path(f"{stem}{suffix}")).is_file()), None)
+        suffixes = (*SOUNDS, *map(str.upper, SOUNDS))
+        sound = next((path for suffix in suffixes if (path := Path(f"{stem}{suffix}")).is_file()), None)
         if sound is None:
             raise FaceDiffError(f"{stem}: no such recording; expected a .wav or .flac file with a .TextGrid")
         grid = Path(f"{stem}.TextGrid")
@@ -100,7 +101,8 @@ def recordings_of(speaker: str, most: int) -> list[Recording]:
 @lru_cache(maxsize=4096)
 def _stems(speaker: Path) -> list[Path]:
     """Recordings of a speaker's folder, without their suffixes, that have a TextGrid."""
-    sounds = sorted(path.with_suffix("") for path in speaker.rglob("*") if path.suffix.lower() in SOUNDS)
+    # A recording that is there as .wav and as .flac is one.
+    sounds = sorted({path.with_suffix("") for path in speaker.rglob("*") if path.suffix.lower() in SOUNDS})
     return [stem for stem in sounds if Path(f"{stem}.TextGrid").is_file()]
 
 

@@ -117,6 +117,17 @@ def test_a_recording_is_a_voice(people: Path) -> None:
         speakers_of(people / "174")
 
 
+def test_a_recording_in_two_formats_is_one_and_capitals_do_not_matter(people: Path) -> None:
+    speaker = next(path for path in sorted(people.iterdir()) if path.is_dir())
+    first = next(iter(sorted(speaker.rglob("*.wav"))))
+    soundfile.write(first.with_suffix(".flac"), *soundfile.read(first))
+    voices = [recording.voice for recording in recordings_of(str(speaker), 100)]
+    assert len(voices) == len(set(voices))
+    first.with_suffix(".flac").unlink()
+    first.rename(first.with_suffix(".WAV"))
+    assert len(open_voice(f"aligned:{first.with_suffix('')}").speak().samples)
+
+
 def test_drawn_speakers_speak_with_the_recordings_of_people(people: Path, tmp_path: Path) -> None:
     data = Puppet(root=str(tmp_path / "corpus"), drawn_speakers=3, recordings=str(people))
     voices = data.edition.people
