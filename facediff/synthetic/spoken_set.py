@@ -218,5 +218,6 @@ def reference(clip: SpokenClip, frame_rate: float) -> SpokenMotion:
     spoken = Utterance(clip.samples, clip.phonemes)
     performed, _ = perform_clip(_performed(clip.text, number, clip.voice), spoken, 0, frame_rate)
     rig = rig_of(SPEAKER)[:, open_face().points].astype(np.float64)
-    # Turns of a few degrees about three axes are nearly the axis-angle of all of them.
-    return SpokenMotion(rig[0] + np.tensordot(performed.weights, rig[1:], 1), np.deg2rad(performed.head))
+    # Turns of a few degrees about three axes are nearly the axis-angle of all of them; one about z leads to the right.
+    turns = np.deg2rad(performed.head) * [1.0, 1.0, -1.0]
+    return SpokenMotion(rig[0] + np.tensordot(performed.weights, rig[1:], 1), turns)

@@ -1,14 +1,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from facediff.errors import FaceDiffError
+from facediff.spaces.rotations import convert, matrices
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import TimedPhoneme, closures, read_phonemes
-from facediff.synthetic.spoken_set import LANGUAGES, open_face, reference, spoken_set, write_spoken_set
+from facediff.synthetic.head.rig import SHAPES, turned
+from facediff.synthetic.performance import FaceMotion
+from facediff.synthetic.spoken_set import (
+    LANGUAGES,
+    SpokenClip,
+    open_face,
+    reference,
+    spoken_set,
+    write_spoken_set,
+)
 
 
 def test_every_language_has_closures_and_a_reference_that_makes_them() -> None:
@@ -30,6 +41,23 @@ def test_the_reference_is_one_motion_at_any_frame_rate() -> None:
     clip = spoken_set(["en"], 1, 1)[0]
     slow, quick = reference(clip, 25).points, reference(clip, 75).points
     assert np.abs(quick[1::3][: len(slow)] - slow).max() < 1e-9
+
+
+def test_the_references_head_turns_as_the_corpus_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    angles = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
+    motion = FaceMotion(np.zeros((3, len(SHAPES))), np.zeros((3, 2)), angles)
+    made = {
+        "perform_clip": lambda *_: (motion, motion),
+        "rig_of": lambda _: np.zeros((1 + len(SHAPES), 1, 3)),
+        "open_face": lambda: SimpleNamespace(points=[0]),
+    }
+    for name, function in made.items():
+        monkeypatch.setattr(f"facediff.synthetic.spoken_set.{name}", function)
+    head = reference(SpokenClip("a_01", "en", "espeak:en", "", np.zeros(0, np.float32), ()), 25).head
+    assert head is not None
+    points = np.random.default_rng(0).normal(size=(3, 4, 3))
+    found = points @ matrices(convert(head, "axis_angle", "quaternion")).transpose(0, 2, 1)
+    np.testing.assert_allclose(found, turned(points, angles, np.zeros(3)), atol=1e-9)
 
 
 def test_speech_for_other_programs_is_what_was_spoken(tmp_path: Path) -> None:
