@@ -108,7 +108,7 @@ def own_shapes(target: Path) -> OwnShapes:
     """
     try:
         return _own_shapes(open_glb(target))
-    except (ValueError, IndexError, KeyError, TypeError) as error:
+    except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
         raise _unreadable(target, error) from error
 
 
@@ -147,7 +147,7 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
         if named and _looks_back(glb) and weights.head is not None:  # solved for, it is in the avatar's axes already
             weights = replace(weights, head=weights.head * [-1.0, 1.0, -1.0])
         _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
-    except (ValueError, IndexError, KeyError, TypeError) as error:
+    except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
         raise _unreadable(target, error) from error
     writer.write(path)
 
