@@ -106,7 +106,7 @@ class DistillationOptions:
     low_latency: bool = False
     whole: float = 0.3
     transcribed: Path | None = None
-    transcribed_share: float = 0.6
+    transcribed_share: float = 0.3
 
     @property
     def goal(self) -> str:
