@@ -38,6 +38,9 @@ Ratio = Annotated[float, Range(0, 150)]
 LIFTER = 30
 """Coefficients of the cepstrum that make the spectral envelope. Harmonics of voices below 530 Hz lie above."""
 
+PIECE = 10 * SAMPLE_RATE
+"""Samples that are encoded together."""
+
 CLOSING, OPENING = 0.2, 0.16
 """Seconds that a mouth takes to come to rest after speech, and to open before it."""
 
@@ -613,8 +616,10 @@ def vorbis(speech: Wave, compression: float) -> npt.NDArray[np.floating]:
 
     scale = max(1.0, float(np.abs(speech).max(initial=0)))
     with io.BytesIO() as file:
-        soundfile.write(
-            file, speech / scale, SAMPLE_RATE, format="OGG", subtype="VORBIS", compression_level=compression
-        )
+        form = {"format": "OGG", "subtype": "VORBIS", "compression_level": compression}
+        with soundfile.SoundFile(file, "w", SAMPLE_RATE, 1, **form) as stream:
+            # Piece by piece: libsndfile lays all that it is given onto the stack, which two minutes overflow.
+            for first in range(0, len(speech), PIECE):
+                stream.write(speech[first : first + PIECE] / scale)
         file.seek(0)
         return cast(Wave, soundfile.read(file, dtype="float32")[0] * scale)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import soundfile
 
 from facediff.data import Puppet
 from facediff.data.augmentation import (
@@ -14,6 +15,7 @@ from facediff.data.augmentation import (
     Example,
     filtered,
     read_augmentations,
+    vorbis,
     warped,
 )
 from facediff.errors import FaceDiffError
@@ -188,3 +190,15 @@ def puppet_of_two(tmp_path_factory: pytest.TempPathFactory) -> str:
     root = tmp_path_factory.mktemp("two") / "corpus"
     generate(root, only=["F1_e01", "F1_e02", "F1_e28"], progress=False)
     return str(root)
+
+
+def test_long_speech_is_encoded_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    lengths, write = [], soundfile.SoundFile.write
+
+    def noting(file: soundfile.SoundFile, samples: np.ndarray) -> None:
+        lengths.append(len(samples))
+        write(file, samples)
+
+    monkeypatch.setattr(soundfile.SoundFile, "write", noting)
+    assert len(vorbis(np.zeros(25 * RATE, np.float32), 1.0)) == 25 * RATE
+    assert max(lengths) <= 10 * RATE  # two minutes at once overflow the stack and end the process
