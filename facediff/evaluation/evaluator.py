@@ -145,7 +145,7 @@ def evaluate(
     if eyelid_pairs is None and "lid_pairs" in needed and corpus is not None and (corpus / EYELID_PAIRS).is_file():
         eyelid_pairs = read_pairs(None, corpus, n_vertices, EyelidPairs)
     speakers = sorted({name.subject for name in names.values()})
-    material = CorpusInputs(corpus if requests else None, frame_rate, speakers, files)
+    material = CorpusInputs(corpus if requests else None, frame_rate, speakers, files, truth_stride)
     context = material.context(
         lips,
         upper_face,
@@ -284,6 +284,7 @@ class CorpusInputs:
     frame_rate: float | None  # of the predictions, if known
     identities: Sequence[str]  # names of all speakers
     files: ParameterFiles | None = None  # how files of parameters are read
+    truth_stride: int = 1  # of what is stored at the frame rate of the truth
 
     def context(
         self,
@@ -351,10 +352,12 @@ class CorpusInputs:
             file = phonemes_file(self.corpus, clip)
             inputs["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
         if "speaking" in needed and self.corpus is not None:
-            inputs["speaking"] = [torch.from_numpy(conversation_file(self.corpus, "speaking", clip))]
+            speaking = conversation_file(self.corpus, "speaking", clip)[:: self.truth_stride]
+            inputs["speaking"] = [torch.from_numpy(speaking)]
         if "partner" in needed and self.corpus is not None and self.files is not None:
             path = self.corpus / "partner" / pair.truth.path.name
-            inputs["partner"] = replace(self.files, truth=path.parent, rig=None).read(path, 1).channels
+            partner = replace(self.files, truth=path.parent, rig=None)
+            inputs["partner"] = partner.read(path, self.truth_stride).channels
         return inputs
 
 

@@ -155,3 +155,21 @@ def test_a_protocol_of_channels_refuses_vertices(tmp_path: Path) -> None:
     words = [tmp_path / "ours", tmp_path / "truth", "--lips", "all", "--n-vertices", "4"]
     assert "channels" in refused(*words, "--protocol", "facediffuser_beat")
     assert "--file-unit" in refused(*words, "--protocol", "meshtalk", "--unit", "mm")
+
+
+def test_mask_and_partner_have_the_stride_of_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random = np.random.default_rng(4)
+    truth, partner = random.uniform(0, 1, (2, 40, 51)).astype(np.float32)
+    prediction, speaking = random.uniform(0, 1, (20, 51)).astype(np.float32), random.random(40) < 0.5
+    for folder, values, rate in (("truth", truth, 50.0), ("truth/partner", partner, 50.0), ("ours", prediction, 25.0)):
+        (tmp_path / folder).mkdir()
+        clip = ParameterClip("ann_a", values, layout("arkit_51"), rate, layout="arkit_51")
+        write_parameters(tmp_path / folder / "ann_a.json", clip)
+    (tmp_path / "truth" / "speaking").mkdir()
+    np.save(tmp_path / "truth" / "speaking" / "ann_a.npy", speaking)
+    words = [tmp_path / "ours", tmp_path / "truth", "--truth-stride", 2, "--protocol", "facediffuser_beat"]
+    words += ["--metric", "s_channel_variance", "--metric", "residual_partner_correlation"]
+    found = scores(capsys, *words)
+    assert found["s_channel_variance"] == pytest.approx(prediction[speaking[::2]].var(0).mean(), rel=1e-4)
+    both = [np.corrcoef(side.ravel(), partner[::2].ravel())[0, 1] for side in (prediction, truth[::2])]
+    assert found["residual_partner_correlation"] == pytest.approx(abs(both[1] - both[0]), rel=1e-4)
