@@ -94,7 +94,7 @@ def list_names(
     files = sorted(
         file
         for file in folder.glob("**/*" if deep else "*")
-        if file.suffix in suffixes and not file.name.startswith(".")
+        if file.suffix.lower() in suffixes and not file.name.startswith(".")
     )
     if not files:
         raise FaceDiffError(f"{folder}: holds no {' or '.join(suffixes)} file; expected {expected}")

@@ -173,3 +173,11 @@ def test_mask_and_partner_have_the_stride_of_the_truth(tmp_path: Path, capsys: p
     assert found["s_channel_variance"] == pytest.approx(prediction[speaking[::2]].var(0).mean(), rel=1e-4)
     both = [np.corrcoef(side.ravel(), partner[::2].ravel())[0, 1] for side in (prediction, truth[::2])]
     assert found["residual_partner_correlation"] == pytest.approx(abs(both[1] - both[0]), rel=1e-4)
+
+
+def test_suffixes_in_capitals_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = np.random.default_rng(5).uniform(0, 1, (9, 51))
+    for folder in ("truth", "ours"):
+        write(tmp_path / folder, "ann_a", values, "arkit_51", ".json")
+        (tmp_path / folder / "ann_a.json").rename(tmp_path / folder / "ann_a.JSON")
+    assert scores(capsys, tmp_path / "ours", tmp_path / "truth", "--protocol", "facediffuser_beat")["mve"] == 0
