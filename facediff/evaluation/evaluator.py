@@ -194,7 +194,8 @@ def evaluate(
     rendered = {}
     regions = {"lips": lips.indices} | ({} if upper_face is None else {"upper_face": upper_face.indices})
     if renders:
-        rendered = score_renders(renders, scorer, paired, regions, faces, corpus, frame_rate)
+        usable = {table.name: ([pair for pair, _ in table.rows], table.missing) for table in tables}
+        rendered = score_renders(renders, scorer, usable, regions, faces, corpus, frame_rate)
     results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
         truth=str(truth),

@@ -5,6 +5,7 @@ import json
 import pickle
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,3 +163,13 @@ def test_metrics_with_options_or_mistakes(shared_files: Files, capsys: pytest.Ca
     ):
         with pytest.raises(FaceDiffError, match=named):
             evaluate(shared_files.method(), shared_files.root, *words)
+
+
+def test_clips_that_are_left_out_are_not_rendered(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered: list[Any] = []
+    monkeypatch.setattr("facediff.evaluation.evaluator.score_renders", lambda *given: rendered.append(given[2]) or {})
+    (files.method("ours") / "A_e03_condition_A.npy").write_bytes(b"damaged")
+    report = files.evaluate("ours", protocols=["paper"], bootstrap=0, renders=["onnx"], workers=1)
+    scored = [sequence.clip for sequence in report.methods[0].sequences]
+    assert "A_e03" not in scored
+    assert [pair.clip for pair in rendered[0]["ours"][0]] == scored
