@@ -470,18 +470,16 @@ def _comparisons(report: EvaluationReport, protocol: str) -> list[str]:
     comparisons = [comparison for comparison in report.comparisons if comparison.protocol == protocol]
     if not comparisons:
         return []
-    rows: dict[str, list[str]] = {}
+    rows: dict[str, dict[str, str]] = {}
     counts: dict[str, str] = {}
     for comparison in comparisons:
         row = f"{comparison.method} − {comparison.baseline}" + (f": {comparison.metric}" if protocol == METRICS else "")
-        rows.setdefault(row, []).append(
-            _cell(comparison.difference, comparison.interval, "+") + ("*" if comparison.starred else "")
-        )
+        column = "difference" if protocol == METRICS else comparison.metric
+        cell = _cell(comparison.difference, comparison.interval, "+") + ("*" if comparison.starred else "")
+        rows.setdefault(row, {})[column] = cell
         counts[row] = str(comparison.sequences)
-    metrics = (
-        ["difference"] if protocol == METRICS else list(dict.fromkeys(comparison.metric for comparison in comparisons))
-    )
-    body = [[row, *cells, counts[row]] for row, cells in rows.items()]
+    metrics = list(dict.fromkeys(column for cells in rows.values() for column in cells))
+    body = [[row, *(cells.get(column) for column in metrics), counts[row]] for row, cells in rows.items()]
     head = "difference, over the sequences that both have (*: the interval over sentences does not contain 0)"
     same = list(
         dict.fromkeys(

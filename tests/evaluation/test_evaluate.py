@@ -4,6 +4,7 @@ import csv
 import json
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from facediff.cli.app import run
 from facediff.errors import FaceDiffError
 from facediff.evaluation import read_region
+from facediff.evaluation.report import text
 from tests.evaluation.conftest import LENGTHS, LIPS, UPPER, VERTICES, Files, scores_of
 
 
@@ -163,6 +165,18 @@ def test_metrics_with_options_or_mistakes(shared_files: Files, capsys: pytest.Ca
     ):
         with pytest.raises(FaceDiffError, match=named):
             evaluate(shared_files.method(), shared_files.root, *words)
+
+
+def test_a_difference_stands_under_its_own_score(shared_files: Files) -> None:
+    report = shared_files.evaluate("ours", "theirs", protocols=["paper"], bootstrap=0)
+    first, *others = report.comparisons  # the second method has no value of the first score
+    more = [replace(each, method="third") for each in report.comparisons]
+    lines = text(replace(report, comparisons=[*others, *more])).splitlines()
+    place = next(place for place, line in enumerate(lines) if line.startswith("difference, over the sequences"))
+    head, second, third = (line.split() for line in lines[place + 1 : place + 4])
+    assert head == [*(each.metric for each in others), first.metric, "sequences"]
+    assert third[:3] == ["third", "−", "ours"]
+    assert second[3:] == [*third[3 : 2 + len(head)][:-1], "-", third[-1]]
 
 
 def test_clips_that_are_left_out_are_not_rendered(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
