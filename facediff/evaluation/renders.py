@@ -201,16 +201,16 @@ class SyncScores(RenderMetric):
         }
 
     def _embeddings(self, graph: RenderGraph, which: int, windows: Array) -> Array:
-        """Embeddings (N, D), a few windows at a time, or one where the graph takes no more."""
+        """Embeddings (N, D), a few windows at a time, or as many as the graph takes."""
         batch = graph.inputs[self.names[which]][0]
-        step = batch if isinstance(batch, int) else 32
-        if len(windows) % step:
-            step = step if not isinstance(batch, int) else 1
+        step, count = batch if isinstance(batch, int) else 32, len(windows)
+        if isinstance(batch, int):  # it takes neither more nor fewer: copies of the last window fill its last batch up
+            windows = windows[np.minimum(np.arange(-(-count // step) * step), count - 1)]
         parts = [
             next(iter(graph.run({self.names[which]: windows[start : start + step]}, step / 25).values()))
             for start in range(0, len(windows), step)
         ]
-        return np.concatenate([part.reshape(len(part), -1) for part in parts]).astype(np.float64)
+        return np.concatenate([part.reshape(len(part), -1) for part in parts])[:count].astype(np.float64)
 
 
 def mel_spectrogram(speech: Speech) -> Array:

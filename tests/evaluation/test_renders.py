@@ -34,13 +34,13 @@ def write_brightness(path: Path, height: int = 32, width: int = 48) -> Path:
     return write_graph(path, {"frames": [1, "T", height, width, 3]}, nodes, "brightness")
 
 
-def write_encoders(folder: Path) -> tuple[Path, Path]:
+def write_encoders(folder: Path, batch: int | str = "N") -> tuple[Path, Path]:
     """Encoders of one number each: how bright the mouth is, and how loud the sound."""
     video = [helper.make_node("ReduceMean", ["crops"], ["seen"], axes=[1, 2, 3], keepdims=1)]
     audio = [helper.make_node("ReduceMean", ["mel"], ["heard"], axes=[1, 2, 3], keepdims=1)]
     return (
-        write_graph(folder / "video.onnx", {"crops": ["N", 15, 16, 16]}, video, "seen"),
-        write_graph(folder / "audio.onnx", {"mel": ["N", 1, 80, 16]}, audio, "heard"),
+        write_graph(folder / "video.onnx", {"crops": [batch, 15, 16, 16]}, video, "seen"),
+        write_graph(folder / "audio.onnx", {"mel": [batch, 1, 80, 16]}, audio, "heard"),
     )
 
 
@@ -115,6 +115,17 @@ def test_sync_finds_the_offset_and_follows_the_formula(tmp_path: Path) -> None:
         metric.score(frames[:8], speech, 25.0)
     with pytest.raises(FaceDiffError, match="wav"):
         metric.score(frames, speech[:0], 25.0)
+
+
+def test_encoders_may_take_a_fixed_number_of_windows(tmp_path: Path) -> None:
+    random = np.random.default_rng(2)
+    frames = random.integers(0, 255, (40, 16, 16, 3)).astype(np.uint8)
+    speech = random.standard_normal(40 * 640).astype(np.float32)
+    scores = []
+    for batch in ("N", 8):
+        video, audio = write_encoders(tmp_path, batch)
+        scores.append(SyncScores(video=str(video), audio=str(audio), reach=5).score(frames, speech, 25.0))
+    assert scores[0] == pytest.approx(scores[1], rel=1e-6)
 
 
 def test_mel_filters_of_slaneys_scale() -> None:
