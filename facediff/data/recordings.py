@@ -55,7 +55,7 @@ class RecordingFolder(ChannelFolder):
         files: dict[str, tuple[Path, Path]] = {}
         for number, path in enumerate(sorted(self.root.rglob("*"))):
             LIMITS.check("entries", number, self.root)
-            if path.suffix.lower() not in self.suffixes or not path.is_file():
+            if path.suffix.lower() not in self.suffixes or path.name.startswith(".") or not path.is_file():
                 continue
             sound = path.with_suffix(".wav")
             sound = sound if sound.is_file() else sounds.get(path.stem, sound)

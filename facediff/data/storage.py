@@ -95,7 +95,7 @@ class ClipFolder:
     def names(self) -> list[str]:
         """The clips that have both files, sorted."""
         names = []
-        for name in sorted(path.stem for path in (self.root / "wav").glob("*.wav")):
+        for name in sorted(path.stem for path in (self.root / "wav").glob("[!.]*.wav")):
             if not name.isprintable():
                 raise FaceDiffError(
                     f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"

@@ -15,6 +15,7 @@ import soundfile
 from facediff.data import Beat, FlameClips, LiveLink, SpeechMotionDataModule
 from facediff.data.check import check
 from facediff.data.parametric import official_split
+from facediff.data.recordings import RecordingFolder
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.spaces import layout
@@ -75,6 +76,15 @@ def test_beat_is_read_in_its_own_names_rate_and_time(tmp_path: Path) -> None:
         "val": 1,
         "test_a": 1,
     }
+
+
+def test_hidden_files_are_no_recordings(tmp_path: Path) -> None:
+    write_beat(tmp_path)
+    for suffix in ("json", "wav"):
+        (tmp_path / "2" / f"._2_scott_0_1_1.{suffix}").write_bytes(b"\0\5\x16\7")
+    names = RecordingFolder(tmp_path, layout("arkit_51"), 30.0).names()
+    assert len(names) == 6
+    assert names[-1] == "2_scott_0_2_2"
 
 
 def test_flame_clips_need_a_layout_and_keep_the_version(tmp_path: Path) -> None:

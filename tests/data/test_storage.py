@@ -36,6 +36,13 @@ def test_clip_whose_name_cannot_be_printed_is_refused(name: str, tmp_path: Path)
     assert str(refused.value).removeprefix(str(tmp_path)).isprintable()
 
 
+def test_hidden_files_are_no_clips(tmp_path: Path) -> None:
+    corpus(tmp_path)
+    for place in ("wav/._A_01.wav", "vertices_npy/._A_01.npy"):  # as macOS adds them on disks of other systems
+        (tmp_path / place).write_bytes(b"\0\5\x16\7")
+    assert list(Corpus(tmp_path, 9, 25.0).clips) == ["A_01"]
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e300, 3e37, -3e37])
 def test_motion_that_is_not_finite_is_refused_by_frame(value: float, tmp_path: Path) -> None:
     opened = corpus(tmp_path)
