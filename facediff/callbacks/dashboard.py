@@ -173,9 +173,9 @@ class ClipErrors:
 
 
 def worst_clips(rows: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
-    """The rows of the model's worst clips by LVE, the worst first; equal ones in the rows' order."""
+    """The rows of the model's worst clips by LVE, or else MVE, the worst first; equal ones in the rows' order."""
     mine = [row for row in rows if row["method"] == "model"]
-    return sorted(mine, key=lambda row: -float(row["lve"]))[:count]
+    return sorted(mine, key=lambda row: -float(row["lve" if "lve" in row else "mve"]))[:count]
 
 
 @torch.inference_mode()

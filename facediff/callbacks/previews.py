@@ -357,7 +357,7 @@ def draw_clip(
         highest=error_scale,
         scale_label=length(error_scale, assets.unit),
         labels=("truth", "facediff", "error"),
-        footer=f"{sample.name} after epoch {epochs}: LVE {clip_scores['lve']:.3g} ({corpus})",
+        footer=f"{sample.name} after epoch {epochs}: {lip_score(clip_scores)} ({corpus})",
     )
     count, rate = len(motion), assets.frame_rate
     picks = [round((i + 0.5) * (count - 1) / PICTURES) for i in range(PICTURES)]
@@ -387,6 +387,12 @@ def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, f
     metrics = cast(Iterable[tuple[str, SequenceMetric]], built.items(copy_state=False))
     (clip,) = align(motion[None], truth[None], clip_names=[sample.name]).clips
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
+
+
+def lip_score(clip_scores: dict[str, float]) -> str:
+    """The error of the lips, or that of all vertices by protocols which have none of the lips."""
+    title = "lve" if "lve" in clip_scores else "mve"
+    return f"{title.upper()} {clip_scores[title]:.3g}"
 
 
 def length(value: float, unit: str) -> str:

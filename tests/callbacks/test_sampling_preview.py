@@ -22,7 +22,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, length
+from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, length, lip_score
 from facediff.cli.app import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
@@ -387,6 +387,11 @@ def test_first_of_each_identity_comes_before_any_second() -> None:
 
 def test_length_has_a_readable_unit() -> None:
     assert [length(0.0051, "m"), length(0.0051, "mm"), length(2, "unit")] == ["5.1 mm", "0.0051 mm", "2 unit"]
+
+
+def test_footer_has_the_score_that_the_protocol_has() -> None:
+    assert lip_score({"mve": 0.5, "lve": 0.25}) == "LVE 0.25"
+    assert lip_score({"mve": 0.5, "fd_jaw": 2.0}) == "MVE 0.5"
 
 
 def test_preview_of_channels_draws_what_the_rig_makes_of_them(
