@@ -631,8 +631,12 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
 
 def as_tensor(value: Any) -> Any:  # noqa: ANN401 - whatever a metric takes
     """A NumPy array as a tensor of its own; everything else as it is."""
-    # A copy, since torch warns of arrays that may not be written to, such as motion files that are memory-mapped.
-    return torch.tensor(value) if hasattr(value, "__array__") and not isinstance(value, Tensor) else value
+    if isinstance(value, Tensor) or not hasattr(value, "__array__"):
+        return value
+    array = value.__array__()
+    # A copy: torch warns of arrays that may not be written to, such as motion files that are memory-mapped, and takes
+    # none that is read backwards or has the other order of bytes.
+    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
 
 
 def _arguments(documented: object) -> dict[str, str]:

@@ -6,6 +6,7 @@ import doctest
 import inspect
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -84,6 +85,12 @@ def test_a_class_of_ones_own_becomes_a_function() -> None:
     assert "    power: A power." in documented
     assert [line for line in documented if line in ("Args:", "Returns:", "Raises:")] == ["Args:", "Returns:", "Raises:"]
     assert LipLag([0, 2]).describe() == f"power of the mean distance over {LipLag([0, 2]).region} [1]"
+
+
+def test_arrays_may_be_backwards_or_of_the_other_order_of_bytes() -> None:
+    motion = np.random.default_rng(0).random((5, 4, 3), np.float32)
+    expected = fm.lip_vertex_error(motion[::-1].copy(), motion, [0])
+    assert fm.lip_vertex_error(motion[::-1], motion.astype(">f4"), [0]) == expected > 0
 
 
 def test_a_metric_that_defines_nothing_says_so() -> None:
