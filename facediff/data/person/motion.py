@@ -51,7 +51,7 @@ def read_motion(
         fits = vertices_of(array.shape) == n_vertices
         if fits and flame is None:
             return FaceSequence(array.reshape(len(array), n_vertices, 3))
-        parameters = array.shape[-1] == FLAME_WIDTH
+        parameters = array.shape[-1:] == (FLAME_WIDTH,)
         if not parameters and not fits:
             raise FaceDiffError(
                 f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) "

@@ -304,6 +304,8 @@ def damaged(known: Person, kind: str) -> Array:
         frames = frames[:20]
     elif kind == "whole numbers":
         return frames.astype(int)
+    elif kind == "one number":
+        return frames[0, 0, 0]
     return frames
 
 
@@ -317,6 +319,7 @@ def damaged(known: Person, kind: str) -> Array:
         ("still", r"motion\.npy: the motion is still"),
         ("one vertex less", r"motion\.npy: has shape \(90, 359, 3\); expected \(frames, 360, 3\)"),
         ("short", r"the motion lasts 0\.67 s .* and the sound 3\.00 s; expected the same stretch"),
+        ("one number", r"motion\.npy: has shape \(\); expected \(frames, 360, 3\)"),
         ("whole numbers", r"motion\.npy: holds int64 \(90, 360, 3\); expected floating-point"),
     ],
 )
