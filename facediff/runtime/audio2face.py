@@ -232,7 +232,7 @@ class FaceAnimator:
         animated = {
             "skin_vertices": vertices,
             "tongue_vertices": self._tongue(tongue),
-            "jaw_transform": np.stack([self._jaw(points) for points in jaw.reshape(count, -1, 3)]),
+            "jaw_transform": np.array([self._jaw(row.reshape(-1, 3)) for row in jaw], np.float32).reshape(count, 4, 4),
             "eyes_rotation": self._eyes(eyes),
         }
         self._frame += count

@@ -275,3 +275,9 @@ def test_infer_refuses_results_of_another_size(tmp_path: Path) -> None:
 def test_emotions_are_those_of_the_folder(model: Audio2Face) -> None:
     assert model.folder.facts.emotions == EMOTIONS
     assert model.emotion({"anger": 0.5}).tolist()[4:] == [0.0, 0.5, 0.0, 0.0]
+
+
+def test_no_speech_is_no_frames(model: Audio2Face) -> None:
+    face = model.animate(model.infer(SPEECH[:0], 30), 30)
+    assert [len(part) for part in face.values()] == [0, 0, 0, 0]
+    assert face["jaw_transform"].shape == (0, 4, 4)
