@@ -138,6 +138,7 @@ def evaluate(
         stored = read_manifest(corpus).get("frame_rate")
         frame_rate = stored / truth_stride if isinstance(stored, int | float) and stored > 0 else None
     if files is not None:
+        files = replace(files, predictions=tuple(map(Path, methods.values())))
         frame_rate = files.frame_rate
     needed = {need for request in requests.values() for need in request.needs}
     if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / LIP_PAIRS).is_file():

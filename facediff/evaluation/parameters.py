@@ -43,6 +43,7 @@ class ParameterFiles:
         layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
         truth: folder of the truth.
         rig: decodes channels to vertices; None where only channels are scored.
+        predictions: folders of the predictions, which may lie in that of the truth.
     """
 
     space: Space
@@ -50,6 +51,7 @@ class ParameterFiles:
     layouts: tuple[str | None, str | None]
     truth: Path
     rig: AnyRig | None = None
+    predictions: tuple[Path, ...] = ()
 
     @classmethod
     def begin(
@@ -111,7 +113,8 @@ class ParameterFiles:
         Raises:
             FaceDiffError: if the file has other channels, or another frame rate.
         """
-        is_truth = path.is_relative_to(self.truth)
+        inside = [folder for folder in self.predictions if folder != self.truth and folder.is_relative_to(self.truth)]
+        is_truth = path.is_relative_to(self.truth) and not any(map(path.is_relative_to, inside))
         clip = even(_read(path, self.layouts[1 if is_truth else 0]))
         if abs(clip.frame_rate / stride - self.frame_rate) > 0.01 * self.frame_rate:
             raise FaceDiffError(

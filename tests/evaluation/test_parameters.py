@@ -76,6 +76,17 @@ def test_dualtalk_by_numpy(
     assert found["p_fd_jaw"] != found["fd_jaw"]
 
 
+def test_predictions_may_lie_in_the_folder_of_the_truth(
+    dialogue: tuple[Path, Path, dict[str, list[Array]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    ours, truth, numbers = dialogue
+    inside = ours.rename(truth / "ours")
+    layouts = ("--layout", "flame_dualtalk", "--truth-layout", "flame_dualtalk_truth")
+    found = scores(capsys, inside, truth, *layouts, "--protocol", "facediffuser_beat")
+    gaps = np.concatenate([clip[0] - clip[1] for clip in numbers.values()])
+    assert found["mve"] == pytest.approx(np.abs(gaps).mean(), rel=1e-5)
+
+
 def test_a_partner_who_is_missing_is_named(dialogue: tuple[Path, Path, dict[str, list[Array]]]) -> None:
     ours, truth, _ = dialogue
     for file in (truth / "partner").iterdir():
