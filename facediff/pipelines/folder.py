@@ -11,6 +11,8 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.animation.style_files import style_paths
 from facediff.editing.controls import check_controls, keys_file
@@ -99,7 +101,7 @@ def animate_folder(
         found,
         output,
         suffix,
-        [f"{name}={json.dumps(value, default=str)}" for name, value in decides.items()],
+        [f"{name}={json.dumps(value, default=_in_words)}" for name, value in decides.items()],
         make_worker=partial(_load_pipeline, quiet, export),
         files=_deciding_files(options, export),
         files_of=partial(_own_files, options),
@@ -107,6 +109,14 @@ def animate_folder(
         scheduler=scheduler,
         retry_failed=retry_failed,
     )
+
+
+def _in_words(value: object) -> str:
+    """A value of Python as text; of an array, whose own text leaves out its middle, the checksum of its numbers."""
+    if not hasattr(value, "__array__"):
+        return str(value)
+    numbers = np.asarray(value)
+    return f"{numbers.dtype} {numbers.shape} {hashlib.sha256(numbers.tobytes()).hexdigest()}"
 
 
 def check_directions(options: AnimationOptions, found: Sequence[Path], folder: Path) -> None:

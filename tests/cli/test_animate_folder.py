@@ -19,7 +19,7 @@ from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import load_model
-from facediff.pipelines.folder import LOCK, _deciding_files, output_names, recordings, seed_of_recording
+from facediff.pipelines.folder import LOCK, _deciding_files, _in_words, output_names, recordings, seed_of_recording
 from facediff.utils.files import locked
 from tests.fakes.batches import run
 from tests.fakes.waiting import PATIENCE, wait_until, wait_until_signalled
@@ -68,6 +68,14 @@ def test_a_model_folder_may_hold_folders(tmp_path: Path) -> None:
     (tmp_path / "model" / "model.json").write_text("{}")
     found = _deciding_files(AnimationOptions(checkpoint=tmp_path / "model"), ExportOptions())
     assert found == [tmp_path / "model" / "model.json"]
+
+
+def test_large_arrays_are_told_apart_and_paths_stay_readable() -> None:
+    plain = np.zeros(2000)
+    other = plain.copy()
+    other[1000] = 1
+    assert _in_words(plain) == _in_words(plain.copy()) != _in_words(other)
+    assert _in_words(Path("a") / "b") == str(Path("a") / "b")
 
 
 def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
