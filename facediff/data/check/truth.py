@@ -71,7 +71,7 @@ def measure_truth(root: Path, names: Iterable[str], rate: float) -> list[dict[st
 
 
 def _measures(root: Path, every: list[str], rate: float) -> list[dict[str, Any]]:
-    clips = list(_read(root, every[:: max(1, len(every) // ENOUGH)], rate))
+    clips = [clip for clip in _read(root, every[:: max(1, len(every) // ENOUGH)], rate) if len(clip.gaze) > 1]
     minutes = sum(len(clip.gaze) for clip in clips) / rate / 60.0
     if not minutes:
         return []
@@ -79,18 +79,21 @@ def _measures(root: Path, every: list[str], rate: float) -> list[dict[str, Any]]
     jumps = np.concatenate([_jumps(clip.gaze, rate) for clip in clips])
     away = np.mean(np.concatenate([np.linalg.norm(clip.gaze, axis=1) > AWAY for clip in clips]))
     nods = sum(_rises(clip.head[:, 0] - np.median(clip.head[:, 0]), NOD, 0.0) for clip in clips)
-    gaps = np.array([gap for clip in clips for gap in clip.gaps])
+    glances = jumps[jumps > AWAY]
+    size = f"{glances.mean():.1f}" if len(glances) else "none"
+    gaps = [gap for clip in clips for gap in clip.gaps]
+    apart = f"{np.quantile(gaps, 0.95):.2f}" if gaps else "none"
     lips, upper = ([clip.regions[name] for clip in clips] for name in ("lips", "upper_face"))
     jaw = _median_frequency([clip.weights["jawOpen"] for clip in clips], rate)
     fine = [_share_above(region, rate, FINEST) for region in (lips, upper)]
     rows = [
         ("blinks a minute", f"{blinks / minutes:.1f}", "26, 10 to 50 by person", "Bentivoglio and others 1997"),
         ("saccades above 1° a minute", f"{np.sum(jumps > 1.0) / minutes:.0f}", "", ""),
-        ("glances above 4°, mean size, °", f"{jumps[jumps > AWAY].mean():.1f}", "14 to 16", "Lee and others 2002"),
+        ("glances above 4°, mean size, °", size, "14 to 16", "Lee and others 2002"),
         ("share of the time looking away", f"{away:.2f}", "0.4", "Argyle and Cook 1976"),
         ("nods above 1° a minute", f"{nods / minutes:.0f}", "", ""),
         ("head's pitch, standard deviation, °", f"{np.mean([np.std(clip.head[:, 0]) for clip in clips]):.2f}", "", ""),
-        ("lips apart at p, b, m, 95th percentile, mm", f"{np.quantile(gaps, 0.95):.2f}", "0", "they touch"),
+        ("lips apart at p, b, m, 95th percentile, mm", apart, "0", "they touch"),
         ("jaw, median frequency of its velocity, Hz", f"{jaw:.1f}", "2 to 7", "Chandrasekaran and others 2009"),
         ("lips, difference ratio", f"{_difference_ratio(lips):.2f}", "", ""),
         ("lips, share of their power above 8 Hz", f"{fine[0]:.3f}", "", ""),
