@@ -224,7 +224,10 @@ def generate_second(
     if only is None and _is_complete(root, facts):
         return
     refuse_foreign(root, production.corpus)
-    clips = [clip for clip in production.clips(drawn, people) if only is None or clip.name in only]
+    every = production.clips(drawn, people)
+    clips = [clip for clip in every if only is None or clip.name in only]
+    if unknown := {*(only or ())} - {clip.name for clip in clips}:
+        raise FaceDiffError(f"the built-in corpus has no clip {min(unknown)!r}; clips are named like {every[0].name!r}")
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, clips, people, production)
         tasks = run_tasks(

@@ -83,6 +83,27 @@ def test_vertices_are_what_weights_decode_to(corpus: Path) -> None:
     assert rig.shape == (1 + len(SHAPES), len(build_head().vertices), 3)
 
 
+def test_an_unknown_clip_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="'F1_e99'"):
+        generate_second(tmp_path / "new", only=["F1_e01", "F1_e99"], progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_small_corpus_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(0)
+    still = {name: random.normal(size=(9, 2, 3)) for name in ("lips", "upper_face")}
+    weights = {name: random.uniform(size=9) for name in ("eyeBlinkLeft", "jawOpen")}
+    clip = truth.TruthClip(weights, np.zeros((9, 2)), np.zeros((9, 3)), still, [])
+    one = {name: values[:1] for name, values in weights.items()}
+    short = truth.TruthClip(one, np.zeros((1, 2)), np.zeros((1, 3)), {k: v[:1] for k, v in still.items()}, [])
+    monkeypatch.setattr(truth, "_read", lambda *_: iter([clip, short]))
+    for part in ("weights", "gaze", "head"):
+        (tmp_path / f"{part}_npy").mkdir()
+    values = {row["measure"]: row["value"] for row in truth.measure_truth(tmp_path, ["a"], 25.0)}
+    assert values["lips apart at p, b, m, 95th percentile, mm"] == "none"
+    assert values["glances above 4°, mean size, °"] == "none"
+
+
 def test_the_check_reads_weights_and_measures_the_truth(corpus: Path) -> None:
     report = check(corpus)
     assert report.sound, text(report)
