@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from facediff.errors import FaceDiffError, counted
+from facediff.live.receivers import json_lines
 from facediff.live.receivers.json_lines import MOST_CLIENTS
+from facediff.live.receivers.sending import listen
 from facediff.spaces.arkit import ARKIT
 from tests.fakes.waiting import PATIENCE, free_port, wait_until
 from tests.live.conftest import FRAME_RATE, VERTICES, Opened, frame, weights_of
@@ -93,6 +97,42 @@ def test_a_slow_client_misses_frames_and_the_others_do_not(opened: Opened) -> No
     assert "missed by slow ones" in receiver.status()
     quick.close()
     slow.close()
+
+
+def test_a_frame_that_is_not_finite_is_left_out(opened: Opened, tmp_path: Path) -> None:
+    receiver = opened(f"jsonl:{tmp_path / 'a.jsonl'}")
+    receiver.send(replace(frame(0), weights=np.full(len(ARKIT), np.nan, np.float32)))
+    receiver.send(frame(1))
+    receiver.close()
+    _, only, end = [json.loads(text) for text in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert only["index"] == 1
+    assert end == {"type": "end", "frames": 1, "dropped": 1}
+
+
+class OnceFull:
+    """A listening socket that has no file left for its first client."""
+
+    def __init__(self, listening: socket.socket) -> None:
+        self._listening, self._failed = listening, False
+
+    def accept(self) -> object:
+        if not self._failed:
+            self._failed = True
+            raise OSError(errno.EMFILE, "Too many open files")
+        return self._listening.accept()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._listening, name)
+
+
+def test_a_client_that_cannot_be_accepted_does_not_keep_out_the_next(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(json_lines, "listen", lambda *place: OnceFull(listen(*place)))
+    port = free_port()
+    receiver = opened(f"jsonl:{port}")
+    with connect(port):
+        wait_for(receiver, "1 client")
 
 
 def test_a_client_that_left_is_forgotten(opened: Opened) -> None:

@@ -34,6 +34,8 @@ PORT = 9_009
 MOST_CLIENTS = 16
 WAITING = 8
 """Frames that wait for one slow client, a disk or a pipe before the oldest is dropped."""
+PAUSE = 0.1
+"""Seconds until a client is accepted again after one could not be."""
 
 
 @receiver.register("jsonl")
@@ -62,6 +64,7 @@ class JsonLines(Receiver):
         self._sink: _Clients | _Stream | None = None
         self._outbox: Outbox[LiveFrame] | None = None
         self._words = ""
+        self._warned = False
 
     def open(self, performance: Performance) -> None:
         """Open the file or the port and describe the performance."""
@@ -90,8 +93,8 @@ class JsonLines(Receiver):
             self._outbox.put(frame)
 
     def _write(self, frame: LiveFrame) -> None:
-        sink = self._sink
-        if sink is None or not sink.wanted:
+        sink, outbox = self._sink, self._outbox
+        if sink is None or outbox is None or not sink.wanted:
             return
         content: dict[str, object] = {
             "type": "frame",
@@ -107,7 +110,15 @@ class JsonLines(Receiver):
             content["head"] = [round(angle, 6) for angle in frame.turned.tolist()]
         if self.with_vertices:
             content["vertices"] = _rounded(frame.vertices)
-        sink.write(line(content))
+        try:
+            data = line(content)
+        except ValueError:  # NaN, as of a model that computes in too few bits
+            if not self._warned:
+                log.warning("%s: frames whose numbers are not finite are left out", self.name)
+            self._warned = True
+            outbox.count_dropped()
+            return
+        sink.write(data)
 
     def close(self) -> None:
         """Write what waits and the last line, and let go."""
@@ -214,6 +225,7 @@ class _Clients:
         self._clients: dict[socket.socket, Outbox[bytes]] = {}
         self.connected = self._missed = 0
         self._full = False
+        self._closed = threading.Event()
         self._thread = threading.Thread(target=self._accept, name=f"clients of {address.text}", daemon=True)
         self._thread.start()
 
@@ -226,8 +238,10 @@ class _Clients:
         while True:
             try:
                 client, _ = self._listening.accept()
-            except OSError:
-                return  # closed
+            except OSError:  # closed; or too many files are open, or the client has left already
+                if self._closed.wait(PAUSE):
+                    return
+                continue
             with self._lock:
                 if len(self._clients) >= MOST_CLIENTS:
                     client.close()
@@ -258,6 +272,7 @@ class _Clients:
 
     def close(self, dropped: int) -> None:
         """Send the last line to clients that take it within a second, and close the port."""
+        self._closed.set()
         with suppress(OSError):
             self._listening.shutdown(socket.SHUT_RDWR)  # wakes the thread that accepts
         self._listening.close()

@@ -231,6 +231,11 @@ class Outbox(Generic[Item]):
             self._waiting.append(item)
             self._changed.notify()
 
+    def count_dropped(self) -> None:
+        """Count an item that was taken and could not be sent."""
+        with self._changed:
+            self.dropped += 1
+
     def _run(self) -> None:
         try:
             if self._first is not None:
