@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
+from facediff.pipelines.animator import ExportedAnimator
 from facediff.pipelines.candidates import Candidate, Placement, perform
 from facediff.spaces import Space
 from facediff.spaces.arkit import ALPHABETICAL, ARKIT
 from facediff.spaces.files import ParameterClip, write_parameters
 from facediff.spaces.layouts import layout
-from facediff.synthetic.spoken_set import open_face, spoken_set
+from facediff.synthetic.spoken_set import SPEAKER, open_face, spoken_set
 
 
 def test_weights_move_the_face_as_its_shapes_say() -> None:
@@ -76,3 +77,27 @@ def test_motion_of_another_program_is_read_by_the_clips_names(tmp_path: Path) ->
     assert made.seconds is None
     own = Placement(open_face()).values(values, Space("arkit", ARKIT))
     assert np.abs(made.clips[clips[0].name].points - own.points).max() < 1e-5
+
+
+class Exported(ExportedAnimator):
+    """An exported model that was not trained on the face of the clips, and has it."""
+
+    identities = ["A"]  # noqa: RUF012 - in place of a property
+    other_identities = [SPEAKER]  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.asked: list[object] = []
+
+    def animate(self, *_: object, **options: object) -> Animation:  # type: ignore[override]
+        self.asked.append(options.get("identity"))
+        rig = open_face().rig
+        rest = np.asarray(rig.neutral, np.float32)
+        return Animation("a", rest[None], rest, 25, np.asarray(rig.faces, np.int32), "m")
+
+
+def test_an_exported_model_speaks_by_the_face_of_the_clips(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = Exported()
+    monkeypatch.setattr("facediff.pipelines.animator.load", lambda *_, **__: model)
+    made = perform(Candidate("exported", model="folder"), spoken_set(["en"], 1, 1), None)
+    assert not isinstance(made, str), made
+    assert {*model.asked} == {SPEAKER}
