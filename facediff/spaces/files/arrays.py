@@ -100,8 +100,10 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
         advice = f"layouts with its arrays: {', '.join(fitting)}" if fitting else "expected exp and pose, or the like"
         raise FaceDiffError(f"{path}: {stated}; give its layout; {advice}")
     entry = LAYOUTS[layout]
-    stated_rate = next((content[key] for key in RATES if key in content and content[key].size == 1), None)
-    rate = _rate(path, frame_rate, entry, None if stated_rate is None else float(stated_rate.reshape(-1)[0]))
+    stated_rate = next((content[key].item() for key in RATES if key in content and content[key].size == 1), None)
+    if stated_rate is not None:
+        check_number(path, "frame rate", stated_rate, *FRAME_RATES, text=True)
+    rate = _rate(path, frame_rate, entry, None if stated_rate is None else float(stated_rate))
     parts = []
     for key, columns in (entry.arrays or {}).items():
         array = _frames(path, key, content[key])
@@ -122,7 +124,12 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
         raise FaceDiffError(f"{path}: its arrays have {sorted(lengths)} frames; expected equally many")
     person = None
     if entry.identity_array in content:
-        shape = np.asarray(content[entry.identity_array], np.float64)
+        shape = content[entry.identity_array]
+        if shape.dtype.kind not in "fiu" or not shape.size:
+            raise FaceDiffError(
+                f"{path}: {entry.identity_array} holds {shape.dtype} {shape.shape}; expected numbers of a person"
+            )
+        shape = np.asarray(shape, np.float64)
         # A reconstruction has a shape for each frame, which is one person's all the same.
         rows = shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape
         person = checked(path, (rows if rows.ndim == 2 else rows.reshape(1, -1))[:1], rate)[0]
