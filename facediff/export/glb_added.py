@@ -55,6 +55,11 @@ def open_to_add(target: Path) -> tuple[Glb, GlbWriter]:
     glb = open_glb(target)
     for kind in ("buffers", "bufferViews", "accessors"):
         glb.entries(kind)  # refuses what is no list, to which the writer could not append
+    if not glb.entries("nodes"):
+        # Its meshes are shown all the same, and an animation moves nodes; the last root is placed first.
+        count = len(glb.entries("meshes"))
+        scene = {"nodes": [*reversed(range(count))]}
+        glb.content |= {"nodes": [{"mesh": mesh} for mesh in range(count)], "scenes": [scene], "scene": 0}
     return glb, GlbWriter(glb.content, glb.binary)
 
 

@@ -143,6 +143,25 @@ def test_an_animation_is_added_and_everything_else_stays(tmp_path: Path) -> None
     assert np.array_equal(read_mesh(tmp_path / "out.glb").vertices, mesh.vertices)
 
 
+def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
+    avatar(tmp_path / "avatar.glb")
+    glb = opened(tmp_path / "avatar.glb")
+    for key in ("nodes", "scenes", "scene", "skins", "animations"):
+        del glb.content[key]
+    (tmp_path / "bare.glb").write_bytes(pack(glb.content, glb.binary))
+    mesh = read_mesh(tmp_path / "bare.glb")
+    rest = mesh.vertices.astype(np.float32)
+    vertices = np.repeat(rest[None], 3, axis=0)
+    vertices[1:, len(rest) // 2 :, 1] += 1.0
+    add_to_glb(tmp_path / "out.glb", tmp_path / "bare.glb", Animation("a", vertices, rest, 25.0, mesh.faces), 0.001)
+    assert np.array_equal(read_mesh(tmp_path / "out.glb").vertices, mesh.vertices)
+    new = opened(tmp_path / "out.glb")
+    (animation,) = new.content["animations"]
+    (channel,) = animation["channels"]
+    assert new.content["nodes"][channel["target"]["node"]] == {"mesh": 1}
+    assert new.content["scenes"][new.content["scene"]]["nodes"] == [1, 0]
+
+
 def test_another_file_is_refused(tmp_path: Path) -> None:
     avatar(tmp_path / "avatar.glb")
     points, faces = relief(5, 5)
