@@ -68,9 +68,12 @@ def read_scores(path: Path) -> list[dict[str, str]]:
     rows = list(read_rows(path, remedy=remedy))
     if not rows or not {"split", "method", "protocol", "frames"} <= rows[0].keys():
         raise FaceDiffError(f"{path}: is no table of test scores; {remedy}")
-    for row in rows:
+    for number, row in enumerate(rows, start=2):
+        if not all(row[column].strip() for column in ("split", "method", "protocol", "frames")):
+            raise FaceDiffError(f"{path}: row {number} has too few cells; {remedy}")
         for column in scored(rows):
-            if not re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?|nan|", row[column].strip(), re.IGNORECASE):
+            row[column] = row[column].strip()
+            if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?|nan|", row[column], re.IGNORECASE):
                 raise FaceDiffError(f"{path}: its {column} is {quoted(row[column])}; expected a number. {remedy}")
     return rows
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from facediff.cli.app import main
+from facediff.errors import FaceDiffError
+from facediff.models.model_card import read_scores
 from facediff.utils.arrays import read_arrays
 
 SCORES = (
@@ -86,6 +88,16 @@ def test_scores_next_to_the_checkpoint_are_on_the_card_unless_older(
     assert main(["publish", str(own), str(tmp_path / "two")]) == 0
     assert "0.125" not in (tmp_path / "two" / "README.md").read_text()
     assert "test_scores.csv" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [("0.25", ".", "its lve is '.'"), ("0.25", "1.2.5", "its lve is '1.2.5'"), (",paper,33,2\n", "\n", "row 2")],
+)
+def test_a_damaged_table_of_scores_is_refused(tmp_path: Path, old: str, new: str, named: str) -> None:
+    (tmp_path / "scores.csv").write_text(SCORES.replace(old, new))
+    with pytest.raises(FaceDiffError, match=named):
+        read_scores(tmp_path / "scores.csv")
 
 
 @pytest.mark.parametrize(
