@@ -112,7 +112,9 @@ def export_model(
         description = describe(model, graphs, precision, sizes, described, named, whose)
         write_json(staged / DESCRIPTION, description.content())
         read_folder(staged)  # what is written must be what is read
-        checked = replace(description, check=compare(model, staged, speech if speech is not None else trial_speech()))
+        checked = replace(
+            description, check=compare(model, staged, trial_speech() if speech is None else speech, styles)
+        )
         share = checked.check["share_of_range"]
         if precision == "float32" and not share <= TOLERANCE:
             raise FaceDiffError(
@@ -410,7 +412,12 @@ def clock_facts(clock: FrameClock) -> dict[str, Any]:
     return facts | ({"rows": clock.rows} if clock.rule == "rows" else {})
 
 
-def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]) -> dict[str, Any]:
+def compare(
+    model: AnimationModel,
+    folder: Path,
+    speech: npt.NDArray[np.float32],
+    further: Mapping[str, Style] | None = None,
+) -> dict[str, Any]:
     """The folder against the model on some speech: largest difference of a number, alone and by the range."""
     import torch
 
@@ -422,7 +429,7 @@ def compare(model: AnimationModel, folder: Path, speech: npt.NDArray[np.float32]
     style, chosen = None, None
     if about.style_source == "reference":
         style = face if face in about.styles else about.styles[0]
-        chosen = model.default_style(style)
+        chosen = (further or {}).get(style) or model.default_style(style)
     heard = torch.from_numpy(speech).to(model.device)
     wanted = model.animate(heard, identity=face, style=chosen, seed=3).vertices.numpy()
     stream = runtime.stream(identity=face, style=style, seed=3)

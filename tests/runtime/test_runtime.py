@@ -12,6 +12,7 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -28,9 +29,10 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
 from facediff.models.inference import ClipNoise as ModelNoise
+from facediff.models.inference import Style
 from facediff.models.inference import WindowNoise as ModelWindowNoise
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
-from facediff.pipelines.export_model import Precision, export_model, store_weights
+from facediff.pipelines.export_model import Precision, compare, export_model, store_weights
 from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel
 from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
@@ -320,6 +322,18 @@ def test_hubert_is_exported_too(tiny_root: Path, tmp_path: Path, hubert_source: 
     description = export_model(made, tmp_path / "out")
     assert description.check["share_of_range"] < 1e-4
     assert description.equal_lengths
+
+
+def test_a_folder_with_further_styles_alone_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still, own, used = np.zeros((2, 3, 3), np.float32), Style("happy", torch.zeros(2)), []
+    model, runtime = MagicMock(device=CPU), MagicMock()
+    model.default_style.side_effect = FaceDiffError("no reference motion")
+    model.animate.side_effect = lambda *_, style, **__: used.append(style) or Mock(vertices=torch.zeros(2, 3, 3))
+    runtime.description = Mock(faces=["A"], styles=["happy"], style_source="reference")
+    runtime.motion.return_value = runtime.stream.return_value.conditions.template = still
+    monkeypatch.setattr(RuntimeModel, "open", lambda _: runtime)
+    assert compare(model, tmp_path, np.zeros(16_000, np.float32), {"happy": own})["largest_difference"] == 0
+    assert used == [own]
 
 
 @pytest.mark.slow
