@@ -95,8 +95,8 @@ def point_style(number: int) -> dict[str, Any]:
 
 
 def plain(text: str) -> str:
-    """Text in which matplotlib sees no formula."""
-    return text.replace("$", r"\$")
+    """Text in which matplotlib sees no formula, nor a name that legends leave out: one that begins with "_"."""
+    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def plot_svg(draw: Callable[[Axes], None], label: str, *, width: float = 4.8, height: float = 3.4) -> str:

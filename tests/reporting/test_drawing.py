@@ -6,8 +6,9 @@ import re
 from xml.etree import ElementTree
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from facediff.reporting.drawing import LINES, MARKERS, plot_svg, point_style
+from facediff.reporting.drawing import LINES, MARKERS, plain, plot_svg, point_style
 
 
 def draw(axes: Axes) -> None:
@@ -23,6 +24,12 @@ def test_a_plot_is_one_element_that_loads_nothing() -> None:
     assert "a_$x$ & <script> 字" in [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
     assert "metadata" not in element
     assert set(re.findall(r'(?:href|src)="([^"]?)', element)) <= {"#"}
+
+
+def test_a_name_that_begins_with_an_underscore_is_in_the_legend() -> None:
+    axes = Figure().add_subplot()
+    axes.plot([0, 1], [1, 2], label=plain("_$old"))
+    assert [label.strip() for label in axes.get_legend_handles_labels()[1]] == [r"_\$old"]
 
 
 def test_thirty_rows_look_different() -> None:
