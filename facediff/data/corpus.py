@@ -272,6 +272,11 @@ class Corpus:
         images = kept[clip.identity]
         return torch.from_numpy(opened.checked(self._all_frames(clip))) @ images[1:] + images[0]
 
+    @property
+    def stride(self) -> int:
+        """How many stored frames of the corpus's own folder there are for each that is read."""
+        return self._strides[self.root]
+
     def _all_frames(self, clip: Clip) -> range:
         """The stored frames of a clip that are read of it as a whole."""
         stride = self._strides[clip.root]

@@ -156,6 +156,12 @@ def closures_of(data: SpeechMotionDataModule, clip: str) -> list[tuple[int, int]
     return [] if file is None else closures(read_phonemes(file), data.frame_rate)
 
 
+def _at_its_side(folder: str, batch: Batch, data: SpeechMotionDataModule) -> list[Tensor]:
+    """What a conversation's folder holds of each clip, of the frames that are read of the motion."""
+    stored = (conversation_file(data.root, folder, clip) for clip in batch.names)
+    return [torch.from_numpy(array[:: data.corpus.stride].copy()) for array in stored]
+
+
 class Evaluation:
     """Metrics of one protocol, and ``metrics`` chosen by name with their options, for every split and method.
 
@@ -543,11 +549,9 @@ class Evaluation:
         if "closures" in self.needs and self._data is not None:
             inputs["closures"] = [closures_of(self._data, clip) for clip in batch.names]
         if self._data is not None and "partner" in self.needs:
-            partners = [conversation_file(self._data.root, "partner", clip) for clip in batch.names]
-            inputs["partner"] = pad([torch.from_numpy(partner) for partner in partners])[..., None].to(motion.device)
+            inputs["partner"] = pad(_at_its_side("partner", batch, self._data))[..., None].to(motion.device)
         if self._data is not None and "speaking" in self.needs:
-            masks = (conversation_file(self._data.root, "speaking", clip) for clip in batch.names)
-            inputs["speaking"] = [torch.from_numpy(mask) for mask in masks]
+            inputs["speaking"] = _at_its_side("speaking", batch, self._data)
         return inputs
 
     def sequences(self) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -42,11 +43,16 @@ def test_every_metric_of_channels_with_a_partner_and_a_mask(
     data = channels
     for folder in ("partner", "speaking"):
         (data.root / folder).mkdir()
+    # Everything is stored at twice the frame rate; every second frame is read.
+    manifest = data.root / "manifest.json"
+    content = json.loads(manifest.read_text()) if manifest.is_file() else {}
+    manifest.write_text(json.dumps({**content, "frame_rate": 2 * data.frame_rate}))
     truths = {}
     for path in (data.root / "values_npy").glob("*.npy"):
         truths[path.stem] = np.load(path)
-        np.save(data.root / "partner" / path.name, truths[path.stem][::-1].copy())
-        np.save(data.root / "speaking" / path.name, np.arange(len(truths[path.stem])) % 2 == 0)
+        np.save(path, np.repeat(truths[path.stem], 2, axis=0))
+        np.save(data.root / "partner" / path.name, np.repeat(truths[path.stem][::-1], 2, axis=0))
+        np.save(data.root / "speaking" / path.name, np.repeat(np.arange(len(truths[path.stem])) % 2 == 0, 2))
     jaw, l_jaw = (f"{prefix}channel_dynamics_deviation:region=jaw" for prefix in ("", "l_"))
     scores = reported(make_trainer(), model(make_model, protocol="dualtalk", metrics=[jaw, l_jaw]), data)
     for name in ("fd", "p_fd", "sid", "rpcc", "sts", "var", "div"):
