@@ -171,7 +171,7 @@ class SyncScores(RenderMetric):
             raise FaceDiffError(f"{self.video.path}: reads speech, and the truth has no wav/ next to it")
         places = np.rint(np.arange(int(len(frames) / frame_rate * 25 + 1e-6)) * frame_rate / 25).astype(int)
         pictures = frames[places.clip(0, len(frames) - 1)][..., :: -1 if self.order == "bgr" else 1]
-        count = min(len(pictures) - 4, int((len(speech) / SAMPLE_RATE - 0.2) * 25) + 1)
+        count = min(len(pictures) - 4, (len(speech) - SAMPLE_RATE // 5) // (SAMPLE_RATE // 25) + 1)
         if count < 2 * self.reach:
             raise FaceDiffError(f"a clip of {len(frames)} frames is too short for offsets of {self.reach} frames")
         windows = np.stack([pictures[start : start + 5] for start in range(count)]) / np.float32(255)
@@ -313,7 +313,7 @@ class RenderScorer:
                 renderer = Renderer(self.faces, template=template, size=metric.size, camera=camera)
                 drawn[key] = np.stack([renderer.render(frame) for frame in vertices])
             speech = self.speech(clip)
-            speech = speech[: int(len(vertices) / self.frame_rate * SAMPLE_RATE)]
+            speech = speech[: int(len(vertices) / self.frame_rate * SAMPLE_RATE + 1e-6)]
             try:
                 found = metric.score(drawn[key], speech, self.frame_rate)
             except FaceDiffError as error:

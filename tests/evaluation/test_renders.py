@@ -117,6 +117,21 @@ def test_sync_finds_the_offset_and_follows_the_formula(tmp_path: Path) -> None:
         metric.score(frames, speech[:0], 25.0)
 
 
+def test_the_last_window_of_the_sound_is_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video, audio = write_encoders(tmp_path)
+    metric = SyncScores(video=str(video), audio=str(audio), reach=5)
+    seen = []
+    embeddings = SyncScores._embeddings
+
+    def counted(self: SyncScores, graph: object, which: int, windows: np.ndarray) -> np.ndarray:
+        seen.append(len(windows))
+        return embeddings(self, graph, which, windows)
+
+    monkeypatch.setattr(SyncScores, "_embeddings", counted)
+    metric.score(np.zeros((30, 16, 16, 3), np.uint8), np.ones(15 * 640, np.float32), 25.0)
+    assert seen == [11, 11]
+
+
 def test_encoders_may_take_a_fixed_number_of_windows(tmp_path: Path) -> None:
     random = np.random.default_rng(2)
     frames = random.integers(0, 255, (40, 16, 16, 3)).astype(np.uint8)
