@@ -10,7 +10,7 @@ from facediff.benchmark.results import Result
 from facediff.benchmark.tables import BenchmarkReport, Table
 from facediff.errors import printable
 from facediff.reporting.documents import Drawing
-from facediff.reporting.drawing import GREY, line_style, plot_svg, point_style
+from facediff.reporting.drawing import GREY, line_style, listed, plot_svg, point_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,7 @@ def curves_plot(table: Table, report: BenchmarkReport, over: str) -> Drawing | N
 
     def draw(axes: Axes) -> None:
         for number, (label, points) in enumerate(lines.items()):
-            axes.plot(*zip(*points, strict=True), label=label, marker="o", markersize=3, **line_style(number))
+            axes.plot(*zip(*points, strict=True), label=listed(label), marker="o", markersize=3, **line_style(number))
         axes.set_xlabel(title)
         axes.locator_params(axis="x", nbins=6, integer=over == "step")
         axes.set_ylabel("LVE of validation")
@@ -98,7 +98,7 @@ def scatter_plot(table: Table) -> Drawing | None:
         ends = (min(values) - room, max(values) + room)
         axes.plot(ends, ends, color=GREY, linestyle=":", linewidth=0.8)
         for number, (label, points) in enumerate(clouds.items(), 1):
-            axes.plot(*zip(*points, strict=True), label=label, linestyle="", **point_style(number))
+            axes.plot(*zip(*points, strict=True), label=listed(label), linestyle="", **point_style(number))
         axes.set(xlim=ends, ylim=ends, ylabel=f"{column} of the row")
         axes.set_xlabel(f"{column} of {printable(baseline.label)[:40]}".replace("$", r"\$"))
 
@@ -121,7 +121,7 @@ def speed_plot(table: Table) -> Drawing | None:
     def draw(axes: Axes) -> None:
         for number, row in enumerate(rows):
             point = ([row.cost.factor or 0.0], [row.scores[column].mean])
-            axes.plot(*point, label=printable(row.label), linestyle="", **point_style(number))
+            axes.plot(*point, label=listed(printable(row.label)), linestyle="", **point_style(number))
         axes.set(xscale="log", xlabel="real-time factor", ylabel=column)
         axes.margins(0.08)
         for formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):

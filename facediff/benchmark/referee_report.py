@@ -24,7 +24,7 @@ from facediff.reporting.documents import (
     terminal_text,
     write_texts,
 )
-from facediff.reporting.drawing import has_matplotlib, line_style, plot_svg
+from facediff.reporting.drawing import has_matplotlib, line_style, listed, plot_svg
 from facediff.synthetic.spoken_set import LANGUAGES, SpokenClip
 from facediff.utils.plain_files import write_json, write_rows
 
@@ -194,7 +194,8 @@ def openings(report: RefereeReport) -> Drawing | None:
         for number, row in enumerate([report.reference, *rows]):
             if row.openings is not None:
                 style = {"color": "black", "linewidth": 0.9} if number == 0 else line_style(number - 1)
-                axes.plot(np.arange(len(row.openings)) / row.frame_rate, 1000 * row.openings, label=row.name, **style)
+                times = np.arange(len(row.openings)) / row.frame_rate
+                axes.plot(times, 1000 * row.openings, label=listed(row.name), **style)
         axes.set_xlabel("s")
         axes.set_ylabel("opening of the lips, mm")
 

@@ -94,9 +94,14 @@ def point_style(number: int) -> dict[str, Any]:
     return {"color": LINES[number % len(LINES)][0], "marker": shape, "markersize": 3.5, "alpha": 0.8}
 
 
+def listed(text: str) -> str:
+    """A label that legends have, although matplotlib leaves out those that begin with "_"."""
+    return f" {text}" if text.startswith("_") else text
+
+
 def plain(text: str) -> str:
     """Text in which matplotlib sees no formula, nor a name that legends leave out: one that begins with "_"."""
-    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
+    return listed(text).replace("$", r"\$")
 
 
 def plot_svg(draw: Callable[[Axes], None], label: str, *, width: float = 4.8, height: float = 3.4) -> str:

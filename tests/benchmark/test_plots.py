@@ -41,3 +41,11 @@ def test_labels_are_text(label: str) -> None:
     drawing = speed_plot(table)
     assert drawing is not None
     assert label.replace("<", "&lt;").replace(">", "&gt;") + "1" in drawing.svg
+
+
+def test_labels_that_begin_with_an_underscore_are_in_the_legends() -> None:
+    named = replace(outline(), rows={name: (f"_{name}", "") for name in outline().rows})
+    report = report_of(named, results(), resamples=0)
+    (table,) = report.tables
+    for drawing in plots_of(table, report).values():
+        assert f" _{table.rows[1].name}<" in drawing.svg
