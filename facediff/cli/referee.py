@@ -13,6 +13,7 @@ from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices
 from facediff.utils import ranges
 from facediff.utils.hub import BUNDLED, check_animating_source, model_or_bundled
+from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -156,11 +157,9 @@ def read_models(path: Path) -> list[Candidate]:
     expected = "expected models: with a name and a path each"
     top = Section(load_yaml(path, expected), str(path), ("models",))
     candidates = []
-    content = top.content.get("models") or {}
+    content = Section(top.content.get("models") or {}, f"{path}: models", None).content
     whole = {"models": {name: {"model": value} if isinstance(value, str) else value for name, value in content.items()}}
-    for name, section in (
-        Section(whole if isinstance(content, dict) else {}, str(path), None).sections("models", KEYS).items()
-    ):
+    for name, section in Section(whole, str(path), None).sections("models", KEYS).items():
         fields = {key: section.optional(key) for key in KEYS if key != "frame_rate"}
         if (fields["model"] is None) == (fields["motion"] is None):
             raise FaceDiffError(f"{section.place}: expected either a model or a folder of motion")
@@ -169,7 +168,9 @@ def read_models(path: Path) -> list[Candidate]:
             raise FaceDiffError(f"{section.place}: commercial_use: {choices(commercial, COMMERCIAL)}")
         if fields["model"] is not None:
             check_animating_source(fields["model"])
-        rate = section.number("frame_rate", None, 1000)
+        rate, rates = section.content.get("frame_rate"), ranges.Range(*FRAME_RATES)
+        if rate is not None and rate not in rates:
+            raise FaceDiffError(f"{section.place}: frame_rate is {quoted(rate)}; expected a number {rates}")
         candidates.append(
             Candidate(
                 name,

@@ -44,17 +44,21 @@ def test_a_plan_names_models_and_motion(tmp_path: Path) -> None:
     plan = tmp_path / "models.yaml"
     plan.write_text(
         f"models:\n  first: {tmp_path / 'a.ckpt'}\n  second: {{motion: {tmp_path / 'motion'}, layout: arkit, "
-        f"frame_rate: 30, licence: theirs, commercial_use: forbidden}}\n"
+        f"frame_rate: 29.97, licence: theirs, commercial_use: forbidden}}\n"
     )
     first, second = read_models(plan)
     assert first.model == str(tmp_path / "a.ckpt")
-    assert second.frame_rate == 30.0
+    assert second.frame_rate == 29.97
     assert second.commercial_use == "forbidden"
     assert second.motion == tmp_path / "motion"
     assert [candidate.name for candidate in candidates_of([str(plan)], [], None, None)] == ["first", "second"]
     assert candidates_of(["puppet"], [], None, None) == candidates_of([], [], None, None)
     with pytest.raises(FaceDiffError, match="first"):
         candidates_of([str(plan), f"first={tmp_path / 'a.ckpt'}"], [], None, None)
+    for wrong in ("models: [a.ckpt, b.ckpt]\n", f"models: {{one: {{motion: {tmp_path}, frame_rate: 0}}}}\n"):
+        plan.write_text(wrong)
+        with pytest.raises(FaceDiffError, match="models.*; expected"):
+            read_models(plan)
     plan.write_text("models: {one: {layout: arkit}}\n")
     with pytest.raises(FaceDiffError, match="models: one"):
         read_models(plan)
