@@ -51,15 +51,15 @@ class RecordingFolder(ChannelFolder):
     @cached_property
     def files(self) -> dict[str, tuple[Path, Path]]:
         """The files with values and speech of each recording, by name, sorted."""
-        sounds = {path.stem: path for path in (self.root / "wav").glob("*.wav")}
+        sounds = {path.stem: path for path in (self.root / "wav").glob("*") if path.suffix.lower() == ".wav"}
         files: dict[str, tuple[Path, Path]] = {}
         for number, path in enumerate(sorted(self.root.rglob("*"))):
             LIMITS.check("entries", number, self.root)
             if path.suffix.lower() not in self.suffixes or path.name.startswith(".") or not path.is_file():
                 continue
-            sound = path.with_suffix(".wav")
-            sound = sound if sound.is_file() else sounds.get(path.stem, sound)
-            if not sound.is_file():
+            beside = (path.with_suffix(suffix) for suffix in (".wav", ".WAV"))
+            sound = next((sound for sound in beside if sound.is_file()), sounds.get(path.stem))
+            if sound is None or not sound.is_file():
                 continue
             if not path.stem.isprintable():
                 raise FaceDiffError(

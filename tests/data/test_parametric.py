@@ -87,6 +87,14 @@ def test_hidden_files_are_no_recordings(tmp_path: Path) -> None:
     assert names[-1] == "2_scott_0_2_2"
 
 
+def test_sounds_may_have_a_suffix_in_capitals(tmp_path: Path) -> None:
+    write_beat(tmp_path)
+    (tmp_path / "2" / "2_scott_0_1_1.wav").rename(tmp_path / "2" / "2_scott_0_1_1.WAV")
+    (tmp_path / "wav").mkdir()
+    (tmp_path / "2" / "2_scott_0_2_2.wav").rename(tmp_path / "wav" / "2_scott_0_2_2.Wav")
+    assert len(RecordingFolder(tmp_path, layout("arkit_51"), 30.0).names()) == 6
+
+
 def test_flame_clips_need_a_layout_and_keep_the_version(tmp_path: Path) -> None:
     root = write_flame(tmp_path / "flame")
     data = FlameClips(root=str(root), layout="flame_diffposetalk", version="2020")
