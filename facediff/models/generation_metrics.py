@@ -500,6 +500,8 @@ def means_of(content: object, source: object) -> dict[str, dict[str, float | Non
     try:
         if not isinstance(content, dict) or content["format"] != FORMAT:
             raise TypeError
+        if not content["metrics"]:
+            raise ValueError
         for row in content["metrics"]:
             mean = row["mean"]
             means.setdefault(str(row["split"]), {})[str(row["metric"])] = None if mean is None else float(mean)

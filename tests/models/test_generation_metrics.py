@@ -211,6 +211,8 @@ def test_several_checkpoints_have_means_and_deviations_and_others_ratios(tiny: T
     assert means_of(stored, "f")["test_b"]["liveliness_lips"] == pytest.approx(0.65)
     with pytest.raises(FaceDiffError, match="f:"):
         means_of({"format": "other"}, "f")
+    with pytest.raises(FaceDiffError, match="f: holds no generation metrics"):
+        means_of({**stored, "metrics": []}, "f")
     rows = {row["metric"]: row for row in scores.rows()}
     assert rows.keys() == GENERATION_METRICS.keys()
     assert rows["liveliness_lips"]["value_2"] == pytest.approx(0.8)
