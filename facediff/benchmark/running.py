@@ -211,9 +211,15 @@ class Runner:
             write_json(place / STATE, {"done": True, **took})
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
-        best = place / BEST
-        checkpoint = best if self.setting.weights == "best" and best.is_file() else last
+        checkpoint = place / BEST if self.setting.weights == "best" else last
+        if not checkpoint.is_file() and training != cell.trainings[-1]:  # only what is scored has to have a best one
+            checkpoint = last
         if not checkpoint.is_file():
+            if last.is_file():
+                raise FaceDiffError(
+                    f"{cell}: {training.config} wrote no {BEST.name}; let it validate, with a ModelCheckpoint that has "
+                    f"filename=best, or write weights: last into the plan"
+                )
             raise FaceDiffError(f"{checkpoint}: was not written; expected a checkpoint, look at the log {self._log}")
         return checkpoint
 

@@ -15,8 +15,20 @@ import pytest
 from facediff.benchmark import Cell, cells_of, read_plan, read_result, report_of
 from facediff.benchmark.outline import outline_of, read_results
 from facediff.benchmark.results import cell_file
-from facediff.benchmark.running import Setting, estimate, fit_options, pending, remember, run_cells
+from facediff.benchmark.running import (
+    BEST,
+    LAST,
+    STATE,
+    Runner,
+    Setting,
+    estimate,
+    fit_options,
+    pending,
+    remember,
+    run_cells,
+)
 from facediff.benchmark.writing import document
+from facediff.errors import FaceDiffError
 from facediff.reporting.documents import markdown
 from tests.fakes.waiting import wait_until
 
@@ -220,3 +232,19 @@ def test_options_take_the_place_of_the_checkpoints_before_them(folder: Path) -> 
     options = fit_options(cell.trainings[-1], {"prior": Path("p.ckpt")}, cell)
     assert options["model.prior"] == "p.ckpt"
     assert options["seed_everything"] == cell.seed
+
+
+def test_the_best_weights_are_not_replaced_by_the_last(folder: Path) -> None:
+    cell = next(cell for cell in cells_of(read_plan(folder / "plan.yaml")) if cell.row == "two")
+    runner = Runner(setting(folder, weights="best"), folder / "out", cell)
+    for training in cell.trainings:
+        place = folder / "out" / training.name
+        (place / LAST).parent.mkdir(parents=True)
+        (place / LAST).touch()
+        (place / STATE).write_text('{"done": true}')
+    prior, scored = cell.trainings
+    assert runner.fit(prior, {}, cell) == folder / "out" / prior.name / LAST  # which may have no score
+    with pytest.raises(FaceDiffError, match=r"two.yaml wrote no best.ckpt.*weights: last"):
+        runner.fit(scored, {}, cell)
+    (folder / "out" / scored.name / BEST).touch()
+    assert runner.fit(scored, {}, cell).name == "best.ckpt"
