@@ -41,17 +41,17 @@ def main_column(table: Table) -> str:
 
 def curves_plot(table: Table, report: BenchmarkReport, over: str) -> Drawing | None:
     """LVE of validation over the steps of training, or over its time, mean over the runs; None where nothing is."""
-    lines: dict[str, Points] = {}
+    lines: list[tuple[str, Points]] = []  # several rows may have one label
     for row in table.rows:
         runs = [result for result in report.results if (result.row, result.corpus) == (row.name, table.corpus)]
         if not row.reference and (points := mean_curve(runs, over)):
-            lines[printable(row.label)] = points
-    if not any(len(points) > 1 for points in lines.values()):
+            lines.append((printable(row.label), points))
+    if not any(len(points) > 1 for _, points in lines):
         return None
     title = "optimiser steps" if over == "step" else "seconds of training"
 
     def draw(axes: Axes) -> None:
-        for number, (label, points) in enumerate(lines.items()):
+        for number, (label, points) in enumerate(lines):
             axes.plot(*zip(*points, strict=True), label=listed(label), marker="o", markersize=3, **line_style(number))
         axes.set_xlabel(title)
         axes.locator_params(axis="x", nbins=6, integer=over == "step")
@@ -83,13 +83,13 @@ def scatter_plot(table: Table) -> Drawing | None:
     if base is None or base.values is None:
         return None
     own = dict(zip(base.clips, np.nanmean(base.values, 0).tolist(), strict=True))
-    clouds: dict[str, Points] = {}
+    clouds: list[tuple[str, Points]] = []
     for row in table.rows:
         scores = row.scores.get(column)
         if row.name != table.baseline and not row.reference and scores is not None and scores.values is not None:
             means = zip(scores.clips, np.nanmean(scores.values, 0).tolist(), strict=True)
-            clouds[printable(row.label)] = [(own[clip], value) for clip, value in means if clip in own]
-    values = [value for points in clouds.values() for point in points for value in point]
+            clouds.append((printable(row.label), [(own[clip], value) for clip, value in means if clip in own]))
+    values = [value for _, points in clouds for point in points for value in point]
     if not values:
         return None
 
@@ -97,7 +97,7 @@ def scatter_plot(table: Table) -> Drawing | None:
         room = 0.06 * (max(values) - min(values)) or abs(max(values)) * 0.1 or 1.0
         ends = (min(values) - room, max(values) + room)
         axes.plot(ends, ends, color=GREY, linestyle=":", linewidth=0.8)
-        for number, (label, points) in enumerate(clouds.items(), 1):
+        for number, (label, points) in enumerate(clouds, 1):
             axes.plot(*zip(*points, strict=True), label=listed(label), linestyle="", **point_style(number))
         axes.set(xlim=ends, ylim=ends, ylabel=f"{column} of the row")
         axes.set_xlabel(f"{column} of {printable(baseline.label)[:40]}".replace("$", r"\$"))

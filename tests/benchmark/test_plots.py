@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from facediff.benchmark import report_of
-from facediff.benchmark.plots import mean_curve, plots_of, scatter_plot, speed_plot
+from facediff.benchmark.plots import curves_plot, mean_curve, plots_of, scatter_plot, speed_plot
 from tests.fakes.benchmark import outline, results
 
 
@@ -43,9 +43,9 @@ def test_labels_are_text(label: str) -> None:
     assert label.replace("<", "&lt;").replace(">", "&gt;") + "1" in drawing.svg
 
 
-def test_labels_that_begin_with_an_underscore_are_in_the_legends() -> None:
-    named = replace(outline(), rows={name: (f"_{name}", "") for name in outline().rows})
+def test_rows_of_one_label_are_all_drawn_and_named_also_with_an_underscore() -> None:
+    named = replace(outline(), rows={name: ("_same", "") for name in outline().rows})
     report = report_of(named, results(), resamples=0)
     (table,) = report.tables
-    for drawing in plots_of(table, report).values():
-        assert f" _{table.rows[1].name}<" in drawing.svg
+    drawings = [curves_plot(table, report, "step"), scatter_plot(table), speed_plot(table)]
+    assert [drawing and drawing.svg.count("> _same<") for drawing in drawings] == [3, 2, 3]
