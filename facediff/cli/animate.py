@@ -177,6 +177,6 @@ def animate(
         if options.own_shapes:
             avatar = own_shapes(mesh)
             tell(avatar.summary, *avatar.left_out(animation))
-        elif output.suffix in (".glb", ".fbx"):
+        elif output.suffix.lower() in (".glb", ".fbx"):
             tell(*unused_shapes(mesh))
     return 0

@@ -71,7 +71,8 @@ def export(
         inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
         counted = f"{len(inside)} files, " if written.is_dir() else ""
         tell(f"{written}: {counted}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
-    tell(FORMATS[output.suffix].next_step)
+    if output.suffix in FORMATS:  # .fbx is made by another program
+        tell(FORMATS[output.suffix].next_step)
 
 
 def _may_have_weights(path: Path, lent: bool) -> bool:

@@ -74,7 +74,9 @@ def retarget(
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
-    both_glb = output.suffix in (".glb", ".fbx") and target_mesh.suffix.lower() == ".glb" and output != target_mesh
+    both_glb = (
+        output.suffix.lower() in (".glb", ".fbx") and target_mesh.suffix.lower() == ".glb" and output != target_mesh
+    )
     for option, chosen in (("--add-to-mesh", add_to_mesh), ("--own-shapes", own_shapes)):
         if chosen and not both_glb:
             raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
@@ -105,7 +107,7 @@ def retarget(
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    dressed = add_to_mesh or (not bare_face and output.suffix in (".glb", ".fbx") and wears_more(target_mesh))
+    dressed = add_to_mesh or (not bare_face and output.suffix.lower() in (".glb", ".fbx") and wears_more(target_mesh))
     if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
     avatar = own_shapes_of(target_mesh) if own_shapes else None
@@ -223,7 +225,7 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
     from facediff.mesh.glb import open_glb
     from facediff.mesh.obj_surface import has_uvs, read_surface
 
-    if mesh.suffix.lower() == ".glb" and output.suffix not in (".glb", ".fbx", ".npy"):
+    if mesh.suffix.lower() == ".glb" and output.suffix.lower() not in (".glb", ".fbx", ".npy"):
         glb = open_glb(mesh)
         if not glb.entries("materials"):
             return []
@@ -232,7 +234,7 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
         return [f"of {mesh.name}, {shown}{lost} are left out; write .glb to keep them"]
     if not has_uvs(mesh):
         return []
-    if output.suffix == ".fbx" or "surface" in FORMATS[output.suffix].uses:
+    if output.suffix.lower() == ".fbx" or "surface" in FORMATS[output.suffix].uses:
         return list(read_surface(mesh, len(made.triangles)).lost)
     return [
         f"{output.suffix} has no texture coordinates: those of {mesh.name} are left out; write .obj, .glb "

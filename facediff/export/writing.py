@@ -210,9 +210,9 @@ def check_used(suffix: str, option_names: Collection[str]) -> None:
         suffix: of the file.
         option_names: names of the options that were given, as ``facediff export`` calls them.
     """
-    if suffix not in FORMATS:
+    form = FORMATS.get(".glb" if suffix.lower() == ".fbx" else suffix)  # .fbx is made of a .glb
+    if form is None:
         return
-    form = FORMATS[suffix]
     for name in OPTIONS:
         if name in option_names and name not in form.uses:
             users = [other for other, other_form in FORMATS.items() if name in other_form.uses]

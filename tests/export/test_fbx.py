@@ -14,6 +14,7 @@ import pytest
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
+from facediff.cli.retarget import surface_notes
 from facediff.errors import FaceDiffError
 from facediff.export import fbx, write_animations
 from facediff.mesh import read_mesh
@@ -78,6 +79,21 @@ def test_several_samples_and_a_failure(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="cannot import"):
         write_animations(tmp_path / "fails.fbx", [clicks()])
     assert not (tmp_path / "fails.fbx").exists()
+
+
+@pytest.mark.usefixtures("blender")
+@pytest.mark.parametrize("name", ["a.fbx", "a.FBX"])
+def test_the_command_ends_and_refuses_what_has_no_effect(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_archive(tmp_path / "a.npz", clicks())
+    words = ["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / name)]
+    assert main([*words, "--size", "100"]) == 2
+    assert "--size" in capsys.readouterr().err
+    assert main(words) == 0
+    assert f"{tmp_path / name}: " in capsys.readouterr().out
+    (tmp_path / "target.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n" + "f 1/1 2/1 3/1\n" * 6)
+    assert surface_notes(tmp_path / "target.obj", tmp_path / name, clicks()) == []
 
 
 def test_without_blender_the_script_is_named(
