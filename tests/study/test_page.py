@@ -145,7 +145,19 @@ def test_answers_wait_while_the_server_is_away(made: Path, serve: Serve, browser
     page.evaluate("window.fetch = window.natural")
     page.wait_for("facediffStudy.state.sent === 1")
     page.wait_for("document.getElementById('status').hidden")
+    # What is refused for good keeps nothing back, and stays in the browser.
+    refusing = "window.fetch = () => (window.fetch = window.natural, Promise.resolve(new Response('', {status: 400})))"
+    page.evaluate(f"{refusing}, null")
+    answer(page)
+    answer(page)
+    page.wait_for("facediffStudy.state.sent === 3")
     stays_clean(page)
+    finish(page)
+    page.wait_for("document.getElementById('thanks-more').textContent.startsWith('Please download')")
+    assert not page.evaluate("document.getElementById('download').hidden || facediffStudy.state.closed")
+    (rater,) = AnswerStore(made / DATABASE, read_study(made)).raters()
+    assert len(rater.answers) == 2
+    assert page.evaluate("facediffStudy.problems") == []
     page.close()
 
 
@@ -210,6 +222,12 @@ def test_wide_and_narrow_windows_have_room_contrast_and_large_targets(
         )
         assert min(targets) >= 43.5
     assert page.evaluate("[...document.querySelectorAll('input')].every((e) => e.labels.length)")
+    # A question whose name every object has is not answered by that.
+    page.evaluate(
+        "facediffStudy.current.seen = true, facediffStudy.study.questions[0].name = 'constructor', "
+        "document.getElementById('language').onchange(), null"
+    )
+    assert page.evaluate("document.getElementById('choices').firstChild.classList.contains('now')")
     page.close()
 
 

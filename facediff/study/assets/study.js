@@ -62,7 +62,7 @@ async function post(path, content) {
   });
   if (!answer.ok) {
     const error = new Error(`${path}: ${answer.status}`);
-    error.refused = answer.status < 500 && answer.status !== 429;
+    error.refused = [400, 409, 413].includes(answer.status); // whatever is sent again will be too
     throw error;
   }
   return answer.json();
@@ -83,13 +83,20 @@ async function send() {
   const state = load();
   try {
     while (state.sent < state.trials.length) {
-      await post("api/answers", { study: study.id, rater: state.rater, ...state.trials[state.sent] });
+      await post("api/answers", { study: study.id, rater: state.rater, ...state.trials[state.sent] }).catch((error) => {
+        if (!error.refused) throw error; // else those after it are sent; it stays in this browser
+      });
       state.sent += 1;
       save();
     }
     if (state.finished && !state.closed) {
-      await post("api/finish", { study: study.id, rater: state.rater, comments: state.comments });
-      state.closed = true;
+      await post("api/finish", { study: study.id, rater: state.rater, comments: state.comments }).then(
+        () => { state.closed = true; },
+        (error) => {
+          if (!error.refused) throw error;
+          served = false; // the rater hands the file over
+        },
+      );
       save();
       show();
     }
@@ -196,7 +203,7 @@ function give(question, answer) {
 }
 
 function unanswered() {
-  return current.asked.findIndex((question) => !(question.name in current.given));
+  return current.asked.findIndex((question) => !Object.hasOwn(current.given, question.name));
 }
 
 function refresh() {
@@ -226,7 +233,7 @@ function showFields() {
     const area = document.createElement("textarea");
     area.maxLength = study.longest;
     area.name = question.name;
-    area.value = load().comments[question.name] || "";
+    area.value = Object.hasOwn(load().comments, question.name) ? load().comments[question.name] : "";
     area.addEventListener("input", () => { load().comments[question.name] = area.value; save(); });
     line.append(words, area);
     return line;
