@@ -109,16 +109,25 @@ def test_a_frame_that_is_not_finite_is_left_out(opened: Opened, tmp_path: Path) 
     assert end == {"type": "end", "frames": 1, "dropped": 1}
 
 
+class Gone(socket.socket):
+    """A socket that takes no options, as macOS has it of a client that has left."""
+
+    def setsockopt(self, *_: object) -> None:  # type: ignore[override]
+        raise OSError(errno.EINVAL, "Invalid argument")
+
+
 class OnceFull:
-    """A listening socket that has no file left for its first client."""
+    """A listening socket that has no file left for its first client, and whose second one has left already."""
 
     def __init__(self, listening: socket.socket) -> None:
-        self._listening, self._failed = listening, False
+        self._listening, self._calls = listening, 0
 
     def accept(self) -> object:
-        if not self._failed:
-            self._failed = True
+        self._calls += 1
+        if self._calls == 1:
             raise OSError(errno.EMFILE, "Too many open files")
+        if self._calls == 2:
+            return Gone(), None
         return self._listening.accept()
 
     def __getattr__(self, name: str) -> object:

@@ -249,9 +249,13 @@ class _Clients:
                         log.warning("%s: %d clients are enough; more are refused", self.address.text, MOST_CLIENTS)
                     self._full = True
                     continue
-                # Small buffers: what waits in the system's is late when it arrives.
-                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**16)
-                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                try:
+                    # Small buffers: what waits in the system's is late when it arrives.
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**16)
+                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                except OSError:  # the client has left already, as macOS says
+                    client.close()
+                    continue
                 name = f"client of {self.address.text}"
                 self._clients[client] = Outbox(client.sendall, WAITING, name, self._first)
                 self.connected += 1
