@@ -61,7 +61,7 @@ class Archive(Format):
         space = FileSpace.of(animation, options)
         if options.output_unit is not None:
             vertices = np.stack(list(space.frames(animation)))
-            head = animation.head
+            head, own = animation.head, animation
             animation = replace(
                 animation,
                 vertices=vertices,
@@ -69,6 +69,9 @@ class Archive(Format):
                 unit=space.unit,
                 head=None if head is None else head * np.repeat([1.0, space.factor], 3),
             )
+            if own.values is not None:
+                deltas = None if own.deltas is None else own.deltas * space.factor
+                animation = animation.made_of(own.space, own.values, deltas)
         write_archive(path, animation if not options.no_speech else replace(animation, speech=None))
 
 

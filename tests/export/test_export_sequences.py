@@ -16,6 +16,7 @@ import trimesh
 
 from facediff.animation import Animation, read_archive
 from facediff.export import ExportOptions, write_animations
+from facediff.spaces import layout
 
 TURN = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # +90 degrees about x
 
@@ -122,6 +123,18 @@ def test_numpy_files(animation: Animation, tmp_path: Path) -> None:
     np.testing.assert_allclose(scaled.vertices, animation.vertices * 1000, rtol=1e-6)
     np.testing.assert_allclose(scaled.template, animation.template * 1000, rtol=1e-6)
     assert (scaled.unit, scaled.speech) == ("mm", None)
+
+
+def test_an_archive_in_another_unit_keeps_its_channels(animation: Animation, tmp_path: Path) -> None:
+    space = layout("arkit")
+    values = np.random.default_rng(0).random((len(animation.vertices), len(space.channels))).astype(np.float32)
+    deltas = np.ones((len(space.face), *animation.template.shape), np.float32)
+    write_animations(tmp_path / "a.npz", [animation.made_of(space, values, deltas)], ExportOptions(output_unit="mm"))
+    scaled = read_archive(tmp_path / "a.npz")
+    assert scaled.values is not None
+    assert scaled.deltas is not None
+    np.testing.assert_array_equal(scaled.values, values)
+    np.testing.assert_allclose(scaled.deltas, 1000 * deltas)
 
 
 def test_memory_map_may_be_replaced_by_its_own_export(animation: Animation, tmp_path: Path) -> None:
