@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.editing.procedural import move_head
 from facediff.errors import FaceDiffError
+from facediff.spaces.arkit import arkit_name
 from facediff.spaces.decoding import ChannelDecoder
 from facediff.spaces.files import even, read_parameters
 
@@ -27,7 +29,9 @@ def read_weights(path: Path) -> Animation:
     clip = even(read_parameters(path))
     if clip.space.kind != "arkit":
         raise FaceDiffError(f"{path}: holds {clip.space.kind} parameters; expected weights of ARKit's shapes")
-    rig, space = built_in_rig(), clip.space
+    rig = built_in_rig()
+    # By ARKit's own spelling, whatever the file's.
+    space = replace(clip.space, channels=tuple(arkit_name(name) or name for name in clip.space.channels))
     column = {name: row for row, name in enumerate(rig.names)}
     nothing = np.zeros(rig.neutral.shape)
     names = [space.channels[channel] for channel in space.face]

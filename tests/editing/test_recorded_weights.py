@@ -49,6 +49,16 @@ def test_weights_exported_as_beat_are_the_same_and_absent_ones_are_left_out(tmp_
     np.testing.assert_array_equal(again.values, first.values)
 
 
+def test_names_in_another_case_move_the_face_too(tmp_path: Path) -> None:
+    frames = '[{"weights": [1, 0], "time": 0}, {"weights": [0, 0], "time": 0.1}]'
+    for name in ("jawOpen", "JawOpen"):
+        (tmp_path / f"{name}.json").write_text(f'{{"names": ["{name}", "mouthPucker"], "frames": {frames}}}')
+    usual, other = (facediff.read(tmp_path / f"{name}.json") for name in ("jawOpen", "JawOpen"))
+    assert np.ptp(usual.vertices, axis=0).max() > 0.01
+    np.testing.assert_array_equal(other.vertices, usual.vertices)
+    assert other.space.channels == ("jawOpen", "mouthPucker")
+
+
 def test_other_parameters_are_refused(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("a,b\n1,2\n")
     with pytest.raises(FaceDiffError, match=r"take\.csv"):
