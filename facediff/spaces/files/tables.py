@@ -135,7 +135,7 @@ def read_live_link(path: Path) -> ParameterClip:
     at_time = folded.index("timecode")
     times, values, numbers = [], [], []
     for number, row in enumerate(rows, start=2):
-        LIMITS.check("frames", number, path)
+        LIMITS.check("frames", number - 1, path)
         if not any(cell.strip() for cell in row[2:]):
             continue  # a frame in which the phone saw no face: its row has a timecode and nothing else
         seconds = seconds_of(row[at_time]) if len(row) > at_time else None
@@ -239,7 +239,7 @@ def read_audio2face(path: Path) -> ParameterClip:
         times.append(_numbers(path, number, full, [at_time], wide)[0])
         values.append(_numbers(path, number, full, columns, wide))
     clock = np.array(times)
-    if len(clock) < 2 or (np.diff(clock) <= 0).any():
+    if len(clock) < 2 or not (np.isfinite(clock).all() and (np.diff(clock) > 0).all()):
         raise FaceDiffError(f"{path}: its times do not ascend, or there is one row only; write it again")
     rate = rate_of(clock)
     known = replace(space, absent=tuple(absent))
