@@ -65,7 +65,7 @@ def has_uvs(path: Path) -> bool:
     if path.suffix.lower() != ".obj" or not path.is_file():
         return False
     with path.open("rb") as stream:
-        return any(line.startswith(b"vt ") for line in stream)
+        return any(line.startswith((b"vt ", b"vt\t")) for line in stream)
 
 
 def read_surface(path: Path, n_triangles: int) -> ObjSurface:

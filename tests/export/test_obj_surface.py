@@ -191,3 +191,9 @@ def test_the_commands_take_the_surface(
     assert b"TEXCOORD_0" in (tmp_path / "b.glb").read_bytes()
     assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "b.ply"), "--surface", str(source)]) == 2
     assert "--surface" in capsys.readouterr().err
+
+
+def test_coordinates_after_a_tab_are_read_too(source: Path) -> None:
+    usual = read_surface(source, 12)
+    source.write_text(source.read_text().replace("vt ", "vt\t"))
+    np.testing.assert_array_equal(read_surface(source, 12).uvs, usual.uvs)
