@@ -94,8 +94,8 @@ def write_video(
         raise FaceDiffError(
             f'video file "{target}" must end in {" or ".join(CONTAINERS)}: other containers are not written.'
         )
-    if not 0 < frame_rate <= 1000:
-        raise FaceDiffError(f"frame_rate is {frame_rate}: give frames per second above 0, such as 25.")
+    if not 0.001 <= frame_rate <= 1000:  # a smaller one would be rounded to 0
+        raise FaceDiffError(f"frame_rate is {frame_rate}: give frames per second from 0.001 to 1000, such as 25.")
     rate = Fraction(frame_rate).limit_denominator(1001)
     sound = None
     if audio is not None:

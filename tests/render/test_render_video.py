@@ -226,6 +226,7 @@ def test_bad_input_is_one_clear_sentence(tmp_path: Path) -> None:
         (lambda: write_video(tmp_path / "folder.mp4", _frames(2), 25), "is a folder"),
         (lambda: write_video(tmp_path / "a.mp4", iter(()), 25), "no frames"),
         (lambda: write_video(tmp_path / "a.mp4", _frames(2), 0), "frame_rate"),
+        (lambda: write_video(tmp_path / "a.mp4", _frames(2), 0.0004), "frame_rate"),
         (lambda: write_video(tmp_path / "a.mp4", _frames(2), 25, sound), "sample_rate"),
         (lambda: write_video(tmp_path / "a.mp4", _frames(2), 25, sound * np.nan, 16000), "NaN"),
         (lambda: write_video(tmp_path / "a.mp4", _frames(2), 25, sound[None], 16000), "mono"),
