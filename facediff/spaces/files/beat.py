@@ -116,6 +116,6 @@ def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> No
         for row, time in zip(clip.values, times, strict=True)
     ]
     content: dict[str, Any] = {"names": [clip.space.channels[index] for index in shapes], "frames": frames}
-    if metadata:
+    if metadata or len(frames) < 2:  # of one frame, times do not say the rate
         content = {"metadata": {"fps": clip.frame_rate, "frame_count": len(frames)}, **content}
     write_json(path, content)

@@ -80,3 +80,11 @@ def test_read_beat_of_lam_takes_the_rate_of_its_metadata(tmp_path: Path) -> None
 def test_read_beat_names_what_is_wrong(tmp_path: Path, changes: dict[str, Any], fault: str) -> None:
     with pytest.raises(FaceDiffError, match=fault):
         read_parameters(written(tmp_path / "a.json", beat(**changes)))
+
+
+def test_one_frame_is_written_with_its_rate(tmp_path: Path) -> None:
+    clip = ParameterClip("a", np.full((1, 52), 0.5, np.float32), layout("arkit"), 25.0)
+    write_parameters(tmp_path / "a.json", clip)
+    again = read_parameters(tmp_path / "a.json")
+    assert again.frame_rate == 25.0
+    np.testing.assert_array_equal(again.values, clip.values)
