@@ -224,6 +224,8 @@ def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
         with atomic(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **content)
         return
+    if not entry.flat:
+        raise FaceDiffError(f"{path}: {name} is no flat array; expected .npz")
     if len(person) != entry.identity:
         raise FaceDiffError(f"{path}: the clip's person has {len(person)} coefficients; {name} has {entry.identity}")
     leading = np.broadcast_to(person, (len(clip.values), entry.identity))
