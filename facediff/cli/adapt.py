@@ -109,10 +109,9 @@ def adapt(
     train = train or ("all" if face is None else "head")
     if train == "head" and face is None:
         raise FaceDiffError("--train head: is for --face; give all or person")
-    if augmentation and voices is None and low_latency is None:
-        raise FaceDiffError("--augmentation: is an option of --voices and --low-latency; give one of them as well")
-    if interpolation is not None and voices is None and low_latency is None:
-        raise FaceDiffError("--interpolation: is an option of --voices and --low-latency; give one of them as well")
+    for name, value in (("augmentation", augmentation), ("interpolation", interpolation)):
+        if value and voices is None and low_latency is None:
+            raise FaceDiffError(f"--{name}: is an option of --voices and --low-latency; give one of them as well")
     if transcribed is not None and voices is None:
         raise FaceDiffError("--transcribed: is an option of --voices; give it as well")
     if audio_encoder is not None and low_latency is None:

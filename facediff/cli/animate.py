@@ -22,6 +22,7 @@ from facediff.cli.parsing import changed, refuse_idle
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
+from facediff.utils.files import holds_glb
 from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
@@ -177,6 +178,6 @@ def animate(
         if options.own_shapes:
             avatar = own_shapes(mesh)
             tell(avatar.summary, *avatar.left_out(animation))
-        elif output.suffix.lower() in (".glb", ".fbx"):
+        elif holds_glb(output):
             tell(*unused_shapes(mesh))
     return 0

@@ -12,7 +12,7 @@ from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.files import check_writable
+from facediff.utils.files import check_writable, holds_glb
 from facediff.utils.option import Option
 from facediff.utils.server import LOOPBACK
 
@@ -74,9 +74,7 @@ def retarget(
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
-    both_glb = (
-        output.suffix.lower() in (".glb", ".fbx") and target_mesh.suffix.lower() == ".glb" and output != target_mesh
-    )
+    both_glb = holds_glb(output) and target_mesh.suffix.lower() == ".glb" and output != target_mesh
     for option, chosen in (("--add-to-mesh", add_to_mesh), ("--own-shapes", own_shapes)):
         if chosen and not both_glb:
             raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
@@ -107,7 +105,7 @@ def retarget(
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    dressed = add_to_mesh or (not bare_face and output.suffix.lower() in (".glb", ".fbx") and wears_more(target_mesh))
+    dressed = add_to_mesh or (not bare_face and holds_glb(output) and wears_more(target_mesh))
     if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
     avatar = own_shapes_of(target_mesh) if own_shapes else None
@@ -225,7 +223,7 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
     from facediff.mesh.glb import open_glb
     from facediff.mesh.obj_surface import has_uvs, read_surface
 
-    if mesh.suffix.lower() == ".glb" and output.suffix.lower() not in (".glb", ".fbx", ".npy"):
+    if mesh.suffix.lower() == ".glb" and not holds_glb(output) and output.suffix.lower() != ".npy":
         glb = open_glb(mesh)
         if not glb.entries("materials"):
             return []

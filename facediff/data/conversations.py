@@ -17,13 +17,14 @@ CONVERSATION = {"partner": "f", "speaking": "b"}
 """Folders of a corpus, ``<folder>/<clip>.npy``, and the kind of numbers in their files."""
 
 
-def conversation_file(root: Path, folder: str, clip: str) -> npt.NDArray[Any]:
+def conversation_file(root: Path, folder: str, clip: str, stride: int = 1) -> npt.NDArray[Any]:
     """The partner's motion of a clip (frames, channels) as float32, or its mask of speaking frames (frames,).
 
     Args:
         root: the corpus's folder.
         folder: ``partner`` or ``speaking``.
         clip: the clip's name.
+        stride: of so many stored frames, the first is read.
 
     Raises:
         FaceDiffError: if the file is missing, or of another shape.
@@ -34,7 +35,7 @@ def conversation_file(root: Path, folder: str, clip: str) -> npt.NDArray[Any]:
     if array.ndim != dimensions:
         expected = "(frames, channels)" if folder == "partner" else "a boolean for each frame"
         raise FaceDiffError(f"{path}: has shape {array.shape}; expected {expected}")
-    return np.array(array, np.float32 if folder == "partner" else np.bool_)
+    return np.array(array[::stride], np.float32 if folder == "partner" else np.bool_)
 
 
 def channel_regions(space: Space) -> dict[str, Region]:

@@ -354,7 +354,7 @@ class CorpusInputs:
             file = phonemes_file(self.corpus, clip)
             inputs["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
         if "speaking" in needed and self.corpus is not None:
-            speaking = conversation_file(self.corpus, "speaking", clip)[:: self.truth_stride]
+            speaking = conversation_file(self.corpus, "speaking", clip, self.truth_stride)
             inputs["speaking"] = [torch.from_numpy(speaking)]
         if "partner" in needed and self.corpus is not None and self.files is not None:
             path = self.corpus / "partner" / pair.truth.path.name

@@ -158,8 +158,8 @@ def closures_of(data: SpeechMotionDataModule, clip: str) -> list[tuple[int, int]
 
 def _at_its_side(folder: str, batch: Batch, data: SpeechMotionDataModule) -> list[Tensor]:
     """What a conversation's folder holds of each clip, of the frames that are read of the motion."""
-    stored = (conversation_file(data.root, folder, clip) for clip in batch.names)
-    return [torch.from_numpy(array[:: data.corpus.stride].copy()) for array in stored]
+    arrays = (conversation_file(data.root, folder, clip, data.corpus.stride) for clip in batch.names)
+    return [torch.from_numpy(array) for array in arrays]
 
 
 class Evaluation:

@@ -21,7 +21,7 @@ from facediff.animation.options import AnimationOptions, DirectionLike, ExportOp
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import SAMPLE_RATE, ranges
-from facediff.utils.files import scratch_folder, valid_text
+from facediff.utils.files import holds_glb, scratch_folder, valid_text
 from facediff.utils.hub import is_audio2face
 from facediff.utils.progress import track
 
@@ -273,7 +273,7 @@ class AnimationPipeline(ABC):
 
         # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates of an .obj.
         wears_more, has_uvs = self._target_beyond_surface
-        is_dressed = output.suffix.lower() in (".glb", ".fbx") and export.output_unit is None and wears_more
+        is_dressed = holds_glb(output) and export.output_unit is None and wears_more
         into = Path(self.options.target_mesh or "") if is_dressed or has_uvs else None
         own_shapes = self.options.own_shapes
         if own_shapes and not is_dressed:

@@ -102,8 +102,8 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     entry = LAYOUTS[layout]
     stated_rate = next((content[key].item() for key in RATES if key in content and content[key].size == 1), None)
     if stated_rate is not None:
-        check_number(path, "frame rate", stated_rate, *FRAME_RATES, text=True)
-    rate = _rate(path, frame_rate, entry, None if stated_rate is None else float(stated_rate))
+        stated_rate = check_number(path, "frame rate", stated_rate, *FRAME_RATES, text=True)
+    rate = _rate(path, frame_rate, entry, stated_rate)
     parts = []
     for key, columns in (entry.arrays or {}).items():
         array = _frames(path, key, content[key])
