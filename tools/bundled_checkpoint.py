@@ -63,7 +63,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     weights = weights_of(model, given.folder)
     model.load_state_dict(weights)
     weights |= model.fit_to_features(corpus_of_checkpoint(given.template, given.data_root, None, None))
-    model.load_state_dict(weights)
     off = compare(model, given.folder, trial_speech())["share_of_range"]
     if not off < SAME:
         raise FaceDiffError(f"{given.template}: gives other motion than {given.folder}; train it by the same recipe")
