@@ -28,7 +28,7 @@ from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_m
 from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, masked_mean
 from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
-from facediff.models.published.squared_errors import mean_squared_error
+from facediff.models.squared_errors import mean_squared_error
 from facediff.utils.ranges import Range
 
 Stage = Literal["prior", "predictor"]

@@ -45,7 +45,7 @@ from facediff.models.published.diffusion import (
 )
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
-from facediff.models.published.squared_errors import squared_errors
+from facediff.models.squared_errors import squared_errors
 from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 

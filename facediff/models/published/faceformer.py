@@ -23,7 +23,7 @@ from facediff.models.published.autoregressive import (
 )
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
-from facediff.models.published.squared_errors import mean_squared_error
+from facediff.models.squared_errors import mean_squared_error
 
 
 @registry.model.register("FaceFormer")

@@ -35,7 +35,7 @@ from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
 from facediff.models.published.base import TRAINED_NETWORK, DirectModel, masked_mean, still_map
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, backbone_config, register
-from facediff.models.published.squared_errors import squared_errors
+from facediff.models.squared_errors import squared_errors
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:

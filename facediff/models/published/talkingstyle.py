@@ -28,7 +28,7 @@ from facediff.models.published.autoregressive import (
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
-from facediff.models.published.squared_errors import mean_squared_error
+from facediff.models.squared_errors import mean_squared_error
 
 StyleAttention = Literal["one_key", "components"]
 """What an attention over a speaker's row attends to: each component to itself alone, or to all of them."""

@@ -26,7 +26,7 @@ from facediff.models.graphs import Spoken
 from facediff.models.layers import Width, exporting, frame_mask, sliding
 from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
-from facediff.models.published.squared_errors import squared_errors
+from facediff.models.squared_errors import squared_errors
 from facediff.speech.windows import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range

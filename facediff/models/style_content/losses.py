@@ -15,6 +15,7 @@ from torch import Tensor
 
 from facediff.data import Batch
 from facediff.models.losses import masked_std
+from facediff.models.squared_errors import squared_errors
 from facediff.speech.cepstra import align_features, cepstra
 
 Motion = Float[Tensor, "batch frames points dims"]
@@ -71,14 +72,16 @@ class MotionDistance:
         gap = motion.new_zeros(())
         if self.lip_gap and pairs is not None and rest is not None:
             gap = frame_mean((_gaps(motion, rest, pairs) - _gaps(truth, rest, pairs)).square().mean(-1), mask)
-        # The difference first: a choice of vertices then copies one array, and leaves one gradient to be scattered.
-        error = motion - truth
+        columns = None
         if vertices is not None:
-            error = error.index_select(2, vertices)
-        # A velocity needs two valid frames: the step from the last frame into the padding is no movement.
+            columns = torch.zeros(motion.shape[2], motion.shape[3], dtype=torch.bool, device=motion.device)
+            columns = columns.index_fill(0, vertices, True).flatten()
+        squares = squared_errors(motion.flatten(2), truth.flatten(2), mask, columns)
+        width = motion.shape[3] * (motion.shape[2] if vertices is None else len(vertices))
         both = mask[:, 1:] & mask[:, :-1]
-        moved = frame_mean(error.square().mean((2, 3)), mask)
-        changed = frame_mean(error.diff(dim=1).square().mean((2, 3)), both)
+        moved, changed = (
+            total / (valid.sum() * width).clamp_min(1) for total, valid in zip(squares, (mask, both), strict=True)
+        )
         total = self.position * moved + self.velocity * changed
         return total + self.lip_gap * gap + self.upper_face * face
 
