@@ -192,6 +192,9 @@ def cache_root(edition: FirstEdition | SecondEdition) -> Path:
     """Where an edition is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     more = f"-drawn{edition.drawn}" if edition.drawn else ""
     more += f"-people{len(edition.people)}" if edition.people else ""
+    # Two folders of recordings may have equally many speakers.
+    if edition.people and edition.people[0].startswith(ALIGNED):
+        more += "-" + hashlib.sha256("\n".join(edition.people).encode()).hexdigest()[:8]
     return cache_dir() / f"puppet-{edition.generator}-seed{edition.seed}{more}"
 
 
@@ -273,7 +276,7 @@ class Puppet(SpeechMotionDataModule):
             raise FaceDiffError("data.people_voices and data.recordings both say who speaks; give one of them")
         people = second_edition.people_voices() if people_voices else ()
         if recordings is not None:
-            people = tuple(f"{ALIGNED}:{speaker}" for speaker in speakers_of(Path(recordings).expanduser()))
+            people = tuple(f"{ALIGNED}:{speaker}" for speaker in speakers_of(Path(recordings).expanduser().absolute()))
         facts = EDITIONS[edition or 2](seed, drawn_speakers, people)
         drawn = drawn_names(drawn_speakers)
         super().__init__(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -147,3 +148,14 @@ def test_drawn_speakers_speak_with_the_recordings_of_people(people: Path, tmp_pa
     assert len(np.load(tmp_path / "corpus" / "weights_npy" / "X01_e01.npy")) == len(speech) / 640
     with pytest.raises(FaceDiffError, match="one of them"):
         Puppet(people_voices=True, recordings=str(people))
+
+
+def test_two_folders_of_recordings_are_kept_apart(
+    people: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each run with the one would otherwise make the corpus of the other anew; a relative path is the same folder."""
+    others = shutil.copytree(people, tmp_path / "others")
+    monkeypatch.chdir(tmp_path)
+    roots = [Puppet(drawn_speakers=3, recordings=str(folder)).root for folder in (people, others, Path("people"))]
+    assert roots[0] != roots[1]
+    assert roots[0] == roots[2]

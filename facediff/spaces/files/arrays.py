@@ -204,11 +204,11 @@ def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
 
     Args:
         path: the ``.npy`` or ``.npz`` file.
-        clip: with the layout's channels in its order.
+        clip: with the layout's channels in its order; the coefficients of a person it does not have are zero.
         layout: name of the layout; the clip's own if empty.
 
     Raises:
-        FaceDiffError: if the clip is not in the layout, or lacks the person that the layout has.
+        FaceDiffError: if the clip is not in the layout, or its person has another number of coefficients.
     """
     name = layout or clip.layout
     entry = find_layout(name, str(path))
