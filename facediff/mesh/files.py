@@ -195,8 +195,10 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
     types = {name: kind for element in elements if element.name == "vertex" for name, kind, _ in element.properties}
     colours = None
     if {"red", "green", "blue"} <= vertex.keys():
-        scale = {"f": 255.0, "u2": 255 / 65535}.get(types["red"][0] if types["red"][0] == "f" else types["red"], 1.0)
-        table = scale * np.stack([np.asarray(vertex[name], np.float64) for name in ("red", "green", "blue")], 1)
+        table = np.stack([np.asarray(vertex[name], np.float64) for name in ("red", "green", "blue")], 1)
+        kind = types["red"][1:]  # after the order of its bytes
+        if kind == "u2" or (kind[0] == "f" and table.max(initial=0) <= 1):  # some tools write bytes as floats
+            table *= 255 / (65535 if kind == "u2" else 1)
         if table.size and not (table.min() >= 0 and table.max() <= 255):
             raise ValueError("its colours are out of range")
         colours = np.rint(table).astype(np.uint8)

@@ -234,6 +234,20 @@ def test_a_textured_ply_keeps_its_vertices(tmp_path: Path) -> None:
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
+@pytest.mark.parametrize(
+    ("kind", "colours"),
+    [("uchar", "255 51 0"), ("float", "1 0.2 0"), ("float", "255 51 0"), ("ushort", "65535 13107 0")],
+)
+def test_colours_of_a_ply_are_those_of_a_screen_whatever_their_type(kind: str, colours: str, tmp_path: Path) -> None:
+    head = [f"property {kind} {name}" for name in ("red", "green", "blue")]
+    body = "".join(f"{row} {colours}\n" for row in SQUARE.splitlines()) + "3 0 1 2\n"
+    head = ["element vertex 4", *XYZ, *head, "element face 1", LIST]
+    (tmp_path / "a.ply").write_bytes(ply(*head, body=body.encode(), form="ascii"))
+    read = read_mesh(tmp_path / "a.ply").colours
+    assert read is not None
+    assert read.tolist() == [[255, 51, 0]] * 4
+
+
 def test_sparse_changes_of_a_glb_are_made(tmp_path: Path) -> None:
     content = json.loads(json.dumps(GOOD))
     content["bufferViews"] += [
