@@ -6,6 +6,7 @@ file from elsewhere opens nothing outside of it.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -134,7 +135,7 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
         LIMITS.check("bytes", file.stat().st_size, file)
         name, left_out = "", set()
         for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
-            word, _, rest = line.strip().partition(" ")
+            word, _, rest = line.strip().replace("\t", " ").partition(" ")
             if word == "newmtl":
                 name = rest.strip()
                 result[name] = Material(name)
@@ -160,7 +161,7 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
 
 def _colour(text: str) -> tuple[float, float, float]:
     try:
-        red, green, blue = (min(max(float(number), 0.0), 1.0) for number in text.split()[:3])
+        red, green, blue = (min(max(0.0, float(number)), 1.0) for number in text.split()[:3])
     except ValueError:
         return Material("").colour
     return red, green, blue
@@ -172,9 +173,10 @@ def _beside(path: Path, name: str) -> Path | None:
     relative = PurePosixPath(name.replace("\\", "/"))
     for candidate in (relative, PurePosixPath(relative.name)):
         # Resolved first, so that neither `..` nor a link leads out of the folder: files from elsewhere name anything.
-        file = (folder / candidate).resolve()
-        if file.is_relative_to(folder) and file.is_file():
-            return file
+        with suppress(OSError, RuntimeError, ValueError):  # too long, a loop of links, or no name at all
+            file = (folder / candidate).resolve()
+            if file.is_relative_to(folder) and file.is_file():
+                return file
     return None
 
 

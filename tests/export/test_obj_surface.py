@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -159,7 +160,8 @@ def test_a_picture_with_the_programs_mark_is_the_same_picture(tmp_path: Path, so
 def test_what_is_missing_or_lies_elsewhere_is_left_out_and_said(tmp_path: Path, source: Path) -> None:
     secret = tmp_path / "secret.png"
     (source.parent / "skin.png").rename(secret)
-    for name in ("../secret.png", str(secret), "none.png", "mine.mtl"):
+    (source.parent / "loop.png").symlink_to("loop.png")
+    for name in ("../secret.png", str(secret), "none.png", "mine.mtl", "loop.png", "a\0b.png", 300 * "long" + ".png"):
         (source.parent / "mine.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
         surface = read_surface(source, 12)
         assert surface.materials[0].picture is None
@@ -193,7 +195,14 @@ def test_the_commands_take_the_surface(
     assert "--surface" in capsys.readouterr().err
 
 
-def test_coordinates_after_a_tab_are_read_too(source: Path) -> None:
+def test_coordinates_and_materials_after_a_tab_are_read_too(source: Path) -> None:
     usual = read_surface(source, 12)
     source.write_text(source.read_text().replace("vt ", "vt\t"))
-    np.testing.assert_array_equal(read_surface(source, 12).uvs, usual.uvs)
+    library = source.parent / "mine.mtl"
+    text = library.read_text()
+    library.write_text(re.sub(r"^(\w+) ", r"\1\t", text, flags=re.MULTILINE))
+    read = read_surface(source, 12)
+    np.testing.assert_array_equal(read.uvs, usual.uvs)
+    assert [vars(material) for material in read.materials] == [vars(material) for material in usual.materials]
+    library.write_text(text.replace("Kd 0.2 0.4 0.6", "Kd nan 2 -inf"))
+    assert read_surface(source, 12).materials[1].colour == (0, 1, 0)
