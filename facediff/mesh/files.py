@@ -97,11 +97,12 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
         raise ValueError("a line `v` has fewer than three coordinates")
     listed = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
     LIMITS.check("vertices", (listed.count(b" ") + listed.count(b"\t")) // 4, path)
-    first_face, last_vertex = max(data.find(b"\nf "), data.find(b"\nf\t")), data.rfind(b"\nv ")
     # Negative numbers count back from the face's own line; with vertices after it they would name others here, where
     # all vertices are read first.
-    if b" -" in listed and 0 <= first_face < last_vertex:
-        raise ValueError("faces between its vertices count backwards from where they stand")
+    if b" -" in listed or b"\t-" in listed:
+        kinds = b"".join(line[:1] for line in lines if line[:2] in (b"v ", b"v\t", b"f ", b"f\t"))
+        if b"fv" in kinds:
+            raise ValueError("faces between its vertices count backwards from where they stand")
     colours = np.rint(table[:, 3:6].clip(0, 1) * 255).astype(np.uint8) if width >= 6 else None
     return Mesh(table[:, :3].copy(), _triangles(listed, len(table)).copy(), colours)
 
@@ -399,7 +400,7 @@ def _read_off(data: bytes, path: Path) -> Mesh:
     LIMITS.check("vertices", n_faces, path)
     if len(lines) < 1 + n_vertices + n_faces:
         raise ValueError(f"it is cut short: its {n_vertices} vertices and {n_faces} faces are not all there")
-    points = np.array([[float(word) for word in line[:3]] for line in lines[1 : 1 + n_vertices]]).reshape(-1, 3)
+    points = np.array([[float(word) for word in line[:3]] for line in lines[1 : 1 + n_vertices]]).reshape(n_vertices, 3)
     polygons = []
     for line in lines[1 + n_vertices : 1 + n_vertices + n_faces]:
         corners = [int(word) for word in line[1 : 1 + max(0, int(line[0]))]]

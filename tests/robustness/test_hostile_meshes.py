@@ -90,6 +90,7 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "obj with a point as face": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1\n"),
     "obj with two coordinates": (".obj", b"v 0 0 0\nv 1 0\nv 0 1 0 1\nf 1 2 3\n"),
     "obj with relative faces in between": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 5 5\nf -3 -2 -1\n"),
+    "obj with such faces after tabs": (".obj", b"v\t0 0 0\nv\t1 0 0\nv\t0 1 0\nf\t-3\t-2\t-1\nv\t5 5 5\nf 1 2 3\n"),
     "obj of zero bytes": (".obj", bytes(1000)),
     # PLY
     "ply of 1e12 vertices": (".ply", ply("element vertex 1000000000000", *XYZ)),
@@ -130,6 +131,7 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "off of -1 faces": (".off", b"OFF\n3 -1 0\n0 0 0\n1 0 0\n0 1 0\n"),
     "off cut in its faces": (".off", b"OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
     "off with vertex 3": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n"),
+    "off with two coordinates": (".off", b"OFF\n3 1 0\n0 0\n1 0\n0 1\n3 0 1 2\n"),
     "off with a short face": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n"),
     # Binary glTF
     "glb of 1e9 vertices": (".glb", changed("accessors.0.count", 10**9)),
