@@ -307,7 +307,9 @@ def _dense(state: Mapping[Any, Any], kind: str, where: str) -> Values:
     else:
         ends = np.asarray(state["indptr"], np.int64)
         minor = np.asarray(state["indices"], np.int64)
-        major = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
+        if not ends[-1] == len(minor) == len(data):
+            raise ValueError("ends that do not fit the data")
+        major = np.searchsorted(ends, np.arange(len(minor)), side="right") - 1  # of the data's size in any case
         row, column = (minor, major) if kind == "csc" else (major, minor)
     if len(data) and min(row.min(), column.min()) < 0:
         raise ValueError("negative index")

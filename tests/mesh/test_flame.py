@@ -317,6 +317,7 @@ def self_containing() -> object:
 BAD = flame_arrays()
 COUNT = len(BAD["weights"])
 REGRESSOR = "scipy.sparse.csc", "csc_matrix"
+SPARSE = {"_shape": (5, COUNT), "data": np.ones(1), "indices": np.zeros(1, np.int64)}
 
 
 @pytest.mark.parametrize(
@@ -330,6 +331,8 @@ REGRESSOR = "scipy.sparse.csc", "csc_matrix"
         ({"J_regressor": compressed(BAD["J_regressor"].T)}, r"J_regressor has shape \(80, 5\), expected 5 rows"),
         ({"J_regressor": foreign(*REGRESSOR, {"_shape": (5, COUNT)})}, "J_regressor is a damaged scipy.sparse.csc"),
         ({"J_regressor": foreign(*REGRESSOR, {"_shape": (5, 10**12)})}, "expected 5 rows"),
+        ({"J_regressor": foreign(*REGRESSOR, {**SPARSE, "indptr": np.array([0, 10**13])})}, "ends that do not fit"),
+        ({"J_regressor": foreign(*REGRESSOR, {**SPARSE, "indptr": np.array([0, 3])})}, "ends that do not fit"),
         ({"J_regressor": foreign("scipy.sparse.bsr", "bsr_matrix", {})}, "scipy.sparse.bsr.bsr_matrix, which is not"),
         ({"kintree_table": np.array([[-1, 0, 3, 1, 1], [0, 1, 2, 3, 4]])}, r"has the parents \[-1, 0, 3, 1, 1\]"),
         ({"weights": np.ones((COUNT, 5))}, "weights of a vertex do not add up to 1"),
