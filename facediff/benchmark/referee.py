@@ -308,7 +308,7 @@ class Judgement:
 
     def lacks(self, score: str) -> str:
         """Why a score has nothing to see in this model, in words; empty if it has."""
-        if score in ("closures", "gap") and self.scores.get("closures", 0) < CLOSES:
+        if score in ("closures", "gap") and self.scores.get("closures", 1) < CLOSES:
             return f"it closes its lips for fewer than {100 * CLOSES:.0f} % of p, b and m"
         if score in ("correlation", "lag") and self.scores.get("correlation", 0) < FOLLOWS:
             return "its mouth does not follow the speech"

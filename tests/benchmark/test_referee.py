@@ -85,6 +85,8 @@ def test_a_model_that_has_a_fault_already_is_not_asked_for_it() -> None:
     deaf = Judgement("deaf", {"closures": 0.1, "correlation": 0.0, "lips": 3.0, "jitter": 1.7})
     assert all(deaf.lacks(score) for score in ("closures", "gap", "correlation", "lag", "lips", "jitter"))
     assert not Judgement("good", {"closures": 0.9, "correlation": 0.9}).lacks("gap")
+    # Of a jaw alone closures are not read, which says nothing of how it closes its lips.
+    assert not Judgement("jaw", {"correlation": 0.9}).lacks("closures")
 
 
 def test_scores_know_which_way_is_better() -> None:
