@@ -64,8 +64,9 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
         )
     chosen = []
     for pattern in names:
+        stars = pattern.replace("[", "[[]").replace("?", "[?]")  # other signs stand for themselves
         for fold in (str, str.casefold):  # another case counts only where nothing is written so
-            matching = [part for part in parts if any(fnmatchcase(fold(name), fold(pattern)) for name in part.names)]
+            matching = [part for part in parts if any(fnmatchcase(fold(name), fold(stars)) for name in part.names)]
             if matching:
                 break
         else:

@@ -56,6 +56,8 @@ def test_names_of_an_obj(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="Heat") as caught:
         named_triangles(tmp_path / "a.obj", ["Head", "Heat"])
     assert all(name in str(caught.value) for name in ("Head", "Skin", "Lips", "Hat", "Felt"))
+    (tmp_path / "a.obj").write_text(OBJ.replace("Hat", "Hat[1]?"))
+    assert named_triangles(tmp_path / "a.obj", ["Hat[1]?"]).tolist() == [3]
     (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
     with pytest.raises(FaceDiffError, match="no names"):
         named_triangles(tmp_path / "b.obj", ["Head"])
