@@ -42,13 +42,13 @@ def loggers_of(path: Path | str) -> list[str]:
     return [str(entry["class_path"]).rpartition(".")[2] for entry in entries if entry and "class_path" in entry]
 
 
-def model_class_of(path: Path | str) -> str | None:
-    """Import path of the model's class that a config, which :func:`check_config` has let through, states itself."""
+def class_of(path: Path | str) -> str | None:
+    """The class that a config, which :func:`check_config` has let through, states: the model's, or of its only part."""
     content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only
-    model = content.get("model", content)  # a file of the model alone has its class outermost
+    model = content.get("model", content)  # a file of one part alone has its class outermost
     if isinstance(model, str) and (part := Path(path).parent / model).is_file():
         check_config(part)
-        return model_class_of(part)
+        return class_of(part)
     named = model.get("class_path") if isinstance(model, dict) else model
     return named if isinstance(named, str) else None
 

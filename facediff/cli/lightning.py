@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.configs import as_parts, bundled_config, check_config, keys_of, loggers_of, model_class_of
+from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of
 from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices, printable
 from facediff.registry import defaults, plain
@@ -216,7 +216,7 @@ def import_model(arguments: Sequence[str]) -> str | None:
     from facediff.cli.data import find_own_module
     from facediff.utils.plain_options import is_path
 
-    named = [value_of(arguments, "--model"), *map(model_class_of, config_files(arguments))]
+    named = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
     chosen = next((name for name in named if is_path(name)), None)
     if chosen is not None:
         find_own_module(chosen)
@@ -386,6 +386,8 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     options = {key: value for key, value in hparams.items() if not key.startswith("_") and key not in LINKS}
     config = {"seed_everything": 0, "model": {"class_path": hparams["_class_path"], "init_args": options}}
     chosen = value_of(arguments, "--data")
+    if chosen is not None and chosen.endswith((".yaml", ".yml")) and Path(chosen).is_file():
+        chosen = class_of(chosen)
     import_corpus(path, checkpoint, chosen, "--data=")
     if chosen in (None, (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")):
         corpus, corpus_options = corpus_of(path, checkpoint)

@@ -87,9 +87,12 @@ def test_a_config_of_the_users_is_not_overwritten(
 
 
 def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of the data module adds to the checkpoint's options, which say where the corpus is."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "part.yaml").write_text("class_path: tests.fakes.tiny.Tiny\ninit_args: {batch_size: 3}\n")
     words = ["predict", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--model.sampler.steps=1"]
-    assert main(words) == 0
+    assert main([*words, "--data=part.yaml"]) == 0
+    assert "batch_size: 3" in (tmp_path / "runs/predict/version_0/config.yaml").read_text()
     files = sorted(tmp_path.glob("runs/predict/version_0/predictions/*.npy"))
     assert [f.name for f in files] == [f"{s}_e0{n}_condition_{s}.npy" for s in "AB" for n in (6, 7)]
     assert np.load(files[0]).shape[1] == 72
