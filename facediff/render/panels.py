@@ -294,7 +294,8 @@ def draw_text(picture: Frame, text: str, *, colour: tuple[int, int, int], scale:
 
     Letters are ``scale`` times as high as the picture, and smaller where the line would be wider than it.
     """
-    if not text.strip():
+    text = " ".join(text.split())  # no layout has line breaks, which names of files may have
+    if not text:
         return picture.copy()
     height, width, _ = picture.shape
     mask = _text_mask(text, max(round(scale * height), 9), round(0.94 * width))

@@ -126,5 +126,6 @@ def test_letters_with_accents_are_drawn_and_no_boxes(renderer: Renderer, monkeyp
 
     if _wide_font() is not None:
         assert len({label(text) for text in ("Zoe", "Zoë", "Zoü", "Zoж")}) == 4  # a box would make two of them alike
+    assert label("Zoë\nZoë") == label("Zoë\x85 Zoë") == label("Zoë Zoë")  # file names may have line breaks
     monkeypatch.setattr("facediff.render.panels._wide_font", lambda: None)
     assert label("Zoë") == label("Zoe")
