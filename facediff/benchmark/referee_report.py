@@ -141,17 +141,10 @@ def languages_and_costs(report: RefereeReport) -> list[Block]:
         cost = [
             NONE if row.seconds is None else f"{row.seconds:.3g}",
             NONE if row.memory is None else f"{row.memory / 2**20:.0f} MiB",
+            NONE if row.problem else f"{row.frame_rate:g}",
         ]
         shares = [NONE if share is None else f"{share:.2f}" for share in closed]
-        rows.append(
-            [
-                row.name,
-                *shares,
-                *cost,
-                NONE if row.problem else f"{row.frame_rate:g}",
-                row.facts.get("commercial use", "unknown"),
-            ]
-        )
+        rows.append([row.name, *shares, *cost, row.facts.get("commercial use", "unknown")])
     head = ["closures in", *(LANGUAGES[code].name for code in spoken), "CPU s/s", "memory", "fps", "commercial use"]
     notes = [
         f"{row.name}: {title}: {value}"
@@ -222,13 +215,7 @@ def content(report: RefereeReport) -> dict[str, Any]:
         "code": dict(report.code),
         "machine": report.machine,
         "clips": [
-            {
-                "name": clip.name,
-                "language": clip.language,
-                "voice": clip.voice,
-                "text": clip.text,
-                "seconds": clip.seconds,
-            }
+            {name: getattr(clip, name) for name in ("name", "language", "voice", "text", "seconds")}
             for clip in report.clips
         ],
         "rows": [

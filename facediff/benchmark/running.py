@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from facediff.benchmark.cells import Cell, Training, config_content, hash_of
-from facediff.benchmark.results import Result, cell_file, curve_of, model_result, predictions_result, read_result
+from facediff.benchmark.results import CELLS, Result, cell_file, curve_of, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
@@ -357,7 +357,7 @@ def estimate(cells: Sequence[Cell], folder: Path) -> dict[Cell, float | None]:
     Timings of all benchmarks of this machine are remembered in the cache folder, by what is trained and for how long.
     """
     latest: dict[tuple[str, str], tuple[float, float]] = {}
-    for path in (folder / "cells").glob("*.json"):
+    for path in (folder / CELLS).glob("*.json"):
         result = read_result(path)
         if result is not None and not result.problem and (seconds := result.total_seconds) is not None:
             key, when = (result.row, result.corpus), path.stat().st_mtime

@@ -149,8 +149,7 @@ def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Arra
     """Least squares, or the fit to a random triple of points where its median residual is less."""
     # A triple without outliers fits all points that did not move, whatever the others do; its median residual is then
     # small. Some hundred points are enough to compare medians, so that many frames are cheap.
-    random = np.random.default_rng(0)
-    # Seeded, so that equal meshes are aligned by the same bits in every run and on every worker.
+    random = np.random.default_rng(0)  # equal meshes are aligned by the same bits in every run and on every worker
     judges = random.permutation(len(target))[:JUDGES]
     judged, goal = source[:, judges], target[judges]
     best = _fit(source, target, np.broadcast_to(base, source.shape[:2]), scale)

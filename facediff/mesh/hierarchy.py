@@ -280,7 +280,6 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     if not 1 <= n_vertices <= len(points):
         raise FaceDiffError(f"coarsen: {n_vertices} vertices asked for; expected 1 to {len(points)}")
     labels = _clusters(points, faces, n_vertices)
-    # The vertex of each cluster that is nearest to the cluster's mean; of equal ones the first.
     # The vertex nearest to the mean stands for its cluster: the simplifier's own positions lie off the surface.
     square = np.square(points - _means(labels, n_vertices).apply(points)[labels]).sum(axis=1)
     # Ties go to the smaller number, so that a hierarchy depends on the mesh alone and a checkpoint finds it again.

@@ -108,7 +108,7 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
 
 
 def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
-    """The vertex and the rings around it, cut at ``wanted`` entries; shorter where the rings end."""
+    """The vertex and the rings around it, cut at ``full_length`` entries; shorter where the rings end."""
     ring = rings[vertex]
     spiral = [vertex, *ring]
     seen = set(spiral)
@@ -119,7 +119,6 @@ def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
             fresh = [near not in seen for near in around]
             if not any(fresh):
                 continue
-            # In counter-clockwise order, the new vertices begin after the ones that are in the spiral already.
             # The first new vertex after an old one, counter-clockwise: the outer ring goes on where the inner one
             # ended.
             start = next((i for i, new in enumerate(fresh) if new and not fresh[i - 1]), 0)
