@@ -389,7 +389,9 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     if chosen is not None and chosen.endswith((".yaml", ".yml")) and Path(chosen).is_file():
         chosen = class_of(chosen)
     import_corpus(path, checkpoint, chosen, "--data=")
-    if chosen in (None, (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")):
+    trained = str((checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path"))
+    package, _, short = trained.rpartition(".")  # or by its name alone, or that which the package has in its front
+    if chosen in (None, trained, short, f"{package.rpartition('.')[0]}.{short}"):
         corpus, corpus_options = corpus_of(path, checkpoint)
         if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in arguments):
             tell_folder(path, corpus_options)
