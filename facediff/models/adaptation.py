@@ -10,6 +10,7 @@ from lightning.pytorch.cli import instantiate_module
 from torch import Tensor
 
 from facediff.data import SpeechMotionDataModule
+from facediff.data.batch import ASSETS_KEY
 from facediff.errors import FaceDiffError
 from facediff.models.base import SIZES, AnimationModel
 from facediff.models.dual_path import DualPathDiffusion
@@ -39,10 +40,11 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
         return model
     options = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
     grown: AnimationModel = instantiate_module(type(model), {**options, "identities": identities})
-    before = model.state_dict()
+    content: dict[str, Any] = {"state_dict": model.state_dict()}
+    model.on_save_checkpoint(content)  # what is measured too, such as the noise scale
+    grown.on_load_checkpoint({**content, ASSETS_KEY: replace(model.assets, identities=identities).state()})
+    before = content["state_dict"]
     grown.load_state_dict({name: grow(before[name], value) for name, value in grown.state_dict().items()})
-    grown.adopt(replace(model.assets, identities=identities))
-    grown.licences, grown.provenance = model.licences, model.provenance
     return grown
 
 

@@ -18,6 +18,7 @@ from facediff.data import Batch, collate
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
+from facediff.models.adaptation import with_extra_identities
 from facediff.models.losses import preconditioned_losses
 from facediff.models.motion_space import ComponentMotion, Preconditioning, TemporalPreconditioning
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler, half_hidden
@@ -459,6 +460,13 @@ def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion
     assert float((share * variances / (variances + 1)).sum()) == pytest.approx(0.5, abs=0.02)
     assert trained.sampler.process is trained.process
     torch.testing.assert_close(space.preconditioning.skip[0, :2], torch.ones(2), rtol=0.2, atol=0)
+
+
+def test_a_further_identity_keeps_the_noise_scale(trained: DualPathDiffusion) -> None:
+    grown = with_extra_identities(trained, ["C", *trained.identities])
+    assert isinstance(grown, DualPathDiffusion)
+    assert grown.process.scale == trained.process.scale != 1
+    assert grown.sampler.signal == trained.sampler.signal
 
 
 def test_training_measures_the_covariance_over_time(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:
