@@ -562,7 +562,11 @@ class AnimationModel(PersonStyles, ABC):
 
     def weighed(self, motion: Float[Tensor, "*frames points dims"]) -> Float[Tensor, "*frames points dims"]:
         """Motion whose squared errors count what :attr:`channel_weighting` says; of vertices the motion itself."""
-        return motion if self.geometry is None else (motion[..., 0] @ self.geometry.T)[..., None]
+        if self.geometry is None:
+            return motion
+        # Not in mixed precision: differences over time of half-precision motion are noise.
+        with torch.autocast(motion.device.type, enabled=False):
+            return (motion[..., 0].to(self.geometry.dtype) @ self.geometry.T)[..., None]
 
     # Checkpoints and publishing.
 

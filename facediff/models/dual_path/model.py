@@ -515,7 +515,8 @@ class DualPathDiffusion(AnimationModel):
         last: Tensor = network.unembed.weight
         rest: Tensor = network.unembed.bias
         if self.geometry is not None:  # linear in the last map, which is weighed in place of its result
-            last, rest = self.geometry @ last, self.geometry @ rest
+            with torch.autocast(noise.device.type, enabled=False):
+                last, rest = self.geometry @ last, self.geometry @ rest
         return fused_losses(
             decoded,
             last,
