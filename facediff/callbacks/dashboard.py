@@ -167,6 +167,7 @@ class ClipErrors:
     split: str
     clip: str
     identity: str
+    condition: str  # the training identity that an unseen speaker's clip was conditioned on; empty for none
     audio: npt.NDArray[np.float32]  # its speech (S,), 16 kHz
     # Distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
     errors: npt.NDArray[np.float32]
@@ -194,14 +195,13 @@ def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, 
         dataset = datasets[row["split"]]
         place = [clip.name for clip in dataset.clips].index(row["clip"])
         sample = dataset[place]
-        batch = collate([sample]).to(model.device)
+        batch = dict(model.views_of_clips(collate([sample]).to(model.device)))[row["identity"]]
         with trainer.precision_plugin.forward_context():
             motion = model.generate(batch, seed=0)
         off = model.assets.to_scored(motion[0].float() - batch.motion[0], sample.identity_name)
         errors = off.norm(dim=-1).mean(dim=0)
-        measured.append(
-            ClipErrors(row["split"], sample.name, sample.identity_name, sample.audio.numpy(), errors.cpu().numpy())
-        )
+        names = (row["split"], sample.name, sample.identity_name, row["identity"])
+        measured.append(ClipErrors(*names, sample.audio.numpy(), errors.cpu().numpy()))
     return measured
 
 
@@ -237,13 +237,13 @@ def highest_error(clips: list[ClipErrors]) -> float:
     return max([*(float(clip.errors.max()) for clip in clips), 1e-12])
 
 
-def wandb_media(model: AnimationModel, clips: list[ClipErrors]) -> dict[tuple[str, str], list[Any]]:
-    """``wandb.Audio`` and ``wandb.Image`` (or None) of every clip, by split and name."""
+def wandb_media(model: AnimationModel, clips: list[ClipErrors]) -> dict[tuple[str, str, str], list[Any]]:
+    """``wandb.Audio`` and ``wandb.Image`` (or None) of every clip, by split, name and condition."""
     import wandb
 
     scale = f"mean error of each vertex, 0 to {highest_error(clips):.3g} {model.assets.unit}" if clips else ""
     return {
-        (clip.split, clip.clip): [
+        (clip.split, clip.clip, clip.condition): [
             wandb.Audio(clip.audio, sample_rate=SAMPLE_RATE, caption=clip.clip),
             None if picture is None else wandb.Image(picture, caption=f"{clip.clip}: {scale}"),
         ]

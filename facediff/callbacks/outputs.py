@@ -142,17 +142,17 @@ class ScoreTable(Callback):
 
 
 def log_sequences(
-    logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str], list[Any]]
+    logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str, str], list[Any]]
 ) -> None:
     """Give Weights & Biases the table of sequences, a row per clip and method, and the words that define its numbers.
 
-    Media are sound and picture by split and clip; the model's rows that have them come first, in this order.
+    Media are sound and picture by split, clip and identity; the model's rows that have them come first, in this order.
     """
     columns = list(sequences[0])
     places = {key: place for place, key in enumerate(media)}
     data: list[tuple[int, list[Any]]] = []
     for row in sequences:
-        key = (row["split"], row["clip"])
+        key = (row["split"], row["clip"], row["identity"])
         shown = row["method"] == "model" and key in media
         values = [*(row[name] for name in columns), *(media[key] if shown else (None, None))]
         data.append((places[key] if shown else len(places), values))

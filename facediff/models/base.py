@@ -374,8 +374,7 @@ class AnimationModel(PersonStyles, ABC):
         """Score generated motion, faces that do not move, and the model's motion for another sentence's speech."""
         split = self.evaluation.splits[dataloader_idx]
         batch = self.with_person_styles(batch)
-        styles = {name: self.default_style(name) for name in self.styled_identities()}
-        for name, view in conditioned(batch, self.unseen_identity, self.identities, styles):
+        for name, view in self.views_of_clips(batch):
             self.evaluation.score(self, split, view, name)
             if self.samples and self.test_samples > 1:
                 drawn = torch.stack([self.generate(view, seed=seed) for seed in range(self.test_samples)])
@@ -399,10 +398,12 @@ class AnimationModel(PersonStyles, ABC):
 
         Unseen speakers are conditioned as ``unseen_identity`` says, so that a clip may have several predictions.
         """
-        batch = self.with_person_styles(batch)
+        return [clip for _, view in self.views_of_clips(batch) for clip in self._predicted(view)]
+
+    def views_of_clips(self, batch: Batch) -> list[tuple[str, Batch]]:
+        """The batch as it is tested and predicted, once for each identity that unseen speakers are conditioned on."""
         styles = {name: self.default_style(name) for name in self.styled_identities()}
-        views = conditioned(batch, self.unseen_identity, self.identities, styles)
-        return [clip for _, view in views for clip in self._predicted(view)]
+        return conditioned(self.with_person_styles(batch), self.unseen_identity, self.identities, styles)
 
     def _predicted(self, batch: Batch) -> list[Prediction]:
         """One prediction of every clip of the batch."""

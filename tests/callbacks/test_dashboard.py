@@ -206,6 +206,19 @@ def test_sequence_table_has_sound_and_picture_of_the_worst_clips(
         np.testing.assert_array_equal(np.asarray(Image.open(run.media[row["error"]["path"]])), picture)
 
 
+def test_error_pictures_are_of_the_identity_and_the_style_that_was_scored(
+    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny
+) -> None:
+    """Unseen speakers come once for each training identity, and everybody with the style of all their motion."""
+    model, trainer = make_model(motion_scale="none", unseen_identity="each_seen", style_source="person"), make_trainer()
+    trainer.test(model, datamodule=tiny, verbose=False)
+    rows = [row for row in model.eval().evaluation.sequences() if row["method"] == "model"]
+    assert len({row["identity"] for row in rows}) == 3
+    for clip, row in zip(measure_clips(trainer, model, rows), rows, strict=True):
+        assert clip.condition == row["identity"]
+        assert clip.errors.mean() == pytest.approx(row["mve"], rel=1e-4)
+
+
 def test_worst_clips_of_a_protocol_without_lip_error_are_those_by_mve() -> None:
     rows = [{"method": method, "clip": clip, "mve": mve} for method, clip, mve in (
         ("model", "a", 1.0), ("still", "a", 9.0), ("model", "b", 2.0))]  # fmt: skip
