@@ -25,7 +25,7 @@ from facediff.models import AnimationModel
 from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import sha256
-from facediff.utils.hub import model_hash
+from facediff.utils.hub import model_hash, split_face
 from facediff.utils.provenance import Provenance, recipe_of
 from facediff.version import __version__
 
@@ -86,7 +86,7 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
 def provenance_of(trainer: Trainer, model: AnimationModel, data: SpeechMotionDataModule) -> Provenance:
     """Which training run is being scored, or predicts: seed, checkpoint, components and options."""
     facts = describe_run(model, data)
-    path = Path(trainer.ckpt_path) if isinstance(trainer.ckpt_path, str | Path) else None
+    path = Path(split_face(trainer.ckpt_path)[0]) if isinstance(trainer.ckpt_path, str | Path) else None
     seed, steps = (model.provenance.get(name, "") for name in ("seed", "steps"))
     scored = {"protocol", "metrics", "unseen_identity", "score_by"}  # decide what is measured, not what is trained
     options = {name: value for name, value in model.hparams.items() if name not in scored}

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import pytest
@@ -18,12 +19,14 @@ from lightning.pytorch import Callback, Trainer
 from facediff import registry
 from facediff.callbacks import EmaWithWarmup
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
+from facediff.callbacks.dashboard import provenance_of
 from facediff.cli.app import main
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
 from facediff.models.dual_path.network import TRUNK
 from facediff.models.styles import read_styles, vector_of
+from facediff.utils.checksums import sha256
 from tests.fakes.channels import TinyChannels, write_channels
 from tests.fakes.tiny import VERTICES, Tiny, tiny_model_options, write_tiny
 
@@ -166,6 +169,11 @@ def test_faces_take_each_others_styles(roots: dict[str, Path], trained: Path, tm
     assert main(["style", "extract", str(clip), "--checkpoint", f"{trained}:halved", "-o", str(vector)]) == 0
     model = load_model(trained)
     np.testing.assert_array_equal(vector_of(read_styles(str(vector), "B", model), model), np.load(vector))
+
+
+def test_scores_of_a_face_name_the_checkpoint(roots: dict[str, Path], trained: Path) -> None:
+    data, trainer = Halved(root=str(roots["halved"])), cast(Trainer, SimpleNamespace(ckpt_path=f"{trained}:halved"))
+    assert provenance_of(trainer, load_model(f"{trained}:halved"), data).checkpoint == sha256(trained)
 
 
 def test_a_name_of_no_face_is_refused(trained: Path) -> None:
