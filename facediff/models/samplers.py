@@ -93,7 +93,8 @@ class NoiseProcess:
             shown = scale**2 * self.signal.double()
             signal = shown / (shown + 1 - self.signal.double())
             before = torch.cat([signal.new_ones(1), signal[:-1]])
-            self.signal, self.variances = signal.float(), (1 - signal / before).float()
+            # At most the largest number below 1: samplers and losses divide by the noise, which is never none.
+            self.signal, self.variances = signal.float().clamp_max(1 - 2**-24), (1 - signal / before).float()
         # A product of so many small factors underflows to 0 in float32; dpm_solver's time, ln(ᾱ / (1 − ᾱ)) / 2, would
         # then be infinite at the very step at which sampling starts.
         if not 0 < float(self.signal[-1]) < 1:

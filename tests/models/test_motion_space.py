@@ -360,6 +360,16 @@ def test_noise_scale_is_motion_of_another_size(scale: float) -> None:
     assert (scaled.steps, scaled.schedule, scaled.scale) == (1000, "squaredcos_cap_v2", scale)
 
 
+def test_noise_far_smaller_than_motion_is_never_none() -> None:
+    """Motion in metres is so much smaller than 1 that the noise scale which hides half of it is large."""
+    process = NoiseProcess(scale=300.0)
+    for sampler in (DdpmSampler(process=process), DpmSolverSampler(process=process, spacing="log_snr")):
+        assert sampler.run(lambda noisy, step: 0.5 * noisy, torch.randn(1, 2, 3)).isfinite().all()
+    tables = Preconditioning(1000, 3)
+    tables.fit(process.signal, VARIANCES, torch.ones(3))
+    assert tables.loss.isfinite().all()
+
+
 def test_the_noise_scale_hides_half_of_the_variance() -> None:
     variances = torch.tensor([900.0, 30.0, 2.0, 0.1])
     scale = half_hidden(variances)
