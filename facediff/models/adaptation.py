@@ -45,6 +45,8 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     grown.on_load_checkpoint({**content, ASSETS_KEY: replace(model.assets, identities=identities).state()})
     before = content["state_dict"]
     grown.load_state_dict({name: grow(before[name], value) for name, value in grown.state_dict().items()})
+    if isinstance(grown, DualPathDiffusion) and grown.network.speech_style is not None:
+        grown.network.speech_style.counts[:count] = 0  # or their usual styles would stay those of the others
     return grown
 
 

@@ -14,6 +14,7 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
+from facediff.models.adaptation import with_extra_identities
 from facediff.models.dual_path.graphs import StepGraph
 from facediff.models.dual_path.network import MEMORY, REACH, RIDGE, SpeechStyle
 from facediff.speech.windows import WindowPlan
@@ -108,6 +109,21 @@ def test_hidden_identities_are_left_out(fitted: SpeechStyle) -> None:
     fitted.update(features, mask, style, torch.full((4,), -1))
     torch.testing.assert_close(fitted.styles, before["styles"])
     torch.testing.assert_close(fitted.counts, before["counts"])
+
+
+def test_the_usual_style_of_a_further_identity_is_of_its_own_clips(
+    make_model: Callable[..., DualPathDiffusion], tiny: Tiny
+) -> None:
+    model = make_model(style_from_speech=True)
+    model.adopt(tiny.assets().with_motion_scale(1.0))
+    model.network.speech_style.counts.fill_(1e6)
+    grown = with_extra_identities(model, ["C", *model.identities])
+    assert isinstance(grown, DualPathDiffusion)
+    speech = grown.network.speech_style
+    assert speech.usual(0) is None
+    style = torch.randn(1, speech.styles.shape[1])
+    speech.update(torch.randn(1, FRAMES, 16), torch.ones(1, FRAMES, dtype=torch.bool), style, torch.tensor([0]))
+    torch.testing.assert_close(speech.usual(0), style[0])
 
 
 @pytest.fixture
