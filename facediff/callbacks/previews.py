@@ -35,7 +35,6 @@ from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, cho
 from facediff.metrics import SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
-from facediff.models.evaluation import regions_of
 from facediff.registry import checks_arguments
 from facediff.render import VIEWS, Camera, Renderer, comparison, contact_sheet, portrait, save_image, write_video
 from facediff.speech.audio import fit_length, samples_for
@@ -381,10 +380,11 @@ def draw_clip(
 
 def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, float]:
     """The protocol's metrics of one clip; in this process alone, unlike those of a whole split."""
-    regions = regions_of(model.assets.scored)
-    truth, motion = (model.assets.to_scored(offsets, sample.identity_name) for offsets in (sample.motion, motion))
-    built = model.evaluation.protocol.build(regions["lips"], regions["upper_face"])
-    metrics = cast(Iterable[tuple[str, SequenceMetric]], built.items(copy_state=False))
+    evaluation, truth = model.evaluation, sample.motion
+    if not evaluation.protocol.channels:
+        truth, motion = (model.assets.to_scored(offsets, sample.identity_name) for offsets in (truth, motion))
+    own = evaluation.metrics["val"]["model"].clone().to(motion.device)
+    metrics = cast(Iterable[tuple[str, SequenceMetric]], own.items(copy_state=False))
     (clip,) = align(motion[None], truth[None], clip_names=[sample.name]).clips
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
 

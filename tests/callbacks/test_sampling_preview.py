@@ -22,7 +22,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, length, lip_score
+from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, length, lip_score, scores
 from facediff.cli.app import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
@@ -392,6 +392,23 @@ def test_length_has_a_readable_unit() -> None:
 def test_footer_has_the_score_that_the_protocol_has() -> None:
     assert lip_score({"mve": 0.5, "lve": 0.25}) == "LVE 0.25"
     assert lip_score({"mve": 0.5, "fd_jaw": 2.0}) == "MVE 0.5"
+
+
+def test_scores_of_a_preview_are_in_the_unit_of_the_protocol_and_of_what_it_scores(
+    make_model: MakeModel, tiny: Tiny, tmp_path: Path
+) -> None:
+    """The corpus is in metres and the protocol in millimetres; the other one takes the numbers of channels."""
+    channels = TinyChannels(root=str(write_channels(tmp_path / "channels")))
+    for data, protocol, off, name, expected in (
+        (tiny, "artalk", torch.tensor([3e-3, 0, 0]), "lve", 3.0),
+        (channels, "facediffuser_beat", torch.tensor([0.2]), "mve", 0.2),
+    ):
+        options = {} if data is tiny else {"n_vertices": 6, "space": CHANNELS}
+        model = make_model(protocol=protocol, **options)
+        model.adopt(data.assets())
+        model.evaluation.prepare(model, ["val"], torch.device("cpu"), data)
+        sample = data.dataset("val")[0]
+        assert scores(model, sample, sample.motion + off)[name] == pytest.approx(expected, rel=1e-4)
 
 
 def test_preview_of_channels_draws_what_the_rig_makes_of_them(
