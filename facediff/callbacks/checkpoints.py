@@ -176,7 +176,7 @@ class LastCheckpoint(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Stop if a signal waits: the checkpoint before validation is there."""
+        """Stop if a signal waits; nothing is saved here, where averaged weights are in place."""
         if self._signals.installed:
             _, number = agreed(trainer, False, self._signals.waiting)
             if number:

@@ -142,7 +142,7 @@ def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
 
     For every style, the mean negative log-probability of picking another one of the same identity among all others,
     with cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling
-    alone would be satisfied by one style for everybody. 0 if no identity has two styles.
+    alone would be satisfied by one style for everybody. 0 if no identity has two styles, or there is one identity.
 
     Args:
         styles: style vectors.

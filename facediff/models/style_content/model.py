@@ -243,7 +243,7 @@ class StyleContentDisentanglement(AnimationModel):
             visible.zero_()[assets.regions["face"].to(visible.device)] = 1.0
 
     def context_frames(self) -> tuple[int, int]:
-        """Frames before and after a frame that its motion from speech and from content depends on."""
+        """Frames before and after a frame that its window of speech, or before it the decoder's kernels, reach."""
         speech, ratio = self.network.speech_content, self.network.speech_rate / self.frame_rate
         before = max(self.network.decoder.past_frames, math.ceil(speech.before / ratio))
         return before, math.ceil((speech.window - 1 - speech.before) / ratio)
