@@ -459,7 +459,7 @@ class AnimationModel(PersonStyles, ABC):
         }
         # Measured on the training split once; a resumed or adapted model keeps the scale that its weights know.
         scale = self._assets.motion_scale if self._assets is not None else None
-        untrained = self._assets is None and stage == "fit"
+        untrained = self.untrained and stage == "fit"
         if scale is None and stage == "fit":
             scale = data.motion_scale()
         self.adopt(data.assets().with_motion_scale(scale))

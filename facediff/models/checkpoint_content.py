@@ -97,6 +97,12 @@ class CheckpointContent(LightningModule, Inference):
         return self._assets
 
     @property
+    def untrained(self) -> bool:
+        """Whether no training has begun; the assets of a model that was validated or tested alone have no scale."""
+        measured = self._assets is not None and self._assets.motion_scale is not None
+        return not measured and IMPORTED not in self.provenance
+
+    @property
     def scale(self) -> float:
         """Factor from offsets in the corpus's unit to the motion that the networks see.
 

@@ -479,6 +479,15 @@ def test_a_further_identity_keeps_the_noise_scale(trained: DualPathDiffusion) ->
     assert grown.sampler.signal == trained.sampler.signal
 
 
+def test_a_validation_before_training_leaves_the_measuring_to_it(
+    make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny
+) -> None:
+    model = make_model(motion_space=SPACE, motion_scale="none")
+    make_trainer(limit_val_batches=1).validate(model, tiny, verbose=False)
+    make_trainer(max_steps=1, limit_val_batches=0).fit(model, datamodule=tiny)
+    torch.testing.assert_close(model.motion_space.components.basis[0].norm(), torch.tensor(1.0))
+
+
 def test_training_measures_the_covariance_over_time(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:
     model = make_model(motion_space=partial(SPACE, prior_frames=5), noise_scale="auto")
     make_trainer(max_epochs=1).fit(model, datamodule=tiny)

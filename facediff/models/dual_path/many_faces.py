@@ -78,7 +78,7 @@ class ManyFaces(DualPathDiffusion):
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
         """Let every face take its own corpus."""
-        untrained = self._assets is None
+        untrained = self.untrained
         super().use_corpus(data, stage)
         if stage not in ("fit", "validate"):
             return  # each face is tested by itself

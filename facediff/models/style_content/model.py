@@ -210,7 +210,7 @@ class StyleContentDisentanglement(AnimationModel):
 
     def setup(self, stage: str) -> None:
         """Ask for pairs of clips, and let a basis that was never trained start from the training motion."""
-        new = self._assets is None
+        new = self.untrained
         super().setup(stage)
         data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if stage == "fit":
