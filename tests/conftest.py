@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 from jaxtyping import install_import_hook
@@ -20,6 +23,15 @@ sys.dont_write_bytecode = False
 
 # A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C, which some test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# Thousands of small files are written whole and waited for, which takes a fifth of the tests' time on a disk. Not where
+# programs cannot be run from memory, or memory is small, as in containers by default.
+MEMORY = Path("/dev/shm")  # noqa: S108 - pytest makes a folder of its own there
+if "TMPDIR" not in os.environ and MEMORY.is_dir() and os.access(MEMORY, os.W_OK):
+    runs_programs = not os.statvfs(MEMORY).f_flag & os.ST_NOEXEC
+    if runs_programs and shutil.disk_usage(MEMORY).free > 8 * 2**30:
+        os.environ["TMPDIR"] = tempfile.tempdir = str(MEMORY)
 
 
 # The shapes in the signatures of the mathematics are checked in tests only; the hook must come before the imports, also

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -230,16 +229,15 @@ def test_a_full_disk_leaves_no_study_and_the_next_run_continues(
             raise OSError(28, "No space left on device")
         return real(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(encoding, "_encode", full)
-    assert make(*FEW) == 2
+    with monkeypatch.context() as patch:
+        patch.setattr(encoding, "_encode", full)
+        assert make(*FEW) == 2
     assert "No space" in capsys.readouterr().err
     assert not (place / "study" / "study.json").exists()
     assert len(list((place / "study").rglob("*.mp4"))) == 3
     assert not list((place / "study").rglob("*.partial-*"))
     assert main(["study", "serve", "study"]) == 2
     assert "study make" in capsys.readouterr().err
-    monkeypatch.undo()
-    os.chdir(place)
     assert make(*FEW) == 0
     assert "3 up to date" in capsys.readouterr().out
 
