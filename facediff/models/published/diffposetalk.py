@@ -29,9 +29,7 @@ from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
-from facediff.models.published.clip_style import (
-    style_contrast,
-)
+from facediff.models.published.clip_style import style_contrast
 from facediff.models.published.diffposetalk_network import (
     Condition,
     CosineProcess,
@@ -49,10 +47,6 @@ from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
 Weight = Annotated[float, Range(0, 1e9)]
-
-NO_SPEECH, NO_PERSON = 0.9, 0.55
-"""Above these, a clip's random number takes its speech and style, or its style alone, from it in training: 10 % and
-45 %."""
 
 
 @registry.model.register("DiffPoseTalk")
@@ -219,8 +213,8 @@ class DiffPoseTalk(ParametricModel):
         terms = {"style": style_contrast(usual, own, self.temperature)}
         features = self.hear(batch, frames)
         first = self._randint(max(1, int(frames.max()) - size + 1), len(batch), generator) % frames.clamp_min(1)
-        drop = torch.rand(len(batch), device=self.device, generator=generator)
-        person = torch.where(drop[:, None] > NO_PERSON, self.no_style[0], usual.detach())
+        unheard, unknown = self.dropped(len(batch), generator)
+        person = torch.where(unknown[:, None], self.no_style[0], usual.detach())
         person = torch.cat([self.shapes_of(batch), person], 1)
         before = (self.start_motion.expand(len(batch), -1, -1), self.start_audio.expand(len(batch), -1, -1))
         errors: list[dict[str, Tensor]] = []
@@ -229,7 +223,7 @@ class DiffPoseTalk(ParametricModel):
             heard, _ = window_at(features, frames, first, size)
             if number and not bool(valid.any()):
                 break
-            silent = torch.where(drop[:, None, None] > NO_SPEECH, self.no_audio, heard)
+            silent = torch.where(unheard[:, None, None], self.no_audio, heard)
             step = self._randint(self.process.steps, len(batch), generator) + 1
             noise = torch.randn(clean.shape, device=self.device, generator=generator)
             noisy = self.process.noised(clean, step, noise)
@@ -245,6 +239,18 @@ class DiffPoseTalk(ParametricModel):
             (weight * terms[name] for name, weight in self.weights.items()), start=torch.zeros((), device=self.device)
         )
         return terms
+
+    def dropped(self, count: int, generator: torch.Generator | None) -> tuple[Bool[Tensor, " batch"], ...]:
+        """From which clips training takes their speech, and from which their style.
+
+        As the authors do: for incremental guidance by both, style from 45 % and speech from 10 % of them, among these;
+        for independent guidance half of either; for guidance by one condition, 10 %.
+        """
+        drop, both = torch.rand(count, device=self.device, generator=generator), len(self.guiding) == 2
+        if both and self.guidance == "incremental":
+            return drop > 0.9, drop > 0.55
+        share, other = 0.5 if both else 0.1, torch.rand(count, device=self.device, generator=generator)
+        return drop < share * ("audio" in self.guiding), other < share * ("style" in self.guiding)
 
     def _randint(self, bound: int, count: int, generator: torch.Generator | None) -> Int[Tensor, " batch"]:
         return torch.randint(0, bound, (count,), device=self.device, generator=generator)

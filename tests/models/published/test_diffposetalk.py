@@ -161,6 +161,26 @@ def test_chosen_windows_are_followed(tmp_path: Path) -> None:
     assert type(model.stream(identity="A")).__name__ == "SpeechStream"
 
 
+@pytest.mark.parametrize(
+    ("guiding", "guidance", "speech", "style", "neither"),
+    [
+        (("audio", "style"), "incremental", 0.1, 0.45, 0.1),
+        (("audio", "style"), "independent", 0.5, 0.5, 0.25),
+        (("audio",), "incremental", 0.1, 0.0, 0.0),
+        (("style",), "independent", 0.0, 0.1, 0.0),
+        ((), "incremental", 0.0, 0.0, 0.0),
+    ],
+)
+def test_training_drops_what_guidance_does_without(
+    guiding: tuple[str, ...], guidance: str, speech: float, style: float, neither: float, tmp_path: Path
+) -> None:
+    model = imported(tmp_path)
+    model.guiding, model.guidance = guiding, guidance  # type: ignore[assignment]
+    unheard, unknown = model.dropped(40_000, torch.Generator().manual_seed(0))
+    shares = [float(rows.float().mean()) for rows in (unheard, unknown, unheard & unknown)]
+    assert shares == pytest.approx([speech, style, neither], abs=0.01)
+
+
 def test_process_is_the_clipped_cosine_schedule() -> None:
     process, expected = CosineProcess(500), author.schedule(500)
     for mine, theirs in (("alphas", "alphas"), ("signal", "alpha_bars"), ("deviations", "sigmas_inflex")):
