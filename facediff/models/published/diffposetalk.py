@@ -509,7 +509,7 @@ def level_of(count: int, total: float, squares: float) -> tuple[float, float]:
 
 def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
     """Speech with its ends mirrored, so that HuBERT gives exactly 50 steps a second: 320·n + 80 samples."""
-    missing = 320 * (len(wave) // 320) + 80 - len(wave)
+    missing = 320 * max(1, len(wave) // 320) + 80 - len(wave)
     side = math.ceil(missing / 2)
     if side < 0:
         return wave

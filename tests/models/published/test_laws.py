@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,12 @@ from facediff.editing.direction import Direction
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, load_model
 from facediff.models.adaptation import with_extra_identities
+from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.models.styles import style_from
 from facediff.pipelines.animator import Animator
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
 from tests.models.conftest import no_dropout
+from tests.models.published.conftest import TEXT
 
 MakeMethod = Callable[..., AnimationModel]
 MakeTrainer = Callable[..., Trainer]
@@ -61,6 +64,15 @@ def test_padding_and_other_clips_change_nothing(method: str, make_method: MakeMe
         alone = model.generate(collate([sample]), seed=3)[0]
         torch.testing.assert_close(together[row, : len(alone)], alone, rtol=0, atol=1e-5)
         assert not together[row, len(alone) :].any()
+
+
+def test_the_speech_of_one_frame_is_enough(method: str, make_method: MakeMethod) -> None:
+    """A pretrained network makes a single step of it, where a pair belongs to a frame."""
+    network = partial(Wav2Vec2Encoder, config=TEXT, edges=False)
+    model = with_assets(make_method(method, audio_encoder=network, audio_dim=None))
+    batch = collate(clips(1))
+    assert model.losses(batch)["loss"].isfinite()
+    assert model.generate(batch).isfinite().all()
 
 
 def test_the_loss_of_a_batch_does_not_look_at_padding(method: str, make_method: MakeMethod) -> None:
