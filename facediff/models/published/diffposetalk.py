@@ -477,9 +477,10 @@ class WindowStream(PieceStream):
         """
         self._refuse_finished()
         self._finished = True
-        left = self.model.frames_of(self._sums[0] + len(self._wave)) - self.frames
+        # By rounding, all of the speech may last a frame less than its windows.
+        left = max(0, self.model.frames_of(self._sums[0] + len(self._wave)) - self.frames)
         wanted = self._left(self.frames + left, frames)
-        motion = self._counted([self._next(self._wave, left)[:, :wanted]] if left > 0 else [])
+        motion = self._counted([self._next(self._wave, left)[:, :wanted]] if left else [])
         return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
 
     def _next(self, wave: Float[Tensor, " samples"], frames: int) -> Motion:

@@ -146,6 +146,15 @@ def test_stream_is_the_file_in_the_same_windows(
     assert torch.equal(torch.cat(parts, 1)[0], whole)
 
 
+def test_stream_may_end_with_a_window(tmp_path: Path) -> None:
+    model = imported(tmp_path)
+    model.frame_rate = 29.97 * model.window_frames / 12  # the samples of a window are rounded down
+    assert model.frames_of(model.window_samples) == model.window_frames - 1
+    stream = model.stream(identity="A")
+    given = stream.feed(0.1 * torch.randn(model.window_samples)).shape[1]
+    assert (given, stream.finish().shape[1]) == (model.window_frames, 0)
+
+
 def test_stream_hears_at_the_level_of_the_speech_so_far(tmp_path: Path) -> None:
     model, audio = imported(tmp_path), speech(30)
     first, louder = (model.stream(identity="A") for _ in range(2))
