@@ -199,8 +199,8 @@ class UniTalker(DirectModel):
             return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
         motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
         for row, count in enumerate(frames.tolist()):
-            own = self.in_windows(batch.select([row]))[:count]
-            motion[row, : len(own)] = own
+            own = self.in_windows(batch.select([row]))  # at rates such as 29.97, a frame more or less by rounding
+            motion[row, :count] = own[torch.arange(count).clamp_max(len(own) - 1)]
         return motion
 
     def standardised(self, batch: Batch) -> Batch:
@@ -222,19 +222,18 @@ class UniTalker(DirectModel):
         speech = clip.audio[0, : int(clip.audio_lengths[0])]
         window, step = WINDOW * SAMPLE_RATE, (WINDOW - OVERLAP) * SAMPLE_RATE
         count = max(0, math.ceil((len(speech) / SAMPLE_RATE - WINDOW) / (WINDOW - OVERLAP))) + 1
-        shared = round(OVERLAP * self.frame_rate)
-        # Both ends of the overlap are of one window alone, as published.
-        share = torch.linspace(0, 1, shared, dtype=torch.float64, device=speech.device).view(-1, 1, 1)
         motion = clip.template.new_zeros(0, *clip.template.shape[1:])
         for number in range(count):
             samples = speech[number * step : number * step + window]
             piece = with_speech(clip, samples, max(1, self.frames_of(len(samples))))
             with self.level_of(speech):
                 now = super().generate_frames(piece, piece.frame_lengths, seeds=[0])[0]
-            if number:
-                mixed = (1 - share) * motion[-shared:] + share * now[:shared]
-                now = torch.cat([mixed.to(now), now[shared:]])
-            motion = torch.cat([motion[:-shared] if number else motion, now])
+            first = round(number * (WINDOW - OVERLAP) * self.frame_rate)
+            before = motion[first : first + len(now)]
+            # Both ends of the overlap are of one window alone, as published.
+            share = torch.linspace(0, 1, len(before), dtype=torch.float64, device=speech.device).view(-1, 1, 1)
+            mixed = (1 - share) * before + share * now[: len(before)]
+            motion = torch.cat([motion[:first], mixed.to(now), now[len(before) :]])
         return motion
 
     def level_of(self, speech: Float[Tensor, " samples"]) -> AbstractContextManager[None]:

@@ -12,10 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facediff.data import collate
+from facediff.data import Assets, Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import UniTalker, import_checkpoint
 from facediff.models.published.autoregressive import periodic_bias, periodic_positions
+from facediff.models.published.base import DirectModel
 from facediff.models.published.unitalker_checkpoints import DATA
 from facediff.utils.licences import commercial_use
 from tests.fakes.tiny import RATE, SEEN, VERTICES
@@ -145,6 +146,26 @@ def test_long_speech_is_standardised_and_again_in_each_window(kind: str, tmp_pat
     expected = torch.cat([pieces[0][:600], shared, pieces[1][150:]])
     values = imported(path).animate(speech, identity="common").vertices[..., 0]
     torch.testing.assert_close(values, expected, rtol=0, atol=1e-5)
+
+
+def test_windows_lie_at_their_time_at_any_frame_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Speech that rises by 1 a second, and a network whose motion is the speech of a frame's moment."""
+    sizes = {"n_vertices": 1, "identities": ["A"], "frame_rate": 29.97, "components": 0}
+    model = UniTalker(audio_encoder=MEL, audio_dim=16, **sizes)
+    vertex = torch.zeros(1, dtype=torch.long)
+    regions = {"lips": vertex, "upper_face": vertex}
+    model.adopt(Assets("tiny", True, "m", 29.97, ["A"], {"A": torch.zeros(1, 3)}, None, regions))
+
+    def generate(self: UniTalker, batch: Batch, frames: Tensor, **_: object) -> Tensor:
+        places = (torch.arange(int(frames[0])) * 16_000 / 29.97).long()
+        return batch.audio[:, places.clamp_max(batch.audio.shape[1] - 1), None, None].expand(-1, -1, 1, 3)
+
+    monkeypatch.setattr(DirectModel, "generate_frames", generate)
+    for seconds in (150.0, 151.03):
+        clip = model.clip_of(torch.arange(seconds * 16_000) / 16_000, "A", None)
+        count = model.frames_of(clip.audio.shape[1])
+        motion = model.generate_frames(clip, torch.tensor([count]), seeds=[0])[0, :, 0, 0]
+        torch.testing.assert_close(motion, torch.arange(count) / 29.97, rtol=0, atol=0.02)
 
 
 def test_neutral_values_are_added_to_every_head(tmp_path: Path) -> None:
