@@ -168,7 +168,7 @@ class LamAudio2Expression(DirectModel):
             heard = torch.cat([before, chunk])
             count = self.frames_of(len(heard))
             # Rounded down as the published code does: a chunk of no whole number of frames gives one frame more.
-            first = int(CONTEXT_FRAMES - len(chunk) / SAMPLE_RATE * 30)
+            first = int(count - len(chunk) / SAMPLE_RATE * self.frame_rate)
             window_clip = with_speech(clip, heard, count)
             motion = super().generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
             values = motion.flatten(1)[first:].detach().float().cpu().numpy()

@@ -121,6 +121,18 @@ def test_the_published_stream(context: bool, tmp_path: Path) -> None:
     torch.testing.assert_close(values, torch.cat(parts), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("rate", [25, 60])
+def test_chunks_fill_the_speech_at_other_frame_rates(rate: int, tmp_path: Path) -> None:
+    _, path = author(tmp_path, 0)
+    model, speech = imported(path, chunks="silence", frame_rate=rate), speech_of(40_000)
+    parts = [
+        model.stream_chunks(model.clip_of(part, "0", None), 16_000, context=False) for part in speech.split(16_000)
+    ]
+    whole = model.animate(speech, identity="0").vertices
+    assert [len(next(part)) for part in parts] == [rate, rate, math.ceil(rate / 2)]
+    assert whole[-1].any()
+
+
 def test_hyperparameters_come_from_one_file(tmp_path: Path) -> None:
     reference, path = author(tmp_path, 0)
     file = tmp_path / "hparams.json"
