@@ -190,6 +190,8 @@ class CodeTalker(AutoregressiveModel):
         Raises:
             FaceDiffError: if there is none, with what to train first; or as :meth:`take_prior`.
         """
+        if resumed:
+            self.prior_file = None  # the checkpoint holds the prior
         if self.stage == "prior" or resumed or self._assets is not None:
             return
         if self.prior_file is None:

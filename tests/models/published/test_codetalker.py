@@ -325,14 +325,17 @@ def test_another_models_checkpoint_is_no_prior(
             make_trainer().fit(make_method("CodeTalker", prior=str(path)), datamodule=tiny)
 
 
+@pytest.mark.parametrize("prior", [None, "moved.ckpt"])
 def test_a_predictor_goes_on_without_the_priors_file(
-    make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
+    prior: str | None, make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
 ) -> None:
     trainer = make_trainer(limit_train_batches=1, limit_val_batches=0)
     trainer.fit(make_method("CodeTalker"), datamodule=tiny)
     trainer.save_checkpoint(tmp_path / "model.ckpt")
     again = make_trainer(max_epochs=2, limit_train_batches=1, limit_val_batches=0)
-    again.fit(make_method("CodeTalker", prior=None), datamodule=tiny, ckpt_path=tmp_path / "model.ckpt")
+    model = make_method("CodeTalker", prior=prior)
+    model.check_training(resumed=True)  # as `facediff fit` does
+    again.fit(model, datamodule=tiny, ckpt_path=tmp_path / "model.ckpt")
     assert again.current_epoch == 2
 
 
