@@ -133,7 +133,7 @@ class OffsetModel(AutoregressiveModel):
     ]:
         """Scaled motion, as predicted in training and true, and the frames of each clip that are compared."""
         frames = self.trained_frames(batch)
-        self.check_length(frames, batch.names[0])
+        self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
         truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
         if self.teacher_forcing:
@@ -148,7 +148,7 @@ class OffsetModel(AutoregressiveModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """Frame by frame; nothing is random."""
-        self.check_length(frames, batch.names[0])
+        self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
         motion = self.network.generate(style, memory, self.loop)
         return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale

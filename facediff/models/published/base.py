@@ -153,8 +153,8 @@ class PublishedModel(AnimationModel):
         above = (self.table_frames or 0) / self.frame_rate if by_windows else math.inf
         self.windows = type(self.windows)(above=above)
 
-    def check_length(self, frames: Int[Tensor, " batch"], source: str) -> None:
-        """Refuse more frames than the published tables have.
+    def check_length(self, frames: Int[Tensor, " batch"], names: Sequence[str]) -> None:
+        """Refuse clips of more frames than the published tables have.
 
         Raises:
             FaceDiffError: with what to do instead.
@@ -162,9 +162,9 @@ class PublishedModel(AnimationModel):
         most, rows = int(frames.max()), self.table_frames
         if rows is not None and most > rows and self.long_speech != "extend":
             raise OptionError.naming(
-                f"{source}: {most / self.frame_rate:.1f} s are {most} frames, and {type(self).__name__}'s published "
-                f"tables have {rows} ({rows / self.frame_rate:g} s); animate it in windows ({{window}} 4), or make the "
-                f"model with long_speech=extend or long_speech=windows"
+                f"{names[int(frames.argmax())]}: {most / self.frame_rate:.1f} s are {most} frames, and "
+                f"{type(self).__name__}'s published tables have {rows} ({rows / self.frame_rate:g} s); animate it in "
+                f"windows ({{window}} 4), or make the model with long_speech=extend or long_speech=windows"
             )
 
     def tested_frames(self, batch: Batch) -> list[int]:

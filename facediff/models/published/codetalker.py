@@ -299,7 +299,7 @@ class CodeTalker(AutoregressiveModel):
         self, batch: Batch, truth: Tensor, frames: Int[Tensor, " batch"], generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
         """The squared error of motion, and the distance of features from true motion's codes, in parallel."""
-        self.check_length(frames, batch.names[0])
+        self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
         before = truth
         if self.history == "own":
@@ -328,7 +328,7 @@ class CodeTalker(AutoregressiveModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """Frame by frame; nothing is random."""
-        self.check_length(frames, batch.names[0])
+        self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
         generate = self.literal if self.loop == "literal" else self.cached
         values, fed_back = generate(style, memory, int(frames.max()), progress or iter)

@@ -206,7 +206,7 @@ class DiffSpeaker(DiffusionModel):
     ) -> dict[str, Tensor]:
         """The losses with given random numbers."""
         frames = batch.frame_lengths
-        self.check_length(frames, batch.names[0])
+        self.check_length(frames, batch.names)
         mask = frame_mask(frames, batch.motion.shape[1])[..., None]
         clean = (batch.motion * self.scale).flatten(2) * mask
         signal = self.signal.to(clean)[step].view(-1, 1, 1)
@@ -241,7 +241,7 @@ class DiffSpeaker(DiffusionModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
         """The reverse process from noise that is drawn once."""
-        self.check_length(frames, batch.names[0])
+        self.check_length(frames, batch.names)
         network, conditions = self.network, self.conditions(batch, frames)
         start = noise(batch.template.new_empty(len(batch), int(frames.max()), self.dims * self.n_vertices))
         space = self.state_space()

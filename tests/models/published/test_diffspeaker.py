@@ -146,6 +146,8 @@ def test_more_frames_than_the_tables_have(make_method: MakeMethod, monkeypatch: 
                 model.animate(speech, identity="A")
             short = model.animate(speech[: 20 * 640 + 80], identity="A").vertices
             assert len(short) == 20
+            with pytest.raises(FaceDiffError, match="clip1: 1.0 s"):
+                model.losses(collate(clips(9, 24)))
         else:
             sizes[way] = len(model.animate(speech, identity="A").vertices)
     assert sizes == {"windows": 21, "extend": 21}
