@@ -13,7 +13,7 @@ from pathlib import Path
 from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.importing import GRAPH, facts_and_faces, read_weights, with_options
+from facediff.models.published.importing import GRAPH, convert, facts_and_faces, read_weights, with_options
 from facediff.models.published.recognition import RECOGNISERS, AuthorsWeights, Recogniser
 
 MOST = 40
@@ -69,7 +69,7 @@ def compared(
     try:
         options, _ = options.with_hparams()
         facts, _ = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
-        converted = method.convert(weights, facts)
+        converted = convert(weights, method, facts, options)
         arguments = with_options(method.method, converted, facts.model_options)
         model = registry.model.get(method.method)(**facts.sizes(), **arguments)
     except FaceDiffError as error:

@@ -96,10 +96,7 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     method = recognise(weights)
     options, unused = options.with_hparams()
     facts, own = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
-    converted = method.convert(weights, facts)
-    ignore = options.all_model_options().get("ignore", ())
-    for prefix in [ignore] if isinstance(ignore, str) else ignore:
-        weights.ignore(prefix, "left out as asked")
+    converted = convert(weights, method, facts, options)
     if left := weights.left():
         raise OptionError.naming(
             f"{weights.source}: holds tensors that {method.method} has no use for ({listed(left)}); is it a variant "
@@ -112,6 +109,17 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     model.adopt(assets)
     label(model, method, facts.dataset, () if own is None else own.licences)
     return Imported(model.eval(), facts.dataset, len(weights.renamed), weights.ignored, [*weights.notes, *notes])
+
+
+def convert(
+    weights: AuthorsWeights, method: Recogniser, facts: CheckpointFacts, options: ImportOptions
+) -> dict[str, Any]:
+    """The model's options; every tensor is used, or left out as the user asks, or left."""
+    ignore = options.all_model_options().get("ignore", ())
+    converted = method.convert(weights, facts)
+    for prefix in [ignore] if isinstance(ignore, str) else ignore:
+        weights.ignore(prefix, "left out as asked")
+    return converted
 
 
 def facts_and_faces(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,8 @@ from tests.models.published.test_lam import author
 OPTIONS = ImportOptions(audio_config=TEXT)
 
 
-def report(path: Path) -> str:
-    return "\n".join(examine([path], OPTIONS))
+def report(path: Path, options: ImportOptions = OPTIONS) -> str:
+    return "\n".join(examine([path], options))
 
 
 def test_a_file_that_fits(tmp_path: Path) -> None:
@@ -28,6 +29,15 @@ def test_a_file_that_fits(tmp_path: Path) -> None:
     assert "method: LamAudio2Expression" in lines
     assert "all fit" in lines
     assert "not needed: backbone.identity_encoder.grus.weight_hh_l0" in lines
+
+
+def test_what_the_import_leaves_out_is_left_out_here(tmp_path: Path) -> None:
+    made, path = author(tmp_path, 0)
+    torch.save({"state_dict": {**made.state_dict(), "extra.weight": torch.ones(2)}}, path)
+    assert "of no use: extra.weight (2,)" in report(path)
+    lines = report(path, replace(OPTIONS, option=["ignore=extra."]))
+    assert "not needed: extra.weight left out as asked" in lines
+    assert "all fit" in lines
 
 
 def test_every_difference_is_named(tmp_path: Path) -> None:
