@@ -160,16 +160,21 @@ def content_of(model: CheckpointContent) -> dict[str, Any]:
     """What a checkpoint of the model holds for inference; no folder of this machine is named in it."""
     content: dict[str, Any] = {"hyper_parameters": dict(model.hparams), "state_dict": model.state_dict()}
     model.on_save_checkpoint(content)
-    content[DATA_SOURCE_KEY] = {name: text for name, text in model.data_source.items() if name == "class_path"}
-    if model.data_options:
-        content[DATA_OPTIONS_KEY] = {
-            name: value for name, value in model.data_options.items() if name not in ("root", "people")
-        }
-    for key in ("hyper_parameters", DATA_OPTIONS_KEY):
-        content[key] = without_paths(content.get(key, {}))
+    return without_folders({**content, DATA_OPTIONS_KEY: model.data_options})
+
+
+def without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a checkpoint without its corpus's folders and any absolute path; so that of its further faces."""
+    source, options = content[DATA_SOURCE_KEY], content.get(DATA_OPTIONS_KEY) or {}
+    cleaned = {
+        **content,
+        "hyper_parameters": without_paths(content["hyper_parameters"]),
+        DATA_SOURCE_KEY: {name: text for name, text in source.items() if name == "class_path"},
+        DATA_OPTIONS_KEY: without_paths({name: options[name] for name in options if name not in ("root", "people")}),
+    }
     if FACES_KEY in content:
-        content[FACES_KEY] = without_paths(content[FACES_KEY])
-    return content
+        cleaned[FACES_KEY] = {name: without_folders(face) for name, face in content[FACES_KEY].items()}
+    return cleaned
 
 
 def without_paths(value: Any) -> Any:  # noqa: ANN401 - plain data

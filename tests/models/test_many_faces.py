@@ -194,13 +194,19 @@ def read_checkpoint_of_one_face(trained: Path) -> None:
 
 
 def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> None:
-    load_model(trained).save_pretrained(tmp_path / "folder")
+    whole = load_model(trained)
+    assert isinstance(whole, ManyFaces)
+    for part in (whole, whole.face("halved")):
+        part.data_options["root"] = part.data_source["root"] = "corpora/mine"
+    whole.save_pretrained(tmp_path / "folder")
     speech = torch.sin(torch.arange(8000) / 9) * 0.3
     for name in ("", ":halved"):
         one, other = (load_model(f"{path}{name}") for path in (trained, tmp_path / "folder"))
         animations = [model.animate(speech, identity="A", seed=2).vertices for model in (one, other)]
         assert torch.equal(*animations)
-    assert str(tmp_path.parent) not in (tmp_path / "folder" / "config.json").read_text()
+    config = (tmp_path / "folder" / "config.json").read_text()
+    assert str(tmp_path.parent) not in config
+    assert "corpora/mine" not in config
 
 
 @pytest.mark.slow
