@@ -604,8 +604,7 @@ CODEC_NAMES = (
 
 def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     """ARTalk's tensors under the names of this file, and its options."""
-    level = weights.get("lvl_idx").flatten().long()
-    scales = [int(count) for count in torch.bincount(level)]
+    scales: list[int] = torch.unique(weights.get("lvl_idx"), return_counts=True)[1].tolist()
     _, past, dim = weights.shape("prev_pos_embed", 3)
     first = next((name for name in weights.tensors if name.endswith("feature_extractor.conv_layers.0.conv.weight")), "")
     prefix = first.removesuffix("feature_extractor.conv_layers.0.conv.weight") or "audio_encoder."
@@ -654,7 +653,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
         "style_dim": style_dim,
         "style_layers": count_layers(weights, "style_encoder.encoder.transformer.layers."),
         "style_rows": rows,
-        "memory_chunks": past // sum(scales),
+        "memory_chunks": past // max(1, sum(scales)),
     }
 
 

@@ -57,7 +57,7 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
     weights.ignore("diffusion_sched.betas", "follows from the other variances")
     weights.ignore("diffusion_sched.sigmas_flex", "deviations of a sampler with more noise, which nothing uses")
     mask = "denoising_net.alignment_mask"
-    width = int((~weights.get(mask).bool())[1].sum()) if mask in weights else 0
+    width = int((~weights.get(mask).bool())[1:2].sum()) if mask in weights and weights.shape(mask) else 0
     weights.ignore(mask, "follows from the number of frames")
     for name, value in facts.details.items():
         weights.add(name, value)

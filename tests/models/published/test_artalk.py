@@ -12,6 +12,7 @@ from scipy.signal import savgol_coeffs
 from torch import Tensor
 
 from facediff.data import Reference
+from facediff.errors import FaceDiffError
 from facediff.mesh.flame import Flame
 from facediff.models import import_checkpoint
 from facediff.models.published.artalk import ARTalk, smoothed
@@ -132,3 +133,10 @@ def test_imported_with_flame_animates_to_parameters_and_vertices(state: dict[str
     exact = decode_flame(Flame.read(flame), raw, layout("flame_artalk"))
     assert finished.vertices.shape == exact.shape
     assert any("MIT" in str(licence) for licence in imported.licences)
+
+
+@pytest.mark.parametrize("levels", [torch.zeros(0), -torch.ones(4), torch.full((4,), 1e15)])
+def test_damaged_levels_are_refused(levels: Tensor, state: dict[str, Tensor], tmp_path: Path) -> None:
+    torch.save({**state, "lvl_idx": levels}, tmp_path / "damaged.pt")
+    with pytest.raises(FaceDiffError):
+        import_checkpoint(tmp_path / "damaged.pt", audio_config=AUDIO_CONFIG)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from facediff.data import Reference
+from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, import_checkpoint
 from facediff.models.inference import Style
 from facediff.models.published.clip_style import ClipStyleEncoder, style_contrast
@@ -225,3 +226,12 @@ def test_style_of_a_padded_clip_is_its_own() -> None:
     with torch.no_grad():
         alone, padded = encoder(clip), encoder(torch.nn.functional.pad(clip, (0, 0, 0, 5), value=3.0), mask)
     torch.testing.assert_close(padded, alone, rtol=1e-5, atol=1e-6)
+
+
+def test_a_mask_of_another_form_is_refused(tmp_path: Path) -> None:
+    files = author.write_diffposetalk(tmp_path, head=True)
+    content = torch.load(files[0], weights_only=False)
+    content["model"]["denoising_net.alignment_mask"] = torch.tensor(True)
+    torch.save(content, files[0])
+    with pytest.raises(FaceDiffError, match="alignment_mask"):
+        import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics())
