@@ -20,14 +20,7 @@ from torch import Tensor, nn
 
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import Features, FrozenEncoder, Lengths, Waves, by_length, fingerprint, fourier
-from facediff.models.layers import (
-    Width,
-    all_states,
-    exporting,
-    frame_mask,
-    longest,
-    sliding,
-)
+from facediff.models.layers import Width, all_states, exporting, frame_mask, longest, sliding
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import quoted

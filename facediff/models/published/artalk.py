@@ -30,12 +30,7 @@ from facediff.models.published.artalk_codec import BitCodec, Bits, resized
 from facediff.models.published.clip_style import convert_style
 from facediff.models.published.diffposetalk_checkpoints import count_layers
 from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
-from facediff.models.published.recognition import (
-    AuthorsWeights,
-    CheckpointFacts,
-    Recogniser,
-    register,
-)
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
@@ -192,7 +187,7 @@ class ARTalk(ParametricModel):
         latest = max(1, int(frames.max()) - size // 2)
         first = torch.randint(0, latest, (len(batch),), device=self.device, generator=generator) % frames.clamp_min(1)
         now, valid = window_at(motion, frames, first, size)
-        past, was = window_at(motion, frames, (first - size).clamp_min(0), size)
+        past, _ = window_at(motion, frames, (first - size).clamp_min(0), size)
         # Before the first frame there is the face at rest, as in generation.
         past = past * (first >= size)[:, None, None]
         codes = self.codec.encode(torch.cat([past, now], 1))

@@ -375,8 +375,6 @@ def periodic_bias(
     # ALiBi's slopes (Press et al. 2022) on the distance in whole periods, as in FaceFormer, so that the frames of one
     # period count alike. Added to the scaled scores, as PyTorch does with a float mask.
     slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
-    # ALiBi's slopes (Press et al. 2022), with whole periods in place of frames: within one period no frame is nearer
-    # than another, as published.
     bias = -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
     return bias.masked_fill(distance < 0, -torch.inf)
 
@@ -498,7 +496,6 @@ def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts, *, a
     """
     weights.shape(name, 3)
     table = weights.get(name)[0].float()
-    # The published table repeats its rows, so the first row that equals row 0 is one period away.
     # The period is no entry of the checkpoint, but the first row that repeats row 0 tells it.
     same = (table[1:] - table[0]).abs().amax(1) < 1e-6
     period = int(same.int().argmax()) + 1 if bool(same.any()) else len(table)

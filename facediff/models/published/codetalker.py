@@ -132,7 +132,6 @@ class CodeTalker(AutoregressiveModel):
         self.output: Output = output
         self.commitment, self.quantisation_weight = commitment, quantisation_weight
         self.feature_weight = feature_weight
-        # The project's two data sets differ in these.
         # VOCASET's predictor has 6 layers and 16 tokens of 64 channels a frame, BIWI's 12 layers and 8 tokens of 128;
         # the product is 1024 both times. BIWI's prior alone has linear maps around its tokens, and no bias in its last
         # map.

@@ -85,7 +85,6 @@ class FaceDiffuser(DiffusionModel):
             raise ArgumentError({"skip_steps": skip_steps, "diffusion_steps": self.steps}, "no step would be left")
         self.skip_steps, self.noised = skip_steps, noised
         self.encode_speech, self.sampling_space = encode_speech, sampling_space
-        # 500 steps on BIWI, 1000 elsewhere; a checkpoint tells it by the width of its one-hot step.
         self.posterior = Posterior(self.steps)
         self.network = FaceDiffuserNetwork(
             audio_width=2 * self.audio_width,

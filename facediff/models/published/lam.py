@@ -27,12 +27,7 @@ from facediff.models.layers import Heads, Share, Width, exporting, frame_mask
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
 from facediff.models.published.convolutions import AUTHORS_NAMES, ConvolutionStack
 from facediff.models.published.lam_finishing import CONTEXT_FRAMES, Finish, Finishing
-from facediff.models.published.recognition import (
-    AuthorsWeights,
-    CheckpointFacts,
-    Recogniser,
-    register,
-)
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import Space
 from facediff.utils import SAMPLE_RATE

@@ -19,13 +19,7 @@ from facediff.models.published.autoregressive import read_period
 from facediff.models.published.convolutions import AUTHORS_NAMES
 from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.recognition import (
-    AuthorsWeights,
-    CheckpointFacts,
-    FaceFacts,
-    Recogniser,
-    register,
-)
+from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, FaceFacts, Recogniser, register
 from facediff.models.published.unitalker import COMMON, UniTalker
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.layouts import find_layout, parametric
