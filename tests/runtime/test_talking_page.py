@@ -140,11 +140,25 @@ def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> No
     offsets = np.array(page.evaluate("[...facediff.page.animated.at(1)]")) * 1000
     template = np.array(page.evaluate("[...facediff.page.stage.face.template]"))
     np.testing.assert_allclose(page.evaluate(shown), template + offsets, atol=1e-3)
+    page.evaluate("(page => (page.seek(10), page.step(1), page.step(1)))(facediff.page)")  # quicker than pictures
+    page.wait_for("facediff.frame === 12")
+    # A pause while the model is not as far yet is none of its waits, which end by themselves.
+    playing = "document.getElementById('play').classList.contains('playing')"
+    page.evaluate("(window.plays = 0, document.getElementById('sound').addEventListener('play', () => plays++), 0)")
+    ready = "Object.assign(page.animated, {{ ready: {}, done: {} }})".format
+    page.evaluate(f"(page => (page.seek(36), {ready(30, 'false')}, page.play(), 0))(facediff.page)")
+    page.wait_for(f"facediff.page.waits && {playing}")
+    page.evaluate(f"(page => (page.pause(), {ready(40, 'true')}, page.play(), 0))(facediff.page)")
+    page.wait_for(f"!facediff.playing && facediff.frame === 39 && !{playing}")
+    assert page.evaluate("plays") == 2
     # Another face of the model has no animation yet.
+    page.press(" ")
+    page.wait_for(playing)
     page.evaluate(
         "(find => (find.value = 'B', find.dispatchEvent(new Event('change'))))(document.getElementById('identity'))"
     )
     assert page.evaluate("document.getElementById('play').disabled && !document.getElementById('again').disabled")
+    page.wait_for(f"!{playing}")
     page.evaluate("document.getElementById('again').click()")
     page.wait_for("facediff.finished")
     assert page.evaluate("facediff.page.animated.names.identity") == "B"

@@ -27,7 +27,7 @@ class TalkingPage {
     this.animated = null;
     this.listening = null;
     this.shown = -1;
-    this.playing = false; // whether somebody wants it to play; it may wait for the model
+    this.playing = this.waits = false; // whether somebody wants it to play, and whether it waits for the model
     this.about = null;
     this.clock = new SilentClock(0);
   }
@@ -354,7 +354,7 @@ class TalkingPage {
   }
 
   pause() {
-    this.playing = false;
+    this.playing = this.waits = false;
     this.clock.pause();
     this.stage?.perform(false);
   }
@@ -367,22 +367,32 @@ class TalkingPage {
   }
 
   step(frames) {
-    const at = this.shown;
+    if (!this.animated) return;
     this.pause();
-    this.seek(at + frames);
+    this.seek(this.frame + frames);
+  }
+
+  /** The frame that the clock is at. */
+  get frame() {
+    return frameAt(this.clock.time, this.animated.frameRate, this.animated.frames);
   }
 
   tick() {
     requestAnimationFrame((now) => {
       if (this.listening) this.listening.tick(now);
       else if (this.animated) this.follow();
+      const pressed = find("play");
+      if (pressed.classList.contains("playing") !== this.playing) {
+        pressed.classList.toggle("playing", this.playing);
+        pressed.setAttribute("aria-label", this.playing ? "Pause" : "Play");
+      }
       this.tick();
     });
   }
 
   /** Show the frame that the clock is at; where the model is not as far yet, the clock waits. */
   follow() {
-    const { animated } = this, frame = frameAt(this.clock.time, animated.frameRate, animated.frames);
+    const { animated, frame } = this;
     if (this.playing && !this.clock.playing) {
       const ahead = Math.min(animated.frames, frame + animated.frameRate);
       if (this.waits && (animated.done || animated.ready >= ahead)) {
@@ -399,11 +409,6 @@ class TalkingPage {
         this.clock.pause();
       }
       return;
-    }
-    const pressed = find("play");
-    if (pressed.classList.contains("playing") !== this.playing) {
-      pressed.classList.toggle("playing", this.playing);
-      pressed.setAttribute("aria-label", this.playing ? "Pause" : "Play");
     }
     if (frame === this.shown) return;
     this.shown = frame;
