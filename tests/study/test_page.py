@@ -123,7 +123,12 @@ def test_from_a_folder_without_a_network_in_a_narrow_window(made: Path, browser:
         "(window.blobs = [], window.natural = URL.createObjectURL.bind(URL), "
         "URL.createObjectURL = (blob) => (blobs.push(blob), natural(blob)), null)"
     )
+    page.wait_for("!document.getElementById('last').hidden")
+    page.evaluate(f"{select}.value = 'en', {select}.onchange()")
+    assert page.evaluate("document.getElementById('fields').textContent").endswith("(optional)")
     finish(page, HOSTILE)
+    page.evaluate(f"{select}.value = 'de', {select}.onchange()")
+    assert page.evaluate("document.getElementById('thanks-more').textContent").startswith("Bitte laden")
     assert page.evaluate("document.getElementById('download').href").startswith("blob:")
     content = json.loads(page.evaluate("blobs.at(-1).text()"))
     rater = check_rater(content, study, "download")
@@ -142,8 +147,13 @@ def test_answers_wait_while_the_server_is_away(made: Path, serve: Serve, browser
     answer(page)
     page.wait_for("!document.getElementById('status').hidden")
     assert page.evaluate("facediffStudy.state.sent") == 0
+    page.wait_for("document.getElementById('video').readyState > 1")  # the next one is no reason to say no more
+    assert page.evaluate("!document.getElementById('status').hidden")
+    page.evaluate("document.getElementById('video').dispatchEvent(new Event('error'))")
     page.evaluate("window.fetch = window.natural")
     page.wait_for("facediffStudy.state.sent === 1")
+    page.wait_for("document.getElementById('status').textContent.startsWith('This video cannot be played')")
+    page.evaluate("document.getElementById('video').dispatchEvent(new Event('loadeddata'))")
     page.wait_for("document.getElementById('status').hidden")
     # What is refused for good keeps nothing back, and stays in the browser.
     refusing = "window.fetch = () => (window.fetch = window.natural, Promise.resolve(new Response('', {status: 400})))"
@@ -222,6 +232,9 @@ def test_wide_and_narrow_windows_have_room_contrast_and_large_targets(
         )
         assert min(targets) >= 43.5
     assert page.evaluate("[...document.querySelectorAll('input')].every((e) => e.labels.length)")
+    choose = "(find => (find.value = 'de', find.onchange()))(document.getElementById('language'))"
+    page.evaluate(choose)
+    assert page.evaluate("document.getElementById('count').textContent").startswith("Video 1 von ")
     # A question whose name every object has is not answered by that.
     page.evaluate(
         "facediffStudy.current.seen = true, facediffStudy.study.questions[0].name = 'constructor', "

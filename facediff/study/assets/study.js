@@ -15,6 +15,7 @@ let served = false;
 let current = null; // the trial on the screen: {trial, since, plays, seen}
 let sending = false;
 const problems = [];
+const warnings = new Set(); // names of the texts that warn
 
 window.addEventListener("error", (event) => problems.push(event.message));
 window.addEventListener("unhandledrejection", (event) => problems.push(String(event.reason)));
@@ -100,16 +101,17 @@ async function send() {
       save();
       show();
     }
-    warn("");
+    warn("waiting", false);
   } catch {
-    warn(text("waiting"));
+    warn("waiting", true);
     setTimeout(send, AGAIN);
   } finally { sending = false; }
 }
 
-function warn(words) {
-  byId("status").hidden = !words;
-  byId("status").textContent = words;
+function warn(name, on = warnings.has(name)) {
+  warnings[on ? "add" : "delete"](name);
+  byId("status").hidden = !warnings.size;
+  byId("status").textContent = [...warnings].map(text).join(" ");
 }
 
 // What is shown.
@@ -128,6 +130,9 @@ function translate() {
   byId("play-reference").textContent = text("play_reference");
   byId("start").textContent = text(state.number === null ? "start" : "resume");
   if (current) showQuestions();
+  if (!byId("last").hidden) showFields();
+  if (!byId("thanks").hidden) showThanks();
+  warn("waiting");
   label();
 }
 
@@ -144,14 +149,12 @@ function show() {
   for (const name of ["welcome", "trial", "last", "thanks"]) byId(name).hidden = name !== section;
   translate();
   if (section === "trial") showTrial(schedule()[done], done, total);
-  if (section === "last") showFields();
-  if (section === "thanks") showThanks();
+  if (section === "last") (byId("fields").querySelector("textarea") || byId("finish")).focus();
   window.scrollTo(0, 0);
 }
 
 function showTrial(trial, done, total) {
   current = { trial, since: performance.now(), plays: 0, seen: false, given: {} };
-  byId("count").textContent = text("progress").replace("{n}", done + 1).replace("{total}", total);
   byId("progress").value = done / total;
   const asksForReference = trial.reference && choices.some((question) => question.reference);
   byId("reference-box").hidden = !asksForReference;
@@ -175,6 +178,7 @@ function preload(trial) {
 function showQuestions() {
   const asked = choices.filter((question) => !question.reference || current.trial.reference);
   current.asked = asked;
+  byId("count").textContent = text("progress").replace("{n}", load().trials.length + 1).replace("{total}", schedule().length);
   byId("choices").replaceChildren(...asked.map((question) => {
     const group = document.createElement("fieldset");
     const legend = document.createElement("legend");
@@ -238,7 +242,6 @@ function showFields() {
     line.append(words, area);
     return line;
   }));
-  (byId("fields").querySelector("textarea") || byId("finish")).focus();
 }
 
 function answersFile() {
@@ -280,10 +283,10 @@ async function begin() {
       save();
     }
     byId("welcome").dataset.left = "yes";
-    warn("");
+    warn("waiting", false);
     show();
   } catch {
-    warn(text("waiting"));
+    warn("waiting", true);
     setTimeout(() => { byId("start").disabled = !byId("agree").checked; }, 500);
   }
 }
@@ -382,8 +385,8 @@ function listen() {
   byId("restart").onclick = () => { if (confirm(text("restart_sure"))) { forget(); location.reload(); } };
   video.addEventListener("play", () => { if (current && video.currentTime < 0.2) current.plays += 1; label(); });
   for (const name of ["pause", "ended", "timeupdate"]) video.addEventListener(name, () => { watched(); label(); });
-  video.addEventListener("error", () => { if (current) warn(text("broken")); });
-  video.addEventListener("loadeddata", () => warn(""));
+  video.addEventListener("error", () => { if (current) warn("broken", true); });
+  video.addEventListener("loadeddata", () => warn("broken", false));
   document.addEventListener("keydown", press);
   window.addEventListener("online", send);
 }
