@@ -96,11 +96,11 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
     examples: dict[str, Path] = {}
     for path in recordings:
         read_recording(path)
-        if path.name in examples:
+        if (name := valid_text(path.name)) in examples:
             raise FaceDiffError(f"--recordings {path}: two have this name; rename one")
-        examples[path.name] = path
+        examples[name] = path
     files: dict[str, bytes | Path] = {
-        PAGE: page(folder.resolve().name, description, arrays, list(examples)).encode(),
+        PAGE: page(valid_text(folder.resolve().name), description, arrays, list(examples)).encode(),
         "worker.js": script_of(WORKER).encode(),
         "capture.js": script_of(("capture",)).encode(),
         "_headers": headers_file().encode(),
@@ -138,7 +138,7 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
     facts: dict[str, Any] = {
         "format": FORMAT,
         "archive": ARCHIVE,
-        "checkpoint": valid_text(title),
+        "checkpoint": title,
         "millimetres": millimetres(face),
         "inward": not np.array_equal(outward(face), face.triangles),
         "delays": DELAYS,

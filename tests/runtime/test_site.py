@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+import sys
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ import soundfile
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.runtime import onnxruntime_web
-from facediff.runtime.site import Site, make_app, make_site, write_site
+from facediff.runtime.site import PAGE, Site, make_app, make_site, write_site
 from facediff.utils.server import LOOPBACK
 from tests.fakes.exported import write_exported
 from tests.fakes.serving import servers
@@ -112,6 +113,15 @@ def test_recordings_are_offered_by_their_names(runtime: dict[str, Path], serve: 
     twin.write_bytes(b"no sound")
     with pytest.raises(FaceDiffError, match=r"other/ü\.wav"):
         make_site(face, runtime, [twin])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no names that are no UTF-8")
+def test_names_that_are_no_text_are_shown_as_far_as_they_are(runtime: dict[str, Path], tmp_path: Path) -> None:
+    folder = write_exported(tmp_path / "fa\udcffce")
+    soundfile.write(tmp_path / "hello.wav", np.sin(np.arange(8000) / 9) / 2, 16_000)
+    site = make_site(folder, runtime, [(tmp_path / "hello.wav").rename(tmp_path / "hell\udcff.wav")])
+    assert "<title>fa\ufffdce" in str(site[PAGE], "utf-8")  # type: ignore[arg-type]
+    assert "recordings/hell\ufffd.wav" in site
 
 
 def test_folder_that_is_interrupted_leaves_nothing(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

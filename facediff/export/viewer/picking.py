@@ -38,6 +38,7 @@ from facediff.export.viewer.packing import Blobs, bounds, millimetres
 from facediff.export.viewer.page import assemble
 from facediff.mesh import Mesh, Similarity
 from facediff.mesh.parts import MeshPart
+from facediff.utils.files import valid_text
 from facediff.utils.server import (
     RefusedError,
     names_of,
@@ -147,7 +148,7 @@ def picking_page(picking: Picking) -> list[str]:
         "picking.html",
         ("style.css", "picking.css"),
         SCRIPTS,
-        {"title": html.escape(f"Pick landmarks: {picking.names[0]} · {picking.names[1]}")},
+        {"title": html.escape(valid_text(f"Pick landmarks: {picking.names[0]} · {picking.names[1]}"))},
         facts,
         blobs,
         loads="img-src data:; connect-src 'self'",

@@ -54,7 +54,7 @@ Serve = Callable[[str], str]
 
 @pytest.fixture
 def picking(tmp_path: Path) -> Picking:
-    return Picking(talking(), other_face(), ("mine", "<b>other</b>.obj"), tmp_path / "map.landmarks.json")
+    return Picking(talking(), other_face(), ("mine", "<b>other</b>\udcff.obj"), tmp_path / "map.landmarks.json")
 
 
 @pytest.fixture
@@ -217,7 +217,7 @@ def places(page: Page, side: str) -> dict[str, np.ndarray]:
 def test_points_are_picked_mirrored_taken_back_and_saved(serve: Serve, picking: Picking, browser: Chromium) -> None:
     page = browser.open(f"{serve(''.join(picking_page(picking)))}/", width=1100, height=800)
     page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
-    assert page.evaluate("document.querySelector('#target .file').textContent") == "<b>other</b>.obj"
+    assert page.evaluate("document.querySelector('#target .file').textContent") == "<b>other</b>\udcff.obj"
     assert page.evaluate("document.getElementById('save').disabled")
     # The built-in face is known: its points are there, each at its vertex.
     for name, place in places(page, "source").items():
