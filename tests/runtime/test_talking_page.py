@@ -201,6 +201,25 @@ def test_resampling_keeps_what_speech_has_and_brings_no_aliases(rate: int, page:
         assert np.abs(gone[middle]).max() < 1e-3
 
 
+def test_recordings_of_other_rates_are_as_long_as_in_python(page: Page, tmp_path: Path) -> None:
+    """Of a file in 16 bits, after a remark of an odd number of bytes; one without a rate is no sound."""
+    for rate, count in ((48_000, 12_352), (11_025, 1000)):
+        wave = np.sin(np.arange(count) * 2500 / rate) / 2
+        soundfile.write(tmp_path / "speech.wav", wave, rate, subtype="PCM_16")
+        content = (tmp_path / "speech.wav").read_bytes()
+        content = content[:36] + b"note\x03\0\0\0abc\0" + content[36:]
+        heard = f"""(async () => {{
+          const bytes = Uint8Array.from(atob("{base64.b64encode(content).decode()}"), (each) => each.charCodeAt(0));
+          const samples = await facediff.page.speechOf(new File([bytes], "speech.wav"));
+          bytes.fill(0, 24, 28);
+          const refused = await facediff.page.speechOf(new File([bytes], "still.wav")).catch((error) => error.message);
+          return [[...samples], refused];
+        }})()"""
+        samples, refused = page.evaluate(heard)
+        np.testing.assert_allclose(samples, read_speech(tmp_path / "speech.wav"), atol=2e-3)
+        assert "still.wav" in refused
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [name for name, (_, options) in CASES.items() if "space" not in options])
 def test_every_model_moves_in_the_page_as_in_python(

@@ -59,5 +59,5 @@ class Resampler {
 function resampled(samples, from, to) {
   if (from === to) return samples;
   const resampler = new Resampler(from, to), tail = new Float32Array(resampler.half + 1);
-  return joined(resampler.feed(samples), resampler.feed(tail)).slice(0, Math.ceil((samples.length * to) / from));
+  return joined(resampler.feed(samples), resampler.feed(tail)).slice(0, Math.round((samples.length * to) / from));
 }

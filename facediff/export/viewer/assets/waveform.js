@@ -5,13 +5,13 @@ function readWav(buffer) {
   const view = new DataView(buffer);
   const name = (at) => String.fromCharCode(...new Uint8Array(buffer, at, 4));
   let rate = 0, channels = 0;
-  for (let at = 12; at + 8 <= buffer.byteLength; at += 8 + view.getUint32(at + 4, true)) {
+  for (let at = 12; at + 8 <= buffer.byteLength; at += 8 + 2 * Math.ceil(view.getUint32(at + 4, true) / 2)) {
     if (name(at) === "fmt ") {
       rate = view.getUint32(at + 12, true);
       // Format 1 is plain numbers; 65534 says the same in a longer form.
       if ([1, 65534].includes(view.getUint16(at + 8, true)) && view.getUint16(at + 22, true) === 16) channels = view.getUint16(at + 10, true);
     }
-    if (name(at) !== "data" || !channels) continue;
+    if (name(at) !== "data" || !channels || !rate) continue;
     const bytes = Math.min(view.getUint32(at + 4, true), buffer.byteLength - at - 8);
     const numbers = new Int16Array(buffer.slice(at + 8, at + 8 + (bytes & ~1)));
     const samples = new Float32Array(Math.floor(numbers.length / channels));
