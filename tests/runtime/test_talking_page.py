@@ -343,6 +343,11 @@ def test_damaged_model_is_refused_in_words_and_names_are_text(
         site[f"model/{name}"] = content
         assert named in page.evaluate(reload)
         site.update(whole)
+    example = "facediff.page.openExample('an example.wav').then(() => '', (error) => error.message)"
+    assert "not loaded" in page.evaluate(example)
+    page.evaluate("facediff.page.facts.threads = 3")
+    assert page.evaluate(reload) == ""
+    assert "WebAssembly, 3 threads" in page.evaluate("document.getElementById('about').textContent")
     hostile = [HOSTILE, *about["faces"][1:]]
     site["model/model.json"] = described(model=HOSTILE, faces=hostile, identities=hostile[:2], styles=about["styles"])
     page.evaluate("(facediff.page.about = null, document.getElementById('identity').replaceChildren())")

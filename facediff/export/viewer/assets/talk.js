@@ -55,7 +55,10 @@ class TalkingPage {
     this.send({ kind: "open", id: 0, base: new URL("model/", location.href).href, runtime: new URL("onnxruntime/", location.href).href, device, threads });
     const { about, arrays } = await opened;
     this.loadSeconds = (performance.now() - began) / 1000;
-    if (this.about) return this.say("");
+    if (this.about) {
+      this.inform();
+      return this.say("");
+    }
     Object.assign(this, { about, arrays });
     this.size = 3 * arrays.templates.shape[1];
     const faces = Uint32Array.from(arrays.faces.data);
@@ -63,6 +66,7 @@ class TalkingPage {
     this.stage = new Stage(find("view"), find("stage"), { template: this.template(0), faces, colours: this.colours(0) }, about.frame_rate);
     this.stage.push(null);
     this.fill();
+    this.inform();
     this.say("open a recording, drop one here, or switch the microphone on");
   }
 
@@ -108,14 +112,18 @@ class TalkingPage {
     this.delays = this.facts.delays.map((each) => ({ ...usual, past: 0, ...each, ...drawn })).filter((each) => each.seconds < usual.seconds);
     this.delays.push(usual);
     find("delay").append(...this.delays.map((plan, number) => new Option(`${(plan.seconds + plan.after).toFixed(1)} s`, number)));
-    const rows = [
+  }
+
+  /** Say what the model is, and what computes it. */
+  inform() {
+    const { about } = this, rows = [
       ["model", about.model], ["trained on", about.synthetic ? `${about.corpus} (synthetic)` : about.corpus], ...Object.entries(about.licences),
       ["mesh", `${this.size / 3} vertices, ${this.arrays.faces.shape[0]} triangles`], ["motion", `${about.frame_rate} frames a second`],
       ["weights", about.precision], ...(about.generation === "sampled" ? [["sampler", `${about.sampler}, ${about.steps.length} steps`]] : []),
       ["size", `${(Object.values(about.sizes).reduce((sum, each) => sum + each, 0) / 1e6).toFixed(1)} MB`],
       ["computed by", `${this.device === "webgpu" ? "WebGPU" : "WebAssembly"}, ${this.threads} ${this.threads === 1 ? "thread" : "threads"}`],
     ].map(([term, words]) => [term, String(words)]);
-    find("about").append(describe(rows));
+    find("about").replaceChildren(describe(rows));
   }
 
   /** Whether a choice means something to the model. */

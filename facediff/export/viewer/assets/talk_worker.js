@@ -115,6 +115,7 @@ onmessage = ({ data }) => {
   // One after the other: ONNX Runtime computes one graph at a time.
   last = last.then(async () => {
     try {
+      if (!model && data.kind !== "open") throw new Error("the model is not loaded: choose what else computes, or load this page again");
       if (!cancelled.has(data.id)) await actions[data.kind](data);
     } catch (error) {
       if (error.message !== CANCELLED) postMessage({ kind: "failed", id: data.id, of: data.kind, message: String(error?.message ?? error) });
