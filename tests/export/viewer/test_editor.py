@@ -187,10 +187,18 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
     )
     page.evaluate(f"{open_file}({json.dumps(saved.read_text())})")
     assert keys_in(page).rows() == wanted.rows()
+    # Frames are those of the animation, as the command takes them.
+    rows = [{"frame": 5, "channel": "brows", "value": 1}, {"time": "0:00:01:05", "channel": "lids", "value": 1}]
+    page.evaluate(f"{open_file}({json.dumps(json.dumps({'keys': rows}))})")
+    assert [key.time for key in keys_in(page).keys] == [5 / RATE, 1 + 5 / RATE]
+    page.evaluate(f"{open_file}({json.dumps(saved.read_text())})")
     for wrong, words in (
         ('{"keys": [{"time": 1, "channel": "brow", "value": 1}]}', "row 1: channel"),
         ('{"keys": [{"time": 1, "channel": "expressiveness", "value": 5}]}', "row 1: value"),
         ('{"keys": [{"time": "1 s", "channel": "expressiveness", "value": 1}]}', "row 1: time"),
+        ('{"keys": [{"frame": 1, "channel": "expressiveness", "value": 1}], "frame_rate": 0}', "row 1: time"),
+        ('{"keys": [null]}', "row 1: channel"),
+        ("null", "keys.json: holds no list"),
         ("{", "nothing was changed"),
     ):
         assert words in page.evaluate(f"{open_file}({json.dumps(wrong)})")

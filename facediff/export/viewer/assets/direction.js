@@ -2,6 +2,7 @@
 
 const KINDS = ["step", "linear", "smooth"];
 const SAME_TIME = 1e-6; // s
+const LATEST = 86_400; // s
 
 /** Change a second at each key: as given, or else such that a smooth curve does not overshoot. */
 function slopesOf(keys) {
@@ -196,11 +197,11 @@ class Direction {
   /** Replace all keys by those of a file's content, in one change that can be undone. */
   open(text) {
     const content = JSON.parse(text);
-    const rows = Array.isArray(content) ? content : content.keys;
+    const rows = Array.isArray(content) ? content : content?.keys;
     if (!Array.isArray(rows)) throw new Error('holds no list called "keys"');
     if ((content.format ?? this.facts.format) !== this.facts.format) throw new Error("is no keys file");
     if ((content.version ?? this.facts.version) !== this.facts.version) throw new Error(`has version ${content.version}`);
-    const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`, content.frame_rate));
+    const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`, content.frame_rate ?? this.facts.frameRate));
     const seen = new Set();
     keys.forEach(({ channel, time }, i) => {
       if (seen.has(`${time} ${channel}`)) throw new Error(`row ${i + 1}: ${channel} has a key at ${time} s already`);
@@ -210,7 +211,7 @@ class Direction {
   }
 
   row(row, where, frameRate) {
-    const { channel, value, interpolation = "smooth", slope } = row;
+    const { channel, value, interpolation = "smooth", slope } = row ?? {};
     const known = typeof channel === "string" && this.channel(channel);
     if (!known) throw new Error(`${where}: channel: ${channel} is not known`);
     const { range } = known;
@@ -218,7 +219,7 @@ class Direction {
     if (!fits) throw new Error(`${where}: value: expected ${range ? `${range[0]} to ${range[1]}` : "a text"}`);
     if (!KINDS.includes(interpolation)) throw new Error(`${where}: interpolation: expected ${KINDS.join(", ")}`);
     const time = secondsOf(row, frameRate);
-    if (!(time >= 0)) throw new Error(`${where}: time: expected seconds, a timecode, or a frame and a frame_rate`);
+    if (!(time >= 0 && time <= LATEST)) throw new Error(`${where}: time: expected seconds up to a day, a timecode, or a frame`);
     const tangent = range && typeof slope === "number" ? { slope } : {};
     return Object.freeze({ time, channel, value, interpolation, ...tangent });
   }
