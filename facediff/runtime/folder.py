@@ -244,12 +244,12 @@ def _check(path: Path, description: Description) -> None:
     if not {*needed} <= {*description.graphs} <= {*needed, *optional}:
         refuse("graphs", ", ".join(needed))
     sampled = description.generation == "sampled"
-    for name, least in (("state", 1), ("kept", 1), ("drawn", 0), ("longest", 0)):
-        if not (least if sampled else 0) <= getattr(description, name) <= 10_000_000:
+    for name, least in (("state", 1), ("kept", 1), ("drawn", 0), ("longest", 0), ("last_step", -1)):
+        if not (least if sampled else min(least, 0)) <= getattr(description, name) <= 10_000_000:
             refuse(name, f"{least} to 10000000")
     for steps, table, least in (("steps", "table", int(sampled)), ("quick_steps", "quick_table", 0)):
         visited, rows = getattr(description, steps), getattr(description, table)
-        if not least <= len(visited) <= MOST_STEPS or not all(isinstance(step, int) and step >= 0 for step in visited):
+        if not least <= len(visited) <= MOST_STEPS or not all(type(n) is int and 0 <= n < 2**31 for n in visited):
             refuse(steps, f"{least} to {MOST_STEPS} steps of the noise process")
         if len(rows) != len(visited) or not all(
             isinstance(row, list)

@@ -411,6 +411,8 @@ def test_damaged_folder_is_refused(case: str, folder: Path, tmp_path: Path) -> N
         ("frame_rate", 0),
         ("table", [[1.0]]),
         ("steps", []),
+        ("steps", [2**70, 0]),
+        ("last_step", 2**70),
         ("windows", {"seconds": -1}),
         ("version", 99),
         ("faces", []),
