@@ -129,11 +129,9 @@ def picking_page(picking: Picking) -> list[str]:
     ]
     facts: dict[str, Any] = {
         "format": FORMAT,
-        "file": picking.file.name,
         "fewest": FEWEST,
         "names": [[name, description] for name, description in NAMES.items()],
         "known": {"source": source_landmarks.vertices, "target": {} if of_target is None else of_target.vertices},
-        "exact": source_landmarks.topology is not None,
         "suggested": suggested,
         "start": [] if picking.start is None else as_rows(picking.start),
         "sides": {

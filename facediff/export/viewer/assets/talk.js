@@ -51,10 +51,8 @@ class TalkingPage {
     this.device = device;
     this.threads = threads;
     this.say("loading the model …", 0);
-    const began = performance.now();
     this.send({ kind: "open", id: 0, base: new URL("model/", location.href).href, runtime: new URL("onnxruntime/", location.href).href, device, threads });
     const { about, arrays } = await opened;
-    this.loadSeconds = (performance.now() - began) / 1000;
     if (this.about) {
       this.inform();
       return this.say("");

@@ -73,7 +73,6 @@ const actions = {
         const piece = samples.subarray(at, at + SAMPLE_RATE);
         outlet.hear(piece);
         outlet.give(await stream.feed(piece));
-        postMessage({ kind: "heard", id, samples: at + piece.length });
       }
       outlet.give(await stream.finish(frames), frames);
     }
@@ -91,12 +90,11 @@ const actions = {
   /** More of the microphone's samples at 16 kHz. */
   async feed({ id, samples }) {
     if (listening?.id !== id) return;
-    const { stream, outlet } = listening, began = performance.now();
+    const { stream, outlet } = listening;
     outlet.hear(samples);
-    const parts = await stream.feed(samples);
-    outlet.give(parts);
+    outlet.give(await stream.feed(samples));
     listening.heard += samples.length;
-    postMessage({ kind: "heard", id, samples: listening.heard, seconds: parts.length ? (performance.now() - began) / 1000 : 0 });
+    postMessage({ kind: "heard", id, samples: listening.heard });
   },
 
   /** The microphone is switched off. */

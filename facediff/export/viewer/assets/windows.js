@@ -90,7 +90,6 @@ function joined(first, second) {
 class SpeechWindows {
   constructor(plan, frameRate, generate, size) {
     Object.assign(this, { plan, frameRate, generate, size });
-    this.frames = 0; // that were given out
     this.speech = new Float32Array(0);
     this.dropped = 0; // samples before these, which no window will hear again
     this.level = new Level();
@@ -113,7 +112,7 @@ class SpeechWindows {
     while (this.heard >= this.sample(this.window.end + this.plan.after)) {
       parts.push(await this.nextWindow(this.window.end + this.plan.after));
     }
-    return this.counted(parts);
+    return parts;
   }
 
   /** The motion that is left. Args: frames in all; as many as fit the speech if absent. */
@@ -128,7 +127,7 @@ class SpeechWindows {
     const { fixed, index } = this.window, left = total - this.window.start - fixed;
     if (this.held && left <= this.plan.overlap) parts.push(this.held.subarray(0, left * this.size));
     else parts.push(await this.make(new SpeechWindow(this.plan, index, left), total));
-    return this.counted(parts);
+    return parts;
   }
 
   /** The window's frames before its overlap with the next, given speech up to frame `heard`; then advance. */
@@ -153,10 +152,5 @@ class SpeechWindows {
     const motion = await this.generate(window, speech, Math.max(heard, seen) - start, this.level.mean, deviation);
     this.held = motion.slice(motion.length - this.plan.overlap * this.size);
     return motion;
-  }
-
-  counted(parts) {
-    this.frames += parts.reduce((sum, part) => sum + part.length / this.size, 0);
-    return parts;
   }
 }
