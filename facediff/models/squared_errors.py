@@ -1,8 +1,8 @@
 """Squared errors of motion and of its changes, in few passes over the vertices.
 
 Losses are means over every coordinate of every frame, so that on a small model most of a training step is reading and
-writing vertices. Written out, error, mask, square, difference and sum are passes of their own, and as many
-again on the way back; here errors are kept once and their gradient is one pass.
+writing vertices. Written out, error, mask, square, difference and sum are passes of their own, and as many again on the
+way back; here errors are kept once and their gradient is one pass.
 """
 
 from __future__ import annotations
