@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, cast, get_args
@@ -37,6 +37,8 @@ STEP_SECONDS = 0.2
 TIMES = Range(0, 86_400)
 SLOPES = Range(-1e6, 1e6)
 MOST_KEYS = 100_000
+INSTEAD_OF = ("acting", "blinks")
+"""Options whose work keys can stand for: a page turns it into keys."""
 COLUMNS = ("time", "frame", "channel", "value", "interpolation", "slope")
 _TIMECODE = re.compile(r"([0-9]{1,2}):([0-9]{2}):([0-9]{2})([:;.,])([0-9]{1,3})", re.ASCII)
 
@@ -153,6 +155,7 @@ class Direction:
     Args:
         keys: in any order; no two of one channel at one time.
         source: what messages call it, such as the file that it was read from.
+        instead_of: options of :data:`INSTEAD_OF` whose work the keys stand for; with them it would be done twice.
 
     Raises:
         FaceDiffError: if there is no key, or two share a channel and a time.
@@ -165,6 +168,7 @@ class Direction:
 
     keys: Sequence[Key]
     source: str = "direction"
+    instead_of: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if not self.keys:
@@ -211,7 +215,9 @@ class Direction:
         return text_shares(self.channels[channel], times)
 
     def refuse_both(self, name: str) -> None:
-        """Refuse keys of what an option of this name sets from beginning to end."""
+        """Refuse keys of what an option of this name sets from beginning to end, or that stand for what it does."""
+        if name in self.instead_of:
+            raise FaceDiffError(f"{self.source}: instead_of: the keys do what --{name} did; omit --{name}")
         for channel in self.under(name):
             raise FaceDiffError(f"{self.source}: channel {channel}: --{name} says the same; give one of them")
 
@@ -232,7 +238,7 @@ class Direction:
     def without_model_channels(self) -> Direction | None:
         """The keys of what changes finished motion; None if there are none."""
         left = tuple(key for key in self.keys if not channel_of(key.channel).in_model)
-        return Direction(left, self.source) if left else None
+        return replace(self, keys=left) if left else None
 
     def rows(self) -> list[dict[str, float | str]]:
         """The keys as the rows of a file."""
@@ -247,15 +253,20 @@ class Direction:
             for key in self.keys
         ]
 
+    def _content(self) -> dict[str, object]:
+        """What a JSON file holds."""
+        instead = {"instead_of": list(self.instead_of)} if self.instead_of else {}
+        return {"format": FORMAT, "version": VERSION, **instead, "keys": self.rows()}
+
     def text(self) -> str:
         """The content of a JSON file, on one line; :meth:`parse` reads it."""
-        return json_text(self.source, {"format": FORMAT, "version": VERSION, "keys": self.rows()}, indent=None)
+        return json_text(self.source, self._content(), indent=None)
 
     def save(self, path: str | Path) -> Path:
-        """Write a .json or .csv file that :func:`read_direction` reads."""
+        """Write a .json or .csv file that :func:`read_direction` reads; a table has no place for ``instead_of``."""
         path = Path(path)
         if path.suffix.lower() == ".json":
-            write_json(path, {"format": FORMAT, "version": VERSION, "keys": self.rows()})
+            write_json(path, self._content())
         elif path.suffix.lower() == ".csv":
             empty = {"slope": ""} if any(key.slope is not None for key in self.keys) else {}
             write_rows(path, [{**empty, **row} if empty else row for row in self.rows()], line_end="\n")
@@ -278,7 +289,7 @@ class Direction:
             content = {"keys": content}
         if not isinstance(content, dict) or not isinstance(content.get("keys"), list):
             raise FaceDiffError(f'{source}: keys: expected an object with a list of rows called "keys"')
-        fields = ("format", "version", "frame_rate", "keys")
+        fields = ("format", "version", "frame_rate", "instead_of", "keys")
         for name in content:
             if name not in fields:
                 raise FaceDiffError(f"{source}: {shown(name)}: {choices(str(name), fields)}")
@@ -291,7 +302,11 @@ class Direction:
             raise FaceDiffError(
                 f"{source}: frame_rate {shown(frame_rate)}: expected {Range(*FRAME_RATES).numbers()} (frames a second)"
             )
-        return cls(tuple(_read_keys(enumerate(content["keys"], 1), source, frame_rate)), source)
+        instead_of = content.get("instead_of", [])
+        if not isinstance(instead_of, list) or not all(name in INSTEAD_OF for name in instead_of):
+            raise FaceDiffError(f"{source}: instead_of {shown(instead_of)}: expected a list of {', '.join(INSTEAD_OF)}")
+        keys = tuple(_read_keys(enumerate(content["keys"], 1), source, frame_rate))
+        return cls(keys, source, tuple(dict.fromkeys(instead_of)))
 
 
 def _mood(**values: float) -> tuple[Key, ...]:

@@ -175,6 +175,20 @@ def test_tables_that_are_wrong_are_refused(tmp_path: Path, text: str, named: str
     assert named in str(raised.value)
 
 
+def test_keys_say_whose_work_they_do(tmp_path: Path) -> None:
+    keys = [Key(0, "lids", 1.0), Key(0, "style", "a")]
+    made = Direction(keys, instead_of=("acting", "blinks"))
+    found = read_direction(made.save(tmp_path / "keys.json"))
+    assert found.instead_of == Direction.parse(made.text(), "text").instead_of == ("acting", "blinks")
+    finished = found.without_model_channels()
+    assert finished is not None
+    assert finished.instead_of == ("acting", "blinks")
+    assert "instead_of" not in Direction(keys).text()
+    for wrong in ("acting", ["sway"], [["acting"]], 1, None):
+        with pytest.raises(FaceDiffError, match="x.json: instead_of .*: expected a list of acting, blinks"):
+            Direction.parse({"instead_of": wrong, "keys": made.rows()}, "x.json")
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="no such file"):
         read_direction(tmp_path / "keys.json")

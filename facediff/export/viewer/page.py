@@ -212,19 +212,20 @@ def _direction_facts() -> dict[str, Any]:
     return {
         "format": direction.FORMAT,
         "version": direction.VERSION,
+        "insteadOf": direction.INSTEAD_OF,
         "stepSeconds": direction.STEP_SECONDS,
         "moods": moods(),
         "channels": channels,
     }
 
 
-def _keys_of(animation: Animation) -> list[dict[str, Any]] | None:
-    """The keys that an animation was made with, as rows; None without any, or if its metadata hold something else."""
+def _direction_of(animation: Animation) -> direction.Direction | None:
+    """The keys that an animation was made with; None without any, or if its metadata hold something else."""
     text = animation.metadata.get(direction.METADATA)
     if text is None:
         return None
     try:
-        return list(direction.Direction.parse(text, animation.name, animation.frame_rate).rows())
+        return direction.Direction.parse(text, animation.name, animation.frame_rate)
     except FaceDiffError:
         return None  # the page shows it as it shows other metadata
 
@@ -249,6 +250,7 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
     opening = mouth_opening(animation)
     pairs = animation.inner_lip_pairs
     template = np.asarray(animation.template, np.float64) * millimetres(animation)
+    made_with = _direction_of(animation)
     return {
         "name": animation.name,
         "vertices": len(animation.template),
@@ -272,7 +274,8 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
         "weighted": channel_facts(animation, blobs),
         "weights": _weights_of(animation, blobs),
         "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),
-        "direction": _keys_of(animation),
+        "direction": None if made_with is None else made_with.rows(),
+        "insteadOf": [] if made_with is None else list(made_with.instead_of),
         "metadata": {str(key): str(value) for key, value in animation.metadata.items()},
     }
 

@@ -112,6 +112,20 @@ def test_a_folder_of_keys_is_refused_where_no_recording_chooses(
         apply_controls(make_animation(2), AnimationControls(direction=tmp_path))
 
 
+def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    both = Direction([Key(0, "lids", 0.5)], instead_of=("acting", "blinks")).save(tmp_path / "both.json")
+    blinks = Direction([Key(0, "lids", 0.5)], instead_of=("blinks",)).save(tmp_path / "blinks.json")
+    for path, option, *value in ((both, "acting", "prosody"), (both, "blinks"), (blinks, "blinks")):
+        with pytest.raises(FaceDiffError, match=f"{path.name}: instead_of: .*omit --{option}"):
+            parsed("--direction", str(path), f"--{option}", *value)
+    parsed("--direction", str(blinks), "--acting", "prosody", "--sway")
+    # The animation goes on saying so, with the keys of both if it is changed twice.
+    made = apply_controls(make_animation(2), parsed("--direction", str(blinks)))
+    later = Direction([Key(0, "brows", 1.0)], instead_of=("acting",))
+    again = apply_controls(made, AnimationControls(direction=later))
+    assert Direction.parse(again.metadata["direction"], "again").instead_of == ("blinks", "acting")
+
+
 def test_shape_keys_add_their_displacements(make_animation: Callable[..., Animation]) -> None:
     animation = make_animation(3, frame_rate=2.0)
     keys = [Key(0, "shape.jawOpen", 0.0, "linear"), Key(1, "shape.jawOpen", 1.0), Key(0, "shape.mouthSmileLeft", -0.5)]

@@ -390,9 +390,22 @@ def test_shapes_brows_and_lids_are_previewed_and_acting_becomes_keys(show: Show,
     assert furthest(edited, numbers) < 0.1
     assert np.linalg.norm(edited.vertices - changed.vertices, axis=2).max() < 0.0003
     assert len(turned.channels["lids"]) < frames / 2
+    assert turned.instead_of == ("acting", "blinks")
     press(page, "z", 2)
     assert keys_in(page).rows() == Direction(new).rows()
     assert "--acting prosody" in page.evaluate(command)
+    # A file says what its keys stand for: nothing is done twice when it is opened, nor left out by another file.
+    page.evaluate(f"facediff.openKeys({json.dumps(turned.text())})")
+    assert keys_in(page) == replace(turned, source="page")
+    assert furthest(edited, numbers) < 0.1
+    assert "--acting" not in page.evaluate(command)
+    assert page.evaluate("document.getElementById('turn-into-keys').disabled")
+    page.evaluate(f"facediff.openKeys({json.dumps(replace(Direction(new), instead_of=('blinks',)).text())})")
+    assert "--acting prosody --controls-seed 3 --direction" in page.evaluate(command)
+    assert furthest(bare.control(direction=Direction(new), acting="prosody", controls_seed=3), numbers) < 0.1
+    page.evaluate(f"facediff.openKeys({json.dumps(Direction(new).text())})")
+    assert furthest(changed, numbers) < 0.1
+    assert "--blinks 40 --acting prosody" in page.evaluate(command)
     # A mood is the keys that the command takes by its name.
     page.evaluate("facediff.openKeys('[]')")
     page.evaluate("(mood.value = 'sad', mood.dispatchEvent(new Event('change')))")

@@ -199,13 +199,14 @@ def test_page_keeps_hostile_names_as_text_and_refers_to_nothing(tmp_path: Path) 
 
 
 def test_page_has_the_keys_of_its_animation_and_what_their_preview_needs(tmp_path: Path) -> None:
-    keys = Direction([Key(0.5, "expressiveness.lips", 2.0), Key(1.0, "style", HOSTILE, "step")])
+    keys = Direction([Key(0.5, "expressiveness.lips", 2.0), Key(1.0, "style", HOSTILE, "step")], instead_of=["blinks"])
     animation = replace(clicks(), regions={"lips": np.arange(4, 8)}, metadata={METADATA: keys.text()})
     odd = replace(clicks(name="odd"), metadata={METADATA: "no keys"})
     write_page(tmp_path / "a.html", [animation, odd])
     page = Written(tmp_path / "a.html")
     first, second = page.facts["animations"]
     assert first["direction"] == keys.rows()
+    assert first["insteadOf"] == ["blinks"]
     assert second["direction"] is None  # and stays among the metadata
     assert second["metadata"] == odd.metadata
     weights = np.frombuffer(page.blob(first["weights"]["lips"]), np.uint8) / 255

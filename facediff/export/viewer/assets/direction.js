@@ -52,10 +52,13 @@ function valueAt(keys, time, [least, most], easing = 0, slopes = null) {
 }
 
 class Direction {
-  /** Args: what the page says about channels and the file; the keys as rows of a file; what is done after every change. */
-  constructor(facts, rows, onChange) {
+  /**
+   * Args: what the page says about channels and the file; the keys as rows of a file; what is done after every change; the
+   * options that the keys stand for.
+   */
+  constructor(facts, rows, onChange, turned = []) {
     Object.assign(this, { facts, onChange });
-    this.keys = this.ordered(rows.map((row) => Object.freeze({ ...row })));
+    this.keys = Object.assign(this.ordered(rows.map((row) => Object.freeze({ ...row }))), { turned });
     this.saved = this.keys;
     this.past = [];
     this.future = [];
@@ -96,7 +99,7 @@ class Direction {
 
   // Changes. Keys are never changed but replaced, so that the history is a list of lists.
 
-  /** `turned` says that keys stand in place of acting and blinks; it is part of the history as they are. */
+  /** `turned` names the options, acting and blinks, that keys stand in place of; it is part of the history as they are. */
   set(keys, turned = this.keys.turned) {
     if (!this.held) {
       this.past.push(this.keys);
@@ -191,7 +194,8 @@ class Direction {
   text() {
     const { format, version } = this.facts;
     const rows = this.keys.map((key) => `    ${JSON.stringify(key)}`).join(",\n");
-    return `{\n  "format": ${JSON.stringify(format)},\n  "version": ${version},\n  "keys": [\n${rows}\n  ]\n}\n`;
+    const { turned } = this.keys, instead = turned.length ? `\n  "instead_of": ${JSON.stringify(turned)},` : "";
+    return `{\n  "format": ${JSON.stringify(format)},\n  "version": ${version},${instead}\n  "keys": [\n${rows}\n  ]\n}\n`;
   }
 
   /** Replace all keys by those of a file's content, in one change that can be undone. */
@@ -201,13 +205,17 @@ class Direction {
     if (!Array.isArray(rows)) throw new Error('holds no list called "keys"');
     if ((content.format ?? this.facts.format) !== this.facts.format) throw new Error("is no keys file");
     if ((content.version ?? this.facts.version) !== this.facts.version) throw new Error(`has version ${content.version}`);
+    const { instead_of: turned = [] } = content;
+    if (!Array.isArray(turned) || turned.some((name) => !this.facts.insteadOf.includes(name))) {
+      throw new Error(`instead_of: expected a list of ${this.facts.insteadOf.join(", ")}`);
+    }
     const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`, content.frame_rate ?? this.facts.frameRate));
     const seen = new Set();
     keys.forEach(({ channel, time }, i) => {
       if (seen.has(`${time} ${channel}`)) throw new Error(`row ${i + 1}: ${channel} has a key at ${time} s already`);
       seen.add(`${time} ${channel}`);
     });
-    this.set(keys);
+    this.set(keys, [...new Set(turned)]);
   }
 
   row(row, where, frameRate) {

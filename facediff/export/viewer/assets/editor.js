@@ -14,13 +14,14 @@ const optionWords = (text, turned) => {
   const strings = Array.isArray(words) ? words.filter((word) => typeof word === "string") : [];
   const known = strings.every((word) => !word.startsWith("-") || /^--(?!output|checkpoint|yes)[a-z-]+$|^-[\d.]+$/.test(word));
   if (!known) return [];
-  return (turned ? withoutRules(strings) : strings).map(quoted);
+  return (turned.length ? withoutRules(strings, turned) : strings).map(quoted);
 };
 
-/** Options without those whose work has been turned into keys; their seed stays for gaze and sway. */
-const withoutRules = (words) => {
-  const others = ["--gaze", "--sway"].some((name) => words.includes(name));
-  const left = ["--acting", "--blinks", ...(others ? [] : ["--controls-seed"])];
+/** Options without those whose work has been turned into keys; their seed stays for the others. */
+const withoutRules = (words, turned) => {
+  const left = turned.map((name) => `--${name}`);
+  const others = ["--acting", "--blinks", "--gaze", "--sway"].some((name) => words.includes(name) && !left.includes(name));
+  if (!others) left.push("--controls-seed");
   let dropped = false;
   return words.filter((word) => {
     if (word.startsWith("--")) dropped = left.includes(word);
@@ -44,7 +45,7 @@ class Editor {
     this.facts = player.facts;
     this.number = Math.max(0, this.facts.animations.findIndex(({ direction }) => direction));
     this.directions = this.facts.animations.map(
-      ({ direction }) => new Direction(this.facts.direction, direction ?? [], () => this.changed())
+      ({ direction, insteadOf }) => new Direction(this.facts.direction, direction ?? [], () => this.changed(), insteadOf)
     );
     this.lanes = [];
     this.chosen = []; // keys; the last one is that of the fields
@@ -168,14 +169,21 @@ class Editor {
     return !this.previews || this.previews[this.number].shows(name);
   }
 
+  /** The options, acting and blinks, whose work the keys do not stand for yet. */
+  get rules() {
+    const acted = this.previews && this.previews[this.number].acted, { turned } = this.direction.keys;
+    if (!acted) return [];
+    return [...(Object.keys(acted.acting).length ? ["acting"] : []), ...(acted.blinks ? ["blinks"] : [])].filter((name) => !turned.includes(name));
+  }
+
   /** Replace what acting and blinking did by keys of the same motion, which can be edited. */
   turnIntoKeys() {
-    const preview = this.previews[this.number], { direction } = this, { acting, blinks } = preview.acted;
-    const names = [...new Set([...Object.keys(acting), ...(blinks ? ["lids"] : [])])];
+    const preview = this.previews[this.number], { direction, rules } = this, { acting } = preview.acted;
+    const names = [...new Set([...(rules.includes("acting") ? Object.keys(acting) : []), ...(rules.includes("blinks") ? ["lids"] : [])])];
     const rows = names.flatMap((name) => preview.reduced(direction, name, TOLERANCES[name] ?? 0.05));
-    const left = direction.keys.filter(({ channel }) => !names.includes(channel) && channel !== "acting");
-    direction.set([...left, ...rows.map(Object.freeze)], true);
-    find("direction-said").textContent = `${rows.length} keys in place of acting and blinks; the command leaves out the options that made them`;
+    const left = direction.keys.filter(({ channel }) => !names.includes(channel) && !(channel === "acting" && rules.includes(channel)));
+    direction.set([...left, ...rows.map(Object.freeze)], [...direction.keys.turned, ...rules]);
+    find("direction-said").textContent = `${rows.length} keys in place of ${rules.join(" and ")}; the command leaves out the options that made them`;
   }
 
   /** A mood's keys at the beginning, in place of other keys of its channels. */
@@ -350,7 +358,7 @@ class Editor {
     this.drawLanes();
     const acted = this.previews && this.previews[this.number].acted;
     find("turn-into-keys").hidden = !acted;
-    find("turn-into-keys").disabled = Boolean(direction.keys.turned);
+    find("turn-into-keys").disabled = !this.rules.length;
     for (const lane of this.lanes) lane.later.hidden = this.canPreview(lane.name);
     find("paste-keys").disabled = !this.copied.length;
     find("undo").disabled = !direction.past.length;

@@ -50,13 +50,13 @@ class Preview {
     const { frameRate, direction: { stepSeconds } } = this.facts;
     const value = (channel) => direction.value(channel, frame / frameRate, stepSeconds);
     const [least, most] = direction.channel(name).range;
-    const byRule = !direction.keys.turned && this.acted;
+    const byRule = (rule) => this.acted && !direction.keys.turned.includes(rule);
     let sum = direction.of(name).length ? value(name) : 0;
-    if (byRule && byRule.acting[name]) {
+    if (byRule("acting") && this.acted.acting[name]) {
       const strength = value("acting");
-      sum = Math.max(least, Math.min(most, sum + byRule.acting[name][frame] * (name === "lids" ? Number(strength > 0) : strength)));
+      sum = Math.max(least, Math.min(most, sum + this.acted.acting[name][frame] * (name === "lids" ? Number(strength > 0) : strength)));
     }
-    return name === "lids" && byRule && byRule.blinks ? Math.max(sum, byRule.blinks[frame]) : sum;
+    return name === "lids" && byRule("blinks") && this.acted.blinks ? Math.max(sum, this.acted.blinks[frame]) : sum;
   }
 
   /** The frames' values of a channel as few keys: straight lines between them are within a tolerance of each frame. */
