@@ -7,6 +7,7 @@ Everything may come from anybody: paths stay in the folder, and no array may be 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePosixPath
@@ -227,7 +228,7 @@ def read_audio2face(folder: Path) -> Audio2FaceFolder:
 
 def network_file(folder: Path, about: Path, content: Mapping[str, Any]) -> Path:
     """The graph of ONNX, which lies next to the engine of TensorRT that ``model.json`` may name instead."""
-    path = _path(folder, about, content, "networkPath").with_suffix(".onnx")
+    path = _path(folder, about, content, "networkPath", ".onnx")
     if not path.is_file():
         raise FaceDiffError(
             f"{path}: no such file; {about.name} names the network so, and its graph of ONNX is needed: an engine of "
@@ -339,9 +340,8 @@ def read_poses(path: Path, config_path: Path, vertices: int) -> Poses:
     names = [name for place, name in enumerate(names) if place or name != "neutral"]
     if not 0 < len(names) <= MOST or len(set(names)) < len(names) or "neutral" in names:
         raise FaceDiffError(f"{path}: poseNames are {quoted(names)}; expected different names of poses; {REMEDY}")
-    deltas = np.empty((len(names), vertices, 3), np.float32)
-    for index, name in enumerate(names):
-        deltas[index] = _matrix(path, arrays, name, (vertices, 3))
+    # Joined when all are there: names alone take no memory.
+    deltas = np.stack([_matrix(path, arrays, name, (vertices, 3)) for name in names])
     mask = _whole(path, arrays, "frontalMask") if "frontalMask" in arrays else np.zeros(0, np.int64)
     if len(mask) and not 0 <= mask.min() <= mask.max() < vertices:
         raise FaceDiffError(f"{path}: frontalMask names a vertex that is not one of {vertices}; {REMEDY}")
@@ -360,7 +360,7 @@ def read_solver_settings(path: Path, count: int) -> SolverSettings:
     def pairs(name: str) -> tuple[int, ...]:
         numbers = _numbers(path, name, params.get(name), count, whole=True)
         partners = [int(number) for number in numbers]
-        if any(number >= 0 and partners.count(number) != 2 for number in partners):
+        if any(number >= 0 and poses != 2 for number, poses in Counter(partners).items()):
             raise FaceDiffError(f"{path}: {name} has a number that is not that of two poses; {REMEDY}")
         return tuple(partners)
 
@@ -392,13 +392,13 @@ def _object(value: object, path: Path, name: str = "") -> dict[str, Any]:
     return value
 
 
-def _path(folder: Path, about: Path, content: Mapping[str, Any], key: str) -> Path:
-    """A file of the folder by its name in ``model.json``; one elsewhere is refused."""
+def _path(folder: Path, about: Path, content: Mapping[str, Any], key: str, suffix: str | None = None) -> Path:
+    """A file of the folder by its name in ``model.json``, or with another suffix; one elsewhere is refused."""
     text = content.get(key)
     pure = PurePosixPath(text.replace("\\", "/")) if isinstance(text, str) and text.isprintable() else PurePosixPath()
     if not pure.parts or pure.is_absolute() or ".." in pure.parts or ":" in str(text):
         raise FaceDiffError(f"{about}: {key} is {quoted(text)}; expected a file of the folder; {REMEDY}")
-    path = folder / pure
+    path = folder / (pure if suffix is None else pure.with_suffix(suffix))
     if path.exists() and not path.resolve().is_relative_to(folder.resolve()):
         raise FaceDiffError(f"{about}: {key} is a link to {quoted(str(path.resolve()))}; expected a file of the folder")
     return path

@@ -191,11 +191,23 @@ def linked(folder: Path) -> None:
     (folder / "model_data.npz").symlink_to(folder.parent / "elsewhere.npz")
 
 
+def linked_graph(folder: Path) -> None:
+    edit("model.json", "networkPath", value="network.trt")(folder)
+    (folder / "network.onnx").rename(folder.parent / "elsewhere.onnx")
+    (folder / "network.onnx").symlink_to(folder.parent / "elsewhere.onnx")
+
+
+def named_only(folder: Path) -> None:
+    edit(INFO, "params", "num_verts_skin", value=2_000_000)(folder)
+    arrays("bs_skin.npz", poseNames=np.array([f"pose{number}" for number in range(10_000)], "S8"))(folder)
+
+
 HOSTILE: dict[str, tuple[str, Change]] = {
     "a path outside": ("networkInfoPath", edit("model.json", "networkInfoPath", value="../network_info.json")),
     "an absolute path": ("modelDataPath", edit("model.json", "modelDataPath", value="/etc/passwd")),
     "a path of a drive": ("modelDataPath", edit("model.json", "modelDataPath", value="C:\\data.npz")),
     "a link outside": ("modelDataPath", linked),
+    "a graph that is a link outside": ("networkPath is a link", linked_graph),
     "no path": ("emotionDatabasePath", edit("model.json", "emotionDatabasePath", value=7)),
     "no graph of ONNX": ("network.onnx", lambda folder: (folder / "network.onnx").unlink()),
     "another kind of network": ("type", edit(INFO, "id", "type", value="diffusion")),
@@ -229,6 +241,7 @@ HOSTILE: dict[str, tuple[str, Change]] = {
         arrays("bs_skin.npz", poseNames=np.array(["a", "neutral"], "S8")),
     ),
     "poses without shapes": ("bs_skin.npz", arrays("bs_skin.npz", poseNames=np.array(["a", "b"], "S8"))),
+    "poses of terabytes by their names": ("pose0 is missing", named_only),
     "a pair of three": (
         "bsSolveCancelPoses",
         edit("bs_skin_config.json", "blendshape_params", "bsSolveCancelPoses", value=[0, 0, 0, -1, -1, -1]),
