@@ -440,6 +440,6 @@ def copy_exported(source: Path, folder: Path) -> int:
     """
     description, _ = read_folder(source)
     with atomic_folder(folder) as staged:
-        for name in (DESCRIPTION, *description.sizes):
+        for name in (DESCRIPTION, ARRAYS, *(f"{graph}.onnx" for graph in description.graphs)):
             shutil.copyfile(source / name, staged / name)
         return sum(path.stat().st_size for path in staged.iterdir())

@@ -14,7 +14,7 @@ from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel, styles
-from facediff.runtime.folder import ARRAYS, DESCRIPTION, packed_deltas
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, copy_exported, packed_deltas
 from facediff.runtime.site import make_site
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
 from facediff.spaces.layouts import layout
@@ -143,3 +143,20 @@ def test_arrays_that_do_not_fit_are_refused(folder: Path, name: str, value: np.n
     fit_sizes(folder)
     with pytest.raises(FaceDiffError, match=f"arrays.npz: .*({name}|delta)"):
         RuntimeModel.open(folder)
+
+
+def test_a_copy_holds_the_files_of_the_model_and_nothing_that_its_description_names_besides(
+    folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "place").mkdir()
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "secret").write_text("secret")
+    folder = folder.rename(tmp_path / "deep" / "channels")
+    path = folder / DESCRIPTION
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "sizes": {**content["sizes"], "../../secret": 6}}))
+    copied = copy_exported(folder, tmp_path / "place" / "copy")
+    assert {path.name for path in (tmp_path / "place" / "copy").iterdir()} == {DESCRIPTION, *content["sizes"]}
+    assert [path.name for path in (tmp_path / "place").iterdir()] == ["copy"]
+    assert copied == path.stat().st_size + sum(content["sizes"].values())
+    RuntimeModel.open(tmp_path / "place" / "copy")
