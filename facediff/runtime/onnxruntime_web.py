@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import http.client
 import io
 import os
 import tarfile
-import urllib.error
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -139,7 +139,7 @@ def _fetch(pinned: Package, say: Callable[[str], object]) -> bytes:
     try:
         with urllib.request.urlopen(pinned.address, timeout=30) as answer:  # noqa: S310 - http or https, see package()
             content: bytes = answer.read(pinned.size + 1)
-    except (OSError, ValueError, urllib.error.URLError) as error:
+    except (OSError, ValueError, http.client.HTTPException) as error:
         raise FaceDiffError(
             f"{pinned.address}: cannot be fetched ({brief(error)}); go online once, or run `npm pack "
             f"onnxruntime-web@{VERSION}` elsewhere and give the file with --runtime"

@@ -45,15 +45,14 @@ class Registry:
 
     def __init__(self, content: bytes) -> None:
         self.content = content
+        self.begins = b"HTTP/1.0 200 OK\r\n\r\n"
         self.asked: list[str] = []
         registry = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 registry.asked.append(self.path)
-                self.send_response(200)
-                self.end_headers()
-                self.wfile.write(registry.content)
+                self.wfile.write(registry.begins + registry.content)
 
             def log_message(self, *_: object) -> None:
                 pass
@@ -108,6 +107,16 @@ def test_other_bytes_are_refused_and_nothing_is_kept(change: str, registry: Regi
 
 def test_registry_that_does_not_answer_is_named_with_the_way_out(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"127\.0\.0\.1:9/onnxruntime-web.*--runtime"):
+        web_runtime()
+    assert cached(tmp_path) == []
+
+
+def test_registry_that_speaks_no_http_is_named_with_the_way_out(registry: Registry, tmp_path: Path) -> None:
+    registry.begins = b"SSH-2.0-OpenSSH\r\n"
+    with pytest.raises(FaceDiffError, match=rf"{registry.address}/onnxruntime-web.*cannot be fetched.*--runtime"):
+        web_runtime()
+    registry.begins = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n"  # and then no chunks
+    with pytest.raises(FaceDiffError, match=rf"{registry.address}/onnxruntime-web"):
         web_runtime()
     assert cached(tmp_path) == []
 
