@@ -139,6 +139,41 @@ def test_from_a_folder_without_a_network_in_a_narrow_window(made: Path, browser:
     page.close()
 
 
+def test_what_is_refused_for_good_is_not_tried_for_ever(made: Path, serve: Serve, browser: Chromium) -> None:
+    page = opened(browser, f"{serve(made)}/")
+    answering = (
+        "((status) => { window.asked = 0; window.natural ??= window.fetch;"
+        " window.fetch = status === null ? window.natural :"
+        " () => (window.asked += 1, Promise.resolve(new Response('', {status}))); return null; })"
+    )
+    said = "document.getElementById('status').textContent"
+    page.evaluate(f"{answering}(403)")  # the study has all the raters that it takes
+    page.evaluate("document.getElementById('agree').click(), document.getElementById('start').click()")
+    page.wait_for(f"{said}.startsWith('This was refused')")
+    page.wait_for("!document.getElementById('start').disabled")
+    # What may pass is tried again without a click.
+    page.evaluate(f"{answering}(503)")
+    page.evaluate("document.getElementById('start').click()")
+    page.wait_for(f"{said}.startsWith('Not sent yet; trying again')")
+    page.evaluate(f"{answering}(null)")
+    page.wait_for("facediffStudy.current")
+    assert page.evaluate("document.getElementById('status').hidden")
+    # A server that does not know the rater is asked once; what was answered is handed over.
+    page.evaluate(f"{answering}(404)")
+    answer(page)
+    page.evaluate("new Promise((done) => setTimeout(done, 3500))")
+    assert page.evaluate("asked") == 1
+    assert page.evaluate("document.getElementById('status').hidden")
+    answer(page)
+    answer(page)
+    finish(page)
+    assert page.evaluate("document.getElementById('thanks-more').textContent").startswith("Please download")
+    assert not page.evaluate("document.getElementById('download').hidden")
+    assert page.evaluate("[facediffStudy.state.trials.length, facediffStudy.state.sent, asked]") == [3, 0, 1]
+    stays_clean(page)
+    page.close()
+
+
 @pytest.mark.slow
 def test_answers_wait_while_the_server_is_away(made: Path, serve: Serve, browser: Chromium) -> None:
     page = opened(browser, f"{serve(made)}/")

@@ -14,6 +14,7 @@ let kept = null; // the state in this browser when its storage cannot be used
 let served = false;
 let current = null; // the trial on the screen: {trial, since, plays, seen}
 let sending = false;
+let beginning = null; // the timer of the next try to begin
 const problems = [];
 const warnings = new Set(); // names of the texts that warn
 
@@ -64,6 +65,8 @@ async function post(path, content) {
   if (!answer.ok) {
     const error = new Error(`${path}: ${answer.status}`);
     error.refused = [400, 409, 413].includes(answer.status); // whatever is sent again will be too
+    error.full = answer.status === 403;
+    error.unknown = answer.status === 404; // the server's answers are not those that this rater has begun in
     throw error;
   }
   return answer.json();
@@ -102,9 +105,12 @@ async function send() {
       show();
     }
     warn("waiting", false);
-  } catch {
-    warn("waiting", true);
-    setTimeout(send, AGAIN);
+  } catch (error) {
+    warn("waiting", !error.unknown);
+    if (error.unknown) {
+      served = false; // the rater hands the file over
+      if (!byId("thanks").hidden) showThanks();
+    } else setTimeout(send, AGAIN);
   } finally { sending = false; }
 }
 
@@ -267,6 +273,8 @@ function showThanks() {
 
 async function begin() {
   const state = load();
+  clearTimeout(beginning);
+  if (byId("welcome").dataset.left) return;
   byId("start").disabled = true;
   try {
     if (state.number === null) {
@@ -284,10 +292,14 @@ async function begin() {
     }
     byId("welcome").dataset.left = "yes";
     warn("waiting", false);
+    warn("refused", false);
     show();
-  } catch {
-    warn("waiting", true);
-    setTimeout(() => { byId("start").disabled = !byId("agree").checked; }, 500);
+  } catch (error) {
+    const final = error.refused || error.full || error.unknown;
+    warn("waiting", !final);
+    warn("refused", final);
+    if (final) setTimeout(() => { byId("start").disabled = !byId("agree").checked; }, 500); // with another code it may do
+    else beginning = setTimeout(() => { if (byId("agree").checked) begin(); }, AGAIN);
   }
 }
 
