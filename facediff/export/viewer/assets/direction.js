@@ -3,6 +3,8 @@
 const KINDS = ["step", "linear", "smooth"];
 const SAME_TIME = 1e-6; // s
 const LATEST = 86_400; // s
+const MOST_SLOPE = 1e6; // a second
+const COLUMNS = ["time", "frame", "channel", "value", "interpolation", "slope"];
 
 /** Change a second at each key: as given, or else such that a smooth curve does not overshoot. */
 function slopesOf(keys) {
@@ -219,26 +221,38 @@ class Direction {
   }
 
   row(row, where, frameRate) {
-    const { channel, value, interpolation = "smooth", slope } = row ?? {};
+    const { channel, interpolation = "smooth" } = row ?? {};
+    for (const name of Object.keys(row ?? {})) {
+      if (!COLUMNS.includes(name)) throw new Error(`${where}: ${name}: expected ${COLUMNS.join(", ")}`);
+    }
     const known = typeof channel === "string" && this.channel(channel);
     if (!known) throw new Error(`${where}: channel: ${channel} is not known`);
-    const { range } = known;
+    const { range } = known, value = range ? numberOf(row.value) : row.value, slope = numberOf(row.slope ?? null);
     const fits = range ? typeof value === "number" && value >= range[0] && value <= range[1] : typeof value === "string" && value.trim();
     if (!fits) throw new Error(`${where}: value: expected ${range ? `${range[0]} to ${range[1]}` : "a text"}`);
     if (!KINDS.includes(interpolation)) throw new Error(`${where}: interpolation: expected ${KINDS.join(", ")}`);
     const time = secondsOf(row, frameRate);
     if (!(time >= 0 && time <= LATEST)) throw new Error(`${where}: time: expected seconds up to a day, a timecode, or a frame`);
-    const tangent = range && typeof slope === "number" ? { slope } : {};
-    return Object.freeze({ time, channel, value, interpolation, ...tangent });
+    if (slope !== null && !(range && Math.abs(slope) <= MOST_SLOPE && typeof slope === "number")) {
+      throw new Error(`${where}: slope: expected ${range ? "a number" : "none, since this is a text"}`);
+    }
+    return Object.freeze({ time, channel, value, interpolation, ...(slope === null ? {} : { slope }) });
   }
 }
 
-/** Seconds of a row: a number of them, a timecode (00:00:01:12, 00:00:01.480), or a frame; NaN if it is none. */
-function secondsOf({ time, frame }, frameRate) {
-  if (time === undefined) return typeof frame === "number" ? frame / frameRate : NaN;
-  if (typeof time === "number") return time;
-  const found = /^(\d{1,2}):(\d\d):(\d\d)([:;.,])(\d{1,3})$/.exec(time);
+/** The number that a text spells, as the command reads cells of a table; anything else as it is. */
+function numberOf(value) {
+  return typeof value === "string" && /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(value) ? Number(value) : value;
+}
+
+/** Seconds of a row: a number of them, a timecode (00:00:01:12, 00:00:01.480), or a frame; NaN if it is none, or both. */
+function secondsOf(row, frameRate) {
+  if ("time" in row === "frame" in row) return NaN;
+  const number = numberOf("time" in row ? row.time : row.frame);
+  if (typeof number === "number") return "time" in row ? number : number / frameRate;
+  const found = "time" in row && typeof number === "string" && /^(\d{1,2}):(\d\d):(\d\d)([:;.,])(\d{1,3})$/.exec(number);
   if (!found) return NaN;
   const whole = 3600 * found[1] + 60 * found[2] + Number(found[3]);
-  return whole + (".,".includes(found[4]) ? found[5] / 10 ** found[5].length : found[5] / frameRate);
+  if (".,".includes(found[4])) return whole + found[5] / 10 ** found[5].length;
+  return Number(found[5]) < Math.ceil(frameRate) ? whole + found[5] / frameRate : NaN;
 }
