@@ -182,6 +182,22 @@ def test_it_loops_at_another_speed_and_without_sound(show: Show) -> None:
 
 
 @pytest.mark.slow
+def test_without_a_sound_that_cannot_be_played_it_loops_and_goes_on_at_its_speed(show: Show) -> None:
+    page = show([clicks()])
+    page.evaluate("document.getElementById('loop').click()")
+    page.evaluate("speed.value = '2', speed.dispatchEvent(new Event('change'))")
+    page.evaluate("facediff.seek(60)")
+    page.evaluate("(sound.dispatchEvent(new Event('error')), null)")
+    assert "cannot play" in page.evaluate("facediff.errors.splice(0)[0]")
+    assert page.evaluate("facediff.clock") == pytest.approx(60 / RATE)
+    page.evaluate("facediff.play(), window.began = performance.now()")
+    page.wait_for("facediff.frame < 40")  # over the end
+    clock, since = page.evaluate("[facediff.clock, (performance.now() - began) / 1000]")
+    assert clock == pytest.approx((60 / RATE + 2 * since) % (FRAMES / RATE), abs=0.05)
+    assert page.evaluate("facediff.playing")
+
+
+@pytest.mark.slow
 def test_faces_turn_together_and_come_back(show: Show) -> None:
     page = show([clicks(), clicks(name="other", lower=10)], width=700, height=500)
     pictures = {}

@@ -59,8 +59,12 @@ class Player {
     const audio = find("sound");
     audio.addEventListener("error", () => {
       report("this browser cannot play the page's sound; the picture goes on without");
-      this.clock = new SilentClock(this.facts.frames / this.facts.frameRate);
-    });
+      const { playing } = this.clock, silent = new SilentClock(this.facts.frames / this.facts.frameRate);
+      silent.seek(this.wanted / this.facts.frameRate);
+      Object.assign(silent, { loop: audio.loop, speed: audio.playbackRate }); // as the controls show
+      this.clock = silent;
+      if (playing) this.play();
+    }, { once: true });
     audio.addEventListener("ended", () => (this.wanted = this.facts.frames - 1));
     audio.src = URL.createObjectURL(new Blob([wav], { type: "audio/wav" }));
     this.clock = new SoundClock(audio, this.facts.frameRate);
