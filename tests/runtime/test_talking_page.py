@@ -287,6 +287,17 @@ def test_without_a_microphone_or_leave_it_says_so(
         page.wait_for("facediff.errors.length")
         assert "microphone" in page.evaluate("facediff.errors[0]")
         assert page.evaluate("!facediff.listening && !document.getElementById('open').disabled")
+        # What fails after it was switched off does not end what was switched on after it.
+        page.evaluate(
+            "(facediff.errors.splice(0), window.refuse = [], navigator.mediaDevices.getUserMedia = () =>"
+            " new Promise((_, reject) => refuse.push(reject)), null)"
+        )
+        for _ in range(3):  # on, off, and on again
+            page.evaluate("document.getElementById('microphone').click()")
+        page.evaluate("(refuse[0](new Error('late')), new Promise((done) => setTimeout(done, 100)))")
+        assert page.evaluate("[refuse.length, Boolean(facediff.listening), facediff.errors.length]") == [2, True, 0]
+        page.evaluate("(refuse[1](new Error('now')), null)")
+        page.wait_for("!facediff.listening && facediff.errors.length === 1")
 
 
 @pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, True), (375, 740, False)])

@@ -33,7 +33,9 @@ class Listening {
     this.resampler = new Resampler(this.context.sampleRate, SAMPLE_RATE);
     node.port.onmessage = ({ data }) => this.hear(data);
     this.context.createMediaStreamSource(this.stream).connect(node);
-    for (const track of this.stream.getTracks()) track.addEventListener("ended", () => this.page.stopListening("the microphone was taken away"));
+    for (const track of this.stream.getTracks()) {
+      track.addEventListener("ended", () => this.page.listening === this && this.page.stopListening("the microphone was taken away"));
+    }
     await this.context.resume();
   }
 
@@ -87,6 +89,6 @@ class Listening {
 
   close() {
     for (const track of this.stream?.getTracks() ?? []) track.stop();
-    this.context?.close();
+    if (this.context && this.context.state !== "closed") this.context.close();
   }
 }

@@ -323,6 +323,8 @@ class TalkingPage {
     try {
       await listening.open();
     } catch (error) {
+      listening.close();
+      if (this.listening !== listening) return; // switched off meanwhile, and perhaps on again
       this.stopListening();
       const words = { NotAllowedError: "it was not allowed; allow it in the browser's bar", NotFoundError: "there is none; plug one in" };
       throw new Error(error.name in words ? `the microphone: ${words[error.name]}` : error.message);
