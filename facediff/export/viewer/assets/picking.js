@@ -67,6 +67,7 @@ class Side {
     this.edges = false;
     this.at = [0.5, 0.5]; // the cross, in shares of the box
     this.scene = new Scene(this.canvas, [face], null);
+    this.canvas.addEventListener("webglcontextrestored", () => app.request()); // after the scene has built itself
     this.prepare();
     this.box.addEventListener("dblclick", (event) => event.stopImmediatePropagation()); // two quick clicks are no reset
     this.camera = new Camera(this.box, () => app.moved(this));
@@ -425,7 +426,12 @@ class Picker {
 
   async save() {
     const { complete, facts } = this;
-    if (this.saved || complete.length < facts.fewest) return;
+    if (this.saved || this.saving || complete.length < facts.fewest) return;
+    this.saving = true;
+    await this.send(complete, facts).finally(() => (this.saving = false));
+  }
+
+  async send(complete, facts) {
     const body = {
       format: facts.format,
       source_vertices: facts.sides.source.vertices,
