@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference
-from facediff.errors import ArgumentError, OptionError
+from facediff.errors import ArgumentError, FaceDiffError, OptionError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.checkpoint_content import MotionScale
@@ -277,8 +277,22 @@ class DirectModel(PublishedModel):
         """Steps that the audio encoder is asked for, for each frame."""
         return 1
 
+    def after_network(self) -> dict[str, str]:
+        """The options that are chosen and change what the network gives, which no graph does; none by default."""
+        return {}
+
     def graphs(self) -> Graphs:
-        """Speech to features, features to motion."""
+        """Speech to features, features to motion.
+
+        Raises:
+            FaceDiffError: if the model goes on after its network, which graphs cannot.
+        """
+        if chosen := self.after_network():
+            named = " and ".join(f"{name}={value}" for name, value in chosen.items())
+            raise FaceDiffError(
+                f"{type(self).__name__}: {named} cannot be exported, since graphs end with the network; import or "
+                f"train the model without {' and '.join(chosen)}, and export that"
+            )
         return direct_graphs(self)
 
 

@@ -185,6 +185,10 @@ class EmoTalk(DirectModel):
             motion[row, :count, :, 0] = torch.from_numpy(values).to(motion)
         return motion
 
+    def after_network(self) -> dict[str, str]:
+        """What finishes the weights, if anything."""
+        return {"finish": "+".join(sorted(self.finish))} if self.finish else {}
+
 
 class EmoTalkNetwork(nn.Module):
     """Features of two speech networks, the level and the person to values of channels.

@@ -139,6 +139,12 @@ class LamAudio2Expression(DirectModel):
             motion[row, : len(finished)] = torch.from_numpy(finished).to(motion).view(-1, *motion.shape[2:])
         return motion
 
+    def after_network(self) -> dict[str, str]:
+        """How speech is cut and what finishes the weights, if anything."""
+        steps = "+".join(sorted(self.finishing.steps))
+        chosen = {"chunks": "" if self.chunks == "none" else self.chunks, "finish": steps}
+        return {name: value for name, value in chosen.items() if value}
+
     def stream_chunks(
         self, clip: Batch, samples: int, *, context: bool, finish: Finish | None = None
     ) -> Iterator[np.ndarray]:

@@ -147,6 +147,8 @@ def test_finishing_is_an_option_of_the_import(tmp_path: Path) -> None:
     model = imported(state, tmp_path, finish="smooth")
     expected = savgol_filter(reference(state, speech, 1, 2).numpy().astype(float), 5, 2, axis=0)
     np.testing.assert_allclose(predict(model, speech, "2"), expected, atol=1e-5)
+    with pytest.raises(FaceDiffError, match=r"EmoTalk: finish=smooth cannot be exported"):
+        model.graphs()
     with pytest.raises(FaceDiffError, match="smoth"):
         imported(state, tmp_path, finish="smoth")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -235,3 +236,11 @@ def test_finishing_is_for_arkit(tmp_path: Path) -> None:
         LamAudio2Expression(
             n_vertices=9, identities=["A"], frame_rate=30.0, audio_encoder=MEL, audio_dim=8, finish="smooth"
         )
+
+
+@pytest.mark.parametrize("option", [{"finish": "blinks+smooth"}, {"chunks": "context"}], ids=str)
+def test_what_no_graph_does_is_named_before_anything_is_recorded(option: dict[str, str], tmp_path: Path) -> None:
+    model = imported(author(tmp_path, 0)[1], **option)
+    ((name, value),) = option.items()
+    with pytest.raises(FaceDiffError, match=rf"{name}={re.escape(value)} cannot be exported.* without {name}"):
+        model.graphs()
