@@ -191,7 +191,9 @@ class Runner:
         """Train, or continue a training that was stopped; the checkpoint."""
         place = self.folder / training.name
         state = read_json(place / STATE) or {}
-        last = place / LAST
+        last, best = place / LAST, place / BEST
+        if state.get("done") and not (last.is_file() or (self.setting.weights == "best" and best.is_file())):
+            state = {}  # somebody deleted what it wrote: train again
         if not state.get("done"):
             refuse_changed(training, cell)
             arguments = ["fit", "--config", str(training.config)]
@@ -211,7 +213,7 @@ class Runner:
             write_json(place / STATE, {"done": True, **took})
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
-        checkpoint = place / BEST if self.setting.weights == "best" else last
+        checkpoint = best if self.setting.weights == "best" else last
         if not checkpoint.is_file() and training != cell.trainings[-1]:  # only what is scored has to have a best one
             checkpoint = last
         if not checkpoint.is_file():

@@ -18,6 +18,7 @@ from facediff.benchmark.results import cell_file
 from facediff.benchmark.running import (
     BEST,
     LAST,
+    RUNS,
     STATE,
     Runner,
     Setting,
@@ -119,6 +120,21 @@ def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path)
     assert {cell.row for cell in run(folder)} == {"one", "two"}
     (folder / "plan.yaml").write_text(PLAN.replace("[0, 1]", "[0, 2]"))
     assert {cell.seed for cell in run(folder)} == {2}
+
+
+def test_a_training_whose_checkpoint_was_deleted_is_done_again(folder: Path) -> None:
+    (folder / "plan.yaml").write_text(ONE_SEED)
+    run(folder)
+    cell = next(cell for cell in cells_of(read_plan(folder / "plan.yaml")) if cell.row == "two")
+    place = folder / "out" / RUNS / cell.folder_name
+    (place / "prior" / LAST).unlink()
+    cell_file(folder / "out", cell).unlink()
+    before = len(calls(folder))
+    assert [each.row for each in run(folder)] == ["two"]
+    assert [each["name"] for each in calls(folder)[before:] if each["command"] == "fit"] == ["prior"]
+    result = read_result(cell_file(folder / "out", cell))
+    assert result is not None
+    assert not result.problem
 
 
 def test_a_changed_model_folder_is_tested_again_but_its_card_may_change(folder: Path) -> None:
