@@ -25,8 +25,6 @@ LONGEST = 900
 """Characters of an error that are printed."""
 TRACEBACK = "FACEDIFF_TRACEBACK"
 """Environment variable that shows the traceback of an unexpected error in place of a sentence."""
-interrupts: list[int] = []
-"""Each Ctrl-C so far."""
 LONG, LARGE = 3600.0, 8 * 2**30
 """Seconds and bytes above which a command names its cost and waits for a yes."""
 
@@ -59,8 +57,6 @@ def prepare_process() -> None:
         line_buffering=bool(getattr(before, "line_buffering", False)),
         write_through=bool(getattr(before, "write_through", False)),
     )
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
     for name in ("SIGTERM", "SIGHUP"):
         signal_number = getattr(signal, name, None)
         if signal_number is not None and signal.getsignal(signal_number) is signal.SIG_DFL:
@@ -69,14 +65,8 @@ def prepare_process() -> None:
 
 def finish_process() -> None:
     """Let Ctrl-C end the process without a word from now on."""
-    if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, _interrupt):
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    """Ctrl-C; a library of C that was importing another one makes the KeyboardInterrupt an ImportError of its own."""
-    interrupts.append(number)
-    signal.default_int_handler(number, frame)
 
 
 class StoppedBySignal(SystemExit):  # noqa: N818 - like the class that it extends, it is no error
@@ -158,8 +148,7 @@ def report(error: BaseException) -> int:
     Raises:
         BaseException: the error itself where it is unexpected and ``FACEDIFF_TRACEBACK`` is set.
     """
-    while_importing = interrupts and isinstance(error, ImportError)
-    if while_importing or any(isinstance(cause, KeyboardInterrupt) for cause in _chain(error)):
+    if any(isinstance(cause, KeyboardInterrupt) for cause in _chain(error)):
         return fail("interrupted", INTERRUPTED)
     if isinstance(error, StoppedBySignal):
         return fail(error.sentence, int(str(error.code)))

@@ -90,20 +90,6 @@ def test_ctrl_c_while_libraries_are_loaded(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
 
 
-def test_an_import_that_ctrl_c_broke_is_an_interruption(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """NumPy says so where Ctrl-C comes while it imports datetime; the KeyboardInterrupt itself is lost."""
-    lost = ImportError('PyCapsule_Import could not import module "datetime"')
-    monkeypatch.setattr(process, "interrupts", [])
-    with pytest.raises(ImportError):
-        process.report(lost)
-    with pytest.raises(KeyboardInterrupt):
-        process._interrupt(signal.SIGINT, None)
-    assert process.report(lost) == 130
-    assert capsys.readouterr().err == "facediff: error: interrupted\n"
-
-
 class CudaError(RuntimeError):
     """As torch raises it."""
 
