@@ -43,9 +43,8 @@ def check_controls(controls: AnimationControls) -> None:
             "eyes", "has no effect without {expressiveness}, {blinks} or {gaze}; give one of them, or omit it"
         )
     if (keys := keys_of(controls.direction)) is not None:
-        for name in ("expressiveness", "acting", "blinks", "gaze", "sway"):
-            # Keys of acting say how strongly --acting acts, and need it.
-            if getattr(controls, name) is not None and (name != "acting" or name in keys.instead_of):
+        for name in ("expressiveness", "blinks", "gaze", "sway", *keys.instead_of):
+            if getattr(controls, name) is not None:
                 keys.refuse_both(name)
         if controls.acting is None and "acting" in keys.channels:
             raise OptionError("", f"{keys.source}: channel acting: has no effect without {{acting}}; give it as well")

@@ -49,6 +49,11 @@ def mean_squared_error(
     return position / (frames.sum() * predicted.shape[2]).clamp_min(1)
 
 
+def neighbours(mask: Bool[Tensor, "batch frames *one"]) -> Bool[Tensor, "batch steps *one"]:
+    """Which frames and the ones after them are valid: the step from the last frame into the padding is no movement."""
+    return mask[:, 1:] & mask[:, :-1]
+
+
 class _SquaredErrors(torch.autograd.Function):
     """Both sums, with the masked error kept for their gradients; clip by clip, which a processor's cache holds."""
 
@@ -62,7 +67,7 @@ class _SquaredErrors(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         # In mixed precision the prediction may be in half precision, which an error and a sum must not be.
         errors = torch.empty_like(predicted, dtype=torch.result_type(predicted, truth))
-        both, sums = _neighbours(mask), errors.new_zeros(2, len(errors))
+        both, sums = neighbours(mask), errors.new_zeros(2, len(errors))
         for clip, error in enumerate(errors):
             torch.sub(predicted[clip], truth[clip], out=error)
             # Chosen, not multiplied: padding may hold what is not finite.
@@ -90,11 +95,6 @@ class _SquaredErrors(torch.autograd.Function):
                 slope[1:] += change
                 slope[:-1] -= change
         return slopes, None, None, None
-
-
-def _neighbours(mask: Tensor) -> Tensor:
-    """Which frames and the ones after them are valid: the step from the last frame into the padding is no movement."""
-    return mask[:, 1:] & mask[:, :-1]
 
 
 def _changes(error: Tensor, both: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from facediff.data import Batch
 from facediff.models.losses import masked_std
-from facediff.models.squared_errors import squared_errors
+from facediff.models.squared_errors import neighbours, squared_errors
 from facediff.speech.cepstra import align_features, cepstra
 
 Motion = Float[Tensor, "batch frames points dims"]
@@ -78,9 +78,9 @@ class MotionDistance:
             columns = columns.index_fill(0, vertices, True).flatten()
         squares = squared_errors(motion.flatten(2), truth.flatten(2), mask, columns)
         width = motion.shape[3] * (motion.shape[2] if vertices is None else len(vertices))
-        both = mask[:, 1:] & mask[:, :-1]
         moved, changed = (
-            total / (valid.sum() * width).clamp_min(1) for total, valid in zip(squares, (mask, both), strict=True)
+            total / (valid.sum() * width).clamp_min(1)
+            for total, valid in zip(squares, (mask, neighbours(mask)), strict=True)
         )
         total = self.position * moved + self.velocity * changed
         return total + self.lip_gap * gap + self.upper_face * face
