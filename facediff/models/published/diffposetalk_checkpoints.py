@@ -154,6 +154,7 @@ register(
         vertices=lambda _: 56,
         count=lambda _: 0,
         faces=faces_of,
+        reads=("templates", "mesh", "statistics"),
         licence="none stated",
         licence_source="github.com/DiffPoseTalk/DiffPoseTalk",
     )

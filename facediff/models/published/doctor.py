@@ -13,7 +13,14 @@ from pathlib import Path
 from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.importing import GRAPH, convert, facts_and_faces, read_weights, with_options
+from facediff.models.published.importing import (
+    GRAPH,
+    convert,
+    facts_and_faces,
+    read_weights,
+    refuse_idle,
+    with_options,
+)
 from facediff.models.published.recognition import RECOGNISERS, AuthorsWeights, Recogniser
 
 MOST = 40
@@ -67,6 +74,7 @@ def compared(
 ) -> Iterator[str]:
     """What is missing, too much, or of another shape than the model that the import would make."""
     try:
+        refuse_idle(options, method)
         options, _ = options.with_hparams()
         facts, _ = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
         converted = convert(weights, method, facts, options)

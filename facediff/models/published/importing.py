@@ -94,6 +94,7 @@ def import_files(paths: str | Path | Sequence[str | Path], options: ImportOption
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     weights = read_weights([path for path in files if path.suffix != GRAPH])
     method = recognise(weights)
+    refuse_idle(options, method)
     options, unused = options.with_hparams()
     facts, own = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
     converted = convert(weights, method, facts, options)
@@ -122,6 +123,27 @@ def convert(
     return converted
 
 
+NO_EFFECT = "does not read this option, which would have no effect; omit it"
+
+
+def refuse_idle(options: ImportOptions, method: Recogniser) -> None:
+    """Refuse options that a method does not read; a file of hyper-parameters may hold them, being for many methods.
+
+    Raises:
+        FaceDiffError: naming the first one.
+    """
+    of_vertices = ("dataset", "identities", "templates", "regions", "mesh")
+    if method.faces is not None:
+        read = method.reads
+    elif method.layout:
+        read = ("identities", "mesh") if layout(method.layout).kind == "flame" else ("identities",)
+    else:
+        read = of_vertices
+    for name in (*of_vertices, "statistics", "data_root", "template_row"):
+        if getattr(options, name) is not None and name not in read:
+            raise OptionError.naming(f"{{{name}}}: {method.method} {NO_EFFECT}")
+
+
 def facts_and_faces(
     weights: AuthorsWeights, method: Recogniser, options: ImportOptions, graphs: Sequence[Path]
 ) -> tuple[CheckpointFacts, FaceFacts | None]:
@@ -132,6 +154,7 @@ def facts_and_faces(
     """
     if method.faces is None:
         return facts_of(weights, method, options, graphs), None
+    the_graph(graphs, None, method)
     own = method.faces(weights, options)
     return own_facts(own, method, options), own
 
@@ -232,6 +255,7 @@ def facts_of(
         FaceDiffError: if they contradict each other, or do not follow.
     """
     if method.layout:
+        the_graph(graphs, None, method)
         return parametric_facts(weights, method, options)
     datasets, count, vertices = dataset_facts(), method.count(weights), method.vertices(weights)
     name: str | None = options.dataset
@@ -273,13 +297,11 @@ def parametric_facts(weights: AuthorsWeights, method: Recogniser, options: Impor
     """The facts of a method that animates channels: its layout says what they are.
 
     Raises:
-        FaceDiffError: if the tensors have another number of channels or identities, or an option is for vertices.
+        FaceDiffError: if the tensors have another number of channels or identities, or a file of hyper-parameters names
+            a data set.
     """
-    for name in ("dataset", "templates", "regions", "mesh"):
-        if getattr(options, name) is not None and (name, layout(method.layout).kind) != ("mesh", "flame"):
-            raise OptionError.naming(
-                f"{{{name}}}: is for methods that animate vertices, and {method.method} animates channels; omit it"
-            )
+    if options.dataset is not None:
+        raise OptionError.naming(f"{{dataset}}: {method.method} {NO_EFFECT}")
     space, channels, count = layout(method.layout), method.vertices(weights), method.count(weights)
     if channels != len(space.channels):
         raise FaceDiffError(
@@ -331,8 +353,10 @@ def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[s
     """Assets of such a method, and notes on them.
 
     Raises:
-        FaceDiffError: if a mesh does not fit its vertices.
+        FaceDiffError: if a mesh does not fit its vertices, or is given for channels of another kind than FLAME's.
     """
+    if options.mesh is not None and not faces.space.is_vertices and faces.space.kind != "flame":
+        raise OptionError.naming(f"{{mesh}}: {faces.corpus} animates channels without a mesh; omit it")
     everything = torch.arange(faces.n_points)
     named = {name: torch.tensor(faces.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
     regions = {name: indices if len(indices) else everything for name, indices in named.items()}

@@ -350,6 +350,7 @@ class Recogniser:
             ``frame_rate`` then says otherwise.
         graph: the option that names the frozen graph that the method needs as well; empty if it needs none.
         faces: the faces of a method whose space and data sets are its own; None for vertices of the known data sets.
+        reads: the options of the import that such a method reads, but for those of all methods.
         licence: of the authors' weights.
         commercial: whether that licence allows commercial use.
         licence_source: where it stands.
@@ -365,6 +366,7 @@ class Recogniser:
     frame_rate: float | None = None
     graph: str = ""
     faces: Callable[[AuthorsWeights, ImportOptions], FaceFacts] | None = None
+    reads: tuple[str, ...] = ()
     licence: str = "unknown"
     commercial: Commercial = "unknown"
     licence_source: str = ""

@@ -239,6 +239,7 @@ register(
         vertices=lambda weights: 0,  # noqa: ARG005 - of the chosen head
         count=lambda weights: weights.shape(TABLE)[0] - 1,
         faces=faces,
+        reads=("dataset", "identities", "mesh", "data_root", "template_row"),
         licence="Apache-2.0",
         commercial="allowed",
         licence_source=RELEASE,

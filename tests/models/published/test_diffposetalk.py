@@ -235,3 +235,16 @@ def test_a_mask_of_another_form_is_refused(tmp_path: Path) -> None:
     torch.save(content, files[0])
     with pytest.raises(FaceDiffError, match="alignment_mask"):
         import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics())
+
+
+@pytest.mark.parametrize("option", [{"identities": ["A"]}, {"regions": Path()}, {"dataset": "biwi"}], ids=str)
+def test_options_without_effect_are_refused(option: dict[str, Any], tmp_path: Path) -> None:
+    files = author.write_diffposetalk(tmp_path, head=False)
+    with pytest.raises(FaceDiffError, match=rf"^{next(iter(option))}: DiffPoseTalk does not read .*omit it"):
+        import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics(), **option)
+
+
+def test_a_graph_that_is_not_needed_is_refused(tmp_path: Path) -> None:
+    files = [*author.write_diffposetalk(tmp_path, head=False), tmp_path / "graph.pb"]
+    with pytest.raises(FaceDiffError, match=r"graph\.pb: is a graph of TensorFlow, which DiffPoseTalk does not need"):
+        import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics())

@@ -60,6 +60,9 @@ def test_what_became_of_every_tensor_is_printed(tmp_path: Path, capsys: pytest.C
         ({"option": "no_such=1"}, "no_such"),
         ({"option": "period=many"}, "period"),
         ({"option": "loop"}, "--option loop"),
+        ({"statistics": "faces.pkl"}, "--statistics: FaceFormer does not read"),
+        ({"data-root": "."}, "--data-root: FaceFormer"),
+        ({"template-row": "1"}, "--template-row: FaceFormer"),
         ({"output": "model.txt"}, "model.txt"),
     ],
 )

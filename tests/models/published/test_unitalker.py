@@ -112,6 +112,12 @@ def test_parity_of_weights(decoder: str, tmp_path: Path) -> None:
             torch.testing.assert_close(values, reference(speech, row, key), rtol=0, atol=1e-5)
 
 
+def test_a_mesh_of_channels_without_one_is_refused(tmp_path: Path) -> None:
+    _, path = author(tmp_path)
+    with pytest.raises(FaceDiffError, match=r"^mesh: UniTalker D3 animates channels without a mesh; omit it"):
+        imported(path, dataset="D3", mesh=tmp_path / "face.obj")
+
+
 @pytest.mark.parametrize("key", ["D0", "D2"])
 def test_parity_of_vertices(key: str, tmp_path: Path) -> None:
     reference, path = author(tmp_path)
