@@ -192,7 +192,7 @@ class CheckpointContent(LightningModule, Inference):
         if ASSETS_KEY in checkpoint:
             # Before the weights are loaded: modules whose size follows from the corpus are made by it.
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
-            self.data_source = checkpoint.get(DATA_SOURCE_KEY, {})
+            self.data_source = checkpoint.get(DATA_SOURCE_KEY) or {}
             self.licences = merged(self.licences, self._stated_licences(checkpoint))
             self.provenance = read_provenance(checkpoint)
             self.data_options = dict(checkpoint.get("datamodule_hyper_parameters") or {})

@@ -165,7 +165,7 @@ def content_of(model: CheckpointContent) -> dict[str, Any]:
 
 def without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a checkpoint without its corpus's folders and any absolute path; so that of its further faces."""
-    source, options = content[DATA_SOURCE_KEY], content.get(DATA_OPTIONS_KEY) or {}
+    source, options = content.get(DATA_SOURCE_KEY) or {}, content.get(DATA_OPTIONS_KEY) or {}
     cleaned = {
         **content,
         "hyper_parameters": without_paths(content["hyper_parameters"]),

@@ -220,6 +220,11 @@ def test_every_leaf_of_a_checkpoint_may_be_anything(content: Tree, evil: None, d
     assert not broken, "\n".join(broken)
 
 
+def test_a_checkpoint_that_names_no_corpus_is_read(content: Tree) -> None:
+    model = build_model("file.ckpt", read_tree({**content, "facediff_data": None}))
+    assert model.data_source == {}
+
+
 def test_a_model_much_larger_than_its_weights_is_refused(content: Tree) -> None:
     """Neither more channels nor more layers than the weights have are built."""
     small = {key: value for key, value in content.items() if key in (*CHECKED, "state_dict")}
