@@ -133,6 +133,7 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
             built.load_state_dict(weights)
         except RuntimeError as error:
             raise FaceDiffError(f"{path}: {misfit(weights, built.state_dict())}") from error
+        check_styles(built)
     except FaceDiffError as error:
         raise FaceDiffError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     except Exception as error:
@@ -429,6 +430,24 @@ def check_weights(path: Path | str, weights: Mapping[str, torch.Tensor], own: Ma
                 f"{path}: its weights {quoted(name)} are of the type {value.dtype}, and {mine.dtype} in the model; the "
                 f"file is damaged"
             )
+
+
+def check_styles(built: AnimationModel) -> None:
+    """Refuse styles of speakers that are not as long as those of the model, of which one number would fill all.
+
+    Raises:
+        FaceDiffError: saying both lengths.
+    """
+    lengths = {len(style.vector) for style in built.person_styles.values()}
+    if not lengths:
+        return
+    still = torch.zeros(1, 1, built.n_vertices, built.dims)
+    with torch.inference_mode():
+        width = built.eval().encode_style(still, torch.ones(1, 1, dtype=torch.bool)).shape[-1]
+    if lengths != {width}:
+        raise FaceDiffError(
+            f"its styles of speakers have {min(lengths)} numbers, those of its model {width}; the file is damaged"
+        )
 
 
 def misfit(weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> str:

@@ -224,6 +224,10 @@ def test_a_speakers_style_is_of_all_their_motion(tiny_root: Path, tmp_path: Path
     torch.save(broken, tmp_path / "b.ckpt")
     with pytest.raises(FaceDiffError, match=r"b\.ckpt.*style of"):
         load_model(tmp_path / "b.ckpt")
+    broken[STYLES_KEY] = {"A": ("x", torch.ones(1))}
+    torch.save(broken, tmp_path / "b.ckpt")
+    with pytest.raises(FaceDiffError, match=r"b\.ckpt: its styles of speakers have 1 numbers, those of its model 4"):
+        load_model(tmp_path / "b.ckpt")
 
 
 def test_words_decide_what_is_the_same_sentence() -> None:
