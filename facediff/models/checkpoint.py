@@ -144,8 +144,8 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
             f"{path}: cannot be rebuilt as {implementation.__name__} ({reason}); install the packages that its "
             f"components come from, in the versions that wrote it"
         ) from error
-    for name, parameter in built.named_parameters():
-        if not parameter.isfinite().all():
+    for name, value in built.state_dict().items():  # buffers such as means of motion as well
+        if not value.isfinite().all():
             raise FaceDiffError(
                 f"{path}: its weights {name} hold NaN or infinity, so the training has diverged; use an earlier "
                 f"checkpoint, or train again with a lower learning rate"

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from facediff.data import Reference
 from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel, import_checkpoint
+from facediff.models import AnimationModel, import_checkpoint, load_model
 from facediff.models.inference import Style
 from facediff.models.published.clip_style import ClipStyleEncoder, style_contrast
 from facediff.models.published.diffposetalk import DiffPoseTalk, fitted
 from facediff.models.published.diffposetalk_network import CosineProcess
+from facediff.models.published.importing import save_model
 from tests.fakes import published_parameters as author
 from tests.fakes.published import AUDIO_CONFIG
 
@@ -248,3 +249,12 @@ def test_a_graph_that_is_not_needed_is_refused(tmp_path: Path) -> None:
     files = [*author.write_diffposetalk(tmp_path, head=False), tmp_path / "graph.pb"]
     with pytest.raises(FaceDiffError, match=r"graph\.pb: is a graph of TensorFlow, which DiffPoseTalk does not need"):
         import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics())
+
+
+def test_statistics_of_a_checkpoint_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    save_model(imported(tmp_path), tmp_path / "model.ckpt")
+    content = torch.load(tmp_path / "model.ckpt", weights_only=True)
+    content["state_dict"]["motion_mean"][3] = torch.nan
+    torch.save(content, tmp_path / "model.ckpt")
+    with pytest.raises(FaceDiffError, match="motion_mean hold NaN"):
+        load_model(tmp_path / "model.ckpt")
