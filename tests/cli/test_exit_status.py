@@ -90,6 +90,27 @@ def test_ctrl_c_while_libraries_are_loaded(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
 
 
+def test_ctrl_c_while_numpy_is_loaded_is_no_import_error() -> None:
+    """The C code of NumPy says that datetime cannot be imported where Ctrl-C comes while it does so."""
+    script = """
+import sys
+
+from facediff.cli import app
+
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "datetime":
+            raise KeyboardInterrupt
+
+
+sys.meta_path.insert(0, Interrupting())
+assert "numpy" not in sys.modules
+import numpy
+"""
+    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True)
+
+
 class CudaError(RuntimeError):
     """As torch raises it."""
 
