@@ -277,4 +277,5 @@ class _ProsodyPerformer(Performer):
             weight = 1 - smoother_step(away)
             total += weight
             weights += weight if step >= 0 and self._prosody.speaks(step) else 0.0
+        # People pause between phrases: who speaks for half of the time is as lively as one gets.
         return smoother_step(2 * weights / total)

@@ -306,6 +306,7 @@ def eyeball_triangles(laid: Surface, features: Features, eye: int) -> Indices:
         if features.skin[laid.faces[some[0], 0]]:
             continue
         centre, extent = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.ptp(points, axis=0)
+        # Lashes and tear lines are flatter than the front of a ball, teeth and hair lie elsewhere or are larger.
         if (
             BALL[0] * width < extent[1] < BALL[1] * width
             and extent[0] < BALL[1] * width

@@ -309,6 +309,7 @@ def sway_curve(
     random = random_of("sway", seed)
     times = np.arange(frames) / frame_rate
     last = float(times[-1]) if frames else 0.0
+    # The waves begin anywhere; the ramps bring them from rest and back to it.
     ramp = max(min(AT_REST, last / 3.0), 1e-6)
     rest = smooth_step(times / ramp) * smooth_step((last - times) / ramp)
     rates = random.uniform(*BAND, (6, WAVES))

@@ -111,6 +111,7 @@ class RegularisedSolver:
         difference = np.zeros((len(symmetric), count))
         for row, (left, right) in enumerate(symmetric):
             difference[row, left], difference[row, right] = 1, -1
+        # Weights are never negative, so that their sum is their L1 norm; its square stays in the quadratic problem.
         return np.asarray(
             L1 * options.l1**2 * np.ones((count, count))
             + (L2 * options.l2 + TEMPORAL * options.temporal) * np.eye(count)

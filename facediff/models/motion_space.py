@@ -326,6 +326,7 @@ class ComponentMotion(MotionSpace):
         deviations = self.components.deviations.cpu().double()
         variances, vectors = torch.linalg.eigh(covariance.double())
         variances = variances.clamp_min(0)
+        # The middle frame has the whole window around it; what a movement does there stands for what is seen of it.
         shown = vectors[:, self.prior_frames // 2].square() * variances
         noised = variances * self._sizes(deviations).square()[:, None]
         return noised.flatten(), (shown * deviations.square()[:, None]).flatten()

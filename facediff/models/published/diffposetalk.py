@@ -487,6 +487,7 @@ class WindowStream(PieceStream):
         """The motion of the next window, of which so many frames are of speech."""
         model, (count, total, squares) = self.model, self._sums
         numbers = wave.double()
+        # The authors bring a whole recording to one level; of a stream, that of all that was heard so far is known.
         self._sums = (count + len(wave), total + float(numbers.sum()), squares + float(numbers.square().sum()))
         mean, deviation = level_of(*self._sums)
         wave = F.pad((wave - mean) / deviation, (0, model.window_samples - len(wave)))
