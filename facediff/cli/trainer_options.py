@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Iterator, Mapping
@@ -164,8 +165,17 @@ IDLE_WARNINGS = (
 
 @contextmanager
 def without_warnings(*messages: str) -> Iterator[None]:
-    """A context in which warnings that begin with one of these patterns are not shown."""
+    """A context without warnings that begin with one of these patterns, and without what Lightning advertises."""
+    log = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    log.addFilter(_no_advertisement)
     with warnings.catch_warnings():
         for message in messages:
             warnings.filterwarnings("ignore", message)
-        yield
+        try:
+            yield
+        finally:
+            log.removeFilter(_no_advertisement)
+
+
+def _no_advertisement(record: logging.LogRecord) -> bool:
+    return "litlogger" not in record.getMessage()

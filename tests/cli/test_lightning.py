@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import logging
 import os
 import re
 import shutil
@@ -55,11 +56,19 @@ def test_a_saved_config_runs_again(fitted: Path, fit: Fit, tmp_path: Path) -> No
 
 
 def test_test_takes_everything_from_the_checkpoint(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    # Lightning's messages do not go to the root of the loggers.
+    monkeypatch.setattr(logging.getLogger("lightning.pytorch"), "handlers", [caplog.handler])
     assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
     assert "protocol paper" in capsys.readouterr().out
+    assert "GPU available" in caplog.text
+    assert "litlogger" not in caplog.text
     (table,) = tmp_path.glob("runs/test/version_0/test_scores.csv")
     # Which training run the scores are of: the config's seed, the file, and the decoder that the run was started with.
     for row in csv.DictReader(table.read_text().splitlines()):
