@@ -290,8 +290,8 @@ class ExportOptions(CheckedOptions):
         tracks: for .csv: arkit, or oculus (15 visemes) or vrm (vowels and blinks) as a plain table
         key_tolerance: for weights: leave out keys that a straight line replaces to within so much
         tolerance: for .glb: largest error in mm
-        surface: for .obj, .glb, .usdc and .usda: the .obj of the animation's mesh, whose texture coordinates, materials
-            and pictures are written (default: an .obj that is the target mesh)
+        surface: for .obj, .glb, .usdc and .usda: the .obj or .glb of the animation's mesh, whose texture coordinates,
+            materials and pictures are written (default: the target mesh)
         view: for .mp4: camera
         size: for .mp4: height and width in pixels
         footer: text below a video, such as "synthetic corpus"
@@ -307,7 +307,7 @@ class ExportOptions(CheckedOptions):
     tracks: Tracks = "arkit"
     key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
-    surface: Annotated[FilePath | None, Option(metavar="OBJ", reads=True)] = None
+    surface: Annotated[FilePath | None, Option(metavar="MESH", reads=True)] = None
     view: View = "front"
     size: Annotated[ranges.Pixels, Option(metavar="PIXELS")] = 512
     footer: Annotated[str, Option(hidden=True)] = ""

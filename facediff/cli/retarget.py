@@ -101,7 +101,7 @@ def retarget(
     from facediff.export.glb_own_shapes import unused_shapes
     from facediff.export.pictures import draw_correspondence
     from facediff.mesh.glb import wears_more
-    from facediff.mesh.obj_surface import has_uvs
+    from facediff.mesh.textures import has_textures
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
@@ -144,7 +144,8 @@ def retarget(
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
         notes += unused_shapes(target_mesh)
     notes += surface_notes(target_mesh, output, made)
-    into = target_mesh if dressed or own_shapes or has_uvs(target_mesh) else None
+    is_bare = holds_glb(output) and target_mesh.suffix.lower() == ".glb"
+    into = target_mesh if dressed or own_shapes or (has_textures(target_mesh) and not is_bare) else None
     written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes, z_up=has_z_up(found))
     if show is not None:
         written.append(show)
@@ -221,19 +222,23 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
     """What of a mesh's texture coordinates and materials a file does not get, a sentence each."""
     from facediff.export import FORMATS
     from facediff.mesh.glb import open_glb
-    from facediff.mesh.obj_surface import has_uvs, read_surface
+    from facediff.mesh.textures import has_textures, read_textures
 
-    if mesh.suffix.lower() == ".glb" and not holds_glb(output) and output.suffix.lower() != ".npy":
+    is_glb = mesh.suffix.lower() == ".glb"
+    if is_glb and (holds_glb(output) or output.suffix.lower() == ".npy"):
+        return []
+    textured = has_textures(mesh)
+    if textured and (output.suffix.lower() == ".fbx" or "surface" in FORMATS[output.suffix].uses):
+        return list(read_textures(mesh, len(made.triangles)).lost)
+    if is_glb:
         glb = open_glb(mesh)
         if not glb.entries("materials"):
             return []
         lost = "materials, pictures and parts" if glb.entries("images") else "materials and parts"
         shown = "" if made.colours is None else "the colours of materials are kept as those of vertices, and "
         return [f"of {mesh.name}, {shown}{lost} are left out; write .glb to keep them"]
-    if not has_uvs(mesh):
+    if not textured:
         return []
-    if output.suffix.lower() == ".fbx" or "surface" in FORMATS[output.suffix].uses:
-        return list(read_surface(mesh, len(made.triangles)).lost)
     return [
         f"{output.suffix} has no texture coordinates: those of {mesh.name} are left out; write .obj, .glb "
         f"or .usdc, or give it to `facediff export` as --surface"

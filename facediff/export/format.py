@@ -17,7 +17,7 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions, Up
 from facediff.errors import FaceDiffError
-from facediff.mesh.obj_surface import ObjSurface, read_surface
+from facediff.mesh.textures import Textures, read_textures
 from facediff.render.meshes import face_outward, vertex_normals
 from facediff.utils.colours import to_linear
 
@@ -148,14 +148,14 @@ def facts(animation: Animation, space: FileSpace) -> dict[str, object]:
     }
 
 
-def surface_of(animation: Animation, options: ExportOptions) -> ObjSurface | None:
+def surface_of(animation: Animation, options: ExportOptions) -> Textures | None:
     """The texture coordinates and materials that the options ask for."""
-    return None if options.surface is None else read_surface(Path(options.surface), len(animation.triangles))
+    return None if options.surface is None else read_textures(Path(options.surface), len(animation.triangles))
 
 
-def pictures_of(surface: ObjSurface, stem: str) -> dict[int, tuple[str, bytes]]:
+def pictures_of(surface: Textures, stem: str) -> dict[int, tuple[str, bytes]]:
     """Names and bytes of the pictures of a surface's materials, by their numbers; one file for each picture."""
-    names: dict[Path, str] = {}
+    names: dict[Path | bytes, str] = {}
     result = {}
     for number, material in enumerate(surface.materials):
         if material.picture is not None and (picture := material.picture_bytes()) is not None:

@@ -19,7 +19,7 @@ from facediff.animation.options import ExportOptions
 from facediff.editing.eyes import puppet_eyes
 from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
-from facediff.mesh.obj_surface import ObjSurface
+from facediff.mesh.textures import Textures
 from facediff.registry import export_format
 from facediff.spaces.rotations import convert
 from facediff.utils.colours import to_linear
@@ -229,7 +229,7 @@ def make_document(
     rest: Array,
     morphs: Morphs,
     extras: dict[str, object],
-    surface: ObjSurface | None = None,
+    surface: Textures | None = None,
 ) -> GlbWriter:
     """The glTF document of one animated mesh at rest (V, 3), with its arrays."""
     document = GlbWriter({"asset": {"version": "2.0", "generator": "facediff"}})
@@ -309,9 +309,9 @@ def make_document(
     return document
 
 
-def add_materials(document: GlbWriter, surface: ObjSurface) -> None:
-    """Give a document the materials of an .obj, with its pictures in the file."""
-    images: dict[Path, int] = {}
+def add_materials(document: GlbWriter, surface: Textures) -> None:
+    """Give a document the materials of a mesh file, with its pictures in the file."""
+    images: dict[Path | bytes, int] = {}
     content, materials = document.content, []
     for material in surface.materials:
         look: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
@@ -322,7 +322,8 @@ def add_materials(document: GlbWriter, surface: ObjSurface) -> None:
             if material.picture not in images:
                 images[material.picture] = len(images)
                 view = document.add_bytes(picture[0])
-                entry = {"name": material.picture.stem, "mimeType": picture[1], "bufferView": view}
+                name = material.picture.stem if isinstance(material.picture, Path) else material.name
+                entry = {"name": name, "mimeType": picture[1], "bufferView": view}
                 content.setdefault("images", []).append(entry)
                 content.setdefault("textures", []).append({"source": images[material.picture]})
             look["baseColorTexture"] = {"index": images[material.picture]}

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
 from facediff.export.format import MARK, FileSpace, Format, facts, folder_of, pictures_of, surface_of
-from facediff.mesh.obj_surface import ObjSurface
+from facediff.mesh.textures import Textures
 from facediff.registry import export_format
 from facediff.utils.plain_files import json_text
 
@@ -43,12 +43,12 @@ class MeshSequence(Format):
             record["speech"] = options.speech_file
         (folder / RECORD).write_bytes(json_text(path, record).encode())
 
-    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> ObjSurface | None:
+    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Textures | None:
         """What the frames show next to positions; files that they share are written to the folder."""
         return None
 
     def encoder(
-        self, animation: Animation, space: FileSpace, surface: ObjSurface | None = None
+        self, animation: Animation, space: FileSpace, surface: Textures | None = None
     ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A function that gives a file's bytes from a frame's positions (V, 3)."""
         raise NotImplementedError
@@ -60,7 +60,7 @@ class ObjSequence(MeshSequence):
 
     uses = ("surface",)
 
-    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> ObjSurface | None:
+    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Textures | None:
         """The texture coordinates; the materials and their pictures are written once for all frames."""
         surface = surface_of(animation, options)
         if surface is not None:
@@ -68,7 +68,7 @@ class ObjSequence(MeshSequence):
         return surface
 
     @staticmethod
-    def write_materials(surface: ObjSurface, folder: Path, stem: str, library: str) -> None:
+    def write_materials(surface: Textures, folder: Path, stem: str, library: str) -> None:
         """The material file, and pictures whose names begin with the stem."""
         pictures, lines = pictures_of(surface, stem), [f"# {MARK.decode()}"]
         for number, material in enumerate(surface.materials):
@@ -80,7 +80,7 @@ class ObjSequence(MeshSequence):
         (folder / f"{library}.mtl").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def encoder(
-        self, animation: Animation, space: FileSpace, surface: ObjSurface | None = None, library: str = LIBRARY
+        self, animation: Animation, space: FileSpace, surface: Textures | None = None, library: str = LIBRARY
     ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """Vertices with nine digits, which give back every float32; colours follow them as sRGB from 0 to 1."""
         comment = f"# {_comment(animation, space)}\n"
@@ -115,7 +115,7 @@ class PlySequence(MeshSequence):
     """A folder with a binary .ply mesh for every frame."""
 
     def encoder(
-        self, animation: Animation, space: FileSpace, surface: ObjSurface | None = None
+        self, animation: Animation, space: FileSpace, surface: Textures | None = None
     ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A header, little-endian vertices with sRGB bytes, and triangles."""
         colours = animation.colours

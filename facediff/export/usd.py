@@ -21,7 +21,7 @@ from facediff.export.format import (
     pictures_of,
     surface_of,
 )
-from facediff.mesh.obj_surface import ObjSurface
+from facediff.mesh.textures import Textures
 from facediff.registry import export_format
 from facediff.utils.colours import to_linear
 
@@ -113,8 +113,8 @@ def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> 
     return mesh
 
 
-def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surface: ObjSurface, file: Path) -> None:  # noqa: ANN401
-    """Texture coordinates of the corners, and the materials of an .obj; pictures are written next to the file."""
+def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surface: Textures, file: Path) -> None:  # noqa: ANN401
+    """Texture coordinates of the corners, and the materials of a mesh file; pictures are written next to the file."""
     from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
 
     faces = outward(animation)

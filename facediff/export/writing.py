@@ -15,7 +15,7 @@ from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choic
 from facediff.export.fbx import refuse_without_blender, write_fbx
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
-from facediff.mesh.obj_surface import PICTURE_SUFFIXES, has_uvs
+from facediff.mesh.textures import PICTURE_SUFFIXES, has_textures
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
 OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
@@ -59,8 +59,9 @@ def write_animations(
             ``hello_obj/``).
         animations: at least one.
         options: what the user chose; the defaults if None.
-        into: the file of the animations' mesh: to the copy of a .glb each animation is added, and of an .obj the
-            texture coordinates and materials are written where the format has them; surfaces alone are written if None.
+        into: the file of the animations' mesh: to the copy of a .glb each animation is added where that is a .glb as
+            well, else its texture coordinates and materials, or an .obj's, are written where the format has them;
+            surfaces alone are written if None.
         own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
         z_up: whether z points up in that file. Formats that hold either axis then have z up too, unless the options
             choose one, so that what is written fits the file.
@@ -89,8 +90,8 @@ def write_animations(
     form = FORMATS[path.suffix]
     if z_up and options.up is None and "z" in form.up_axes:
         options = replace(options, up="z")
-    if into is not None and into.suffix.lower() == ".obj":
-        if "surface" in form.uses and options.surface is None and has_uvs(into):
+    if into is not None and not (into.suffix.lower() == path.suffix == ".glb"):
+        if "surface" in form.uses and options.surface is None and has_textures(into):
             options = replace(options, surface=into)
         into = None
     for animation in animations:

@@ -26,7 +26,7 @@ TYPES: dict[int, np.dtype[Any]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 INDICES = ("u1", "u2", "u4")
 POSITIONS = ("f4", "i1", "u1", "i2", "u2")  # whole numbers by the extension KHR_mesh_quantization
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -101,7 +101,7 @@ class Glb:
 
         Args:
             index: number of the accessor.
-            form: ``VEC3``, ``VEC4``, ``MAT4`` or ``SCALAR``.
+            form: ``VEC2``, ``VEC3``, ``VEC4``, ``MAT4`` or ``SCALAR``.
             kinds: the types of number that are allowed.
             count: how many there must be. A sparse accessor without data states no size that could be trusted.
         """
@@ -157,6 +157,11 @@ class Glb:
         if offset + (count - 1) * stride + row > length or start + length > len(self.binary):
             raise ValueError("has data beyond its end")
         return np.ndarray((count, width), kind, self.binary, start + offset, (stride, kind.itemsize)).copy()
+
+    def piece(self, view: object) -> bytes:
+        """The bytes of a buffer view."""
+        entry = self.entry("bufferViews", view)
+        return self._slab({"bufferView": view}, TYPES[5121], whole(entry, "byteLength"), 1).tobytes()
 
     def primitives(self, mesh: int) -> list[dict[str, Any]]:
         """The parts of a mesh."""

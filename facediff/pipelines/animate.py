@@ -271,10 +271,12 @@ class AnimationPipeline(ABC):
         """
         from facediff.export import write_animations
 
-        # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates of an .obj.
-        wears_more, has_uvs = self._target_beyond_surface
+        # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates and pictures.
+        wears_more, has_textures = self._target_beyond_surface
+        target = Path(self.options.target_mesh or "")
         is_dressed = holds_glb(output) and export.output_unit is None and wears_more
-        into = Path(self.options.target_mesh or "") if is_dressed or has_uvs else None
+        is_bare = holds_glb(output) and target.suffix.lower() == ".glb"
+        into = target if is_dressed or (has_textures and not is_bare) else None
         own_shapes = self.options.own_shapes
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
@@ -293,14 +295,14 @@ class AnimationPipeline(ABC):
 
     @cached_property
     def _target_beyond_surface(self) -> tuple[bool, bool]:
-        """Whether the target mesh is a .glb that wears more than its surface, or an .obj with texture coordinates."""
+        """Whether the target mesh is a .glb that wears more than its surface, and whether it has textures."""
         if self.options.target_mesh is None:
             return False, False
         from facediff.mesh.glb import wears_more
-        from facediff.mesh.obj_surface import has_uvs
+        from facediff.mesh.textures import has_textures
 
         target = Path(self.options.target_mesh)
-        return wears_more(target), has_uvs(target)
+        return wears_more(target), has_textures(target)
 
     @contextmanager
     def animations(

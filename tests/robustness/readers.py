@@ -961,8 +961,12 @@ def _output_to(stream: object) -> object:
 
 @functools.cache
 def surface_folder() -> Path:
-    """A textured .obj with its materials and a picture."""
+    """A textured .obj with its materials and a picture, and a .glb made of it."""
     from PIL import Image
+
+    from facediff.animation import Animation
+    from facediff.export import write_animations
+    from facediff.mesh import read_mesh
 
     folder = new_folder()
     mesh(folder / "face.obj")
@@ -973,17 +977,22 @@ def surface_folder() -> Path:
     (folder / "face.obj").write_text("\n".join(lines) + "\n")
     (folder / "face.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd skin.png\nnewmtl cloth\nKd 0.2 0.4 0.6\n")
     Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "skin.png")
+    read = read_mesh(folder / "face.obj")
+    rest = read.vertices.astype(np.float32)
+    animation = Animation("face", rest[None], rest, 25.0, faces=read.faces)
+    write_animations(folder / "face.glb", [animation], into=folder / "face.obj")
     return folder
 
 
 def surface(name: str) -> tuple[Callable[[Path], object], Callable[[Path], object]]:
-    """Writes one file of a textured .obj, and reads its surface with it."""
+    """Writes one file of a textured mesh, and reads its surface with it."""
 
     def read(folder: Path) -> object:
         from facediff.mesh import read_mesh
-        from facediff.mesh.obj_surface import read_surface
+        from facediff.mesh.textures import read_textures
 
-        surface = read_surface(folder / "face.obj", len(read_mesh(folder / "face.obj").faces))
+        textured = folder / ("face.glb" if name == "face.glb" else "face.obj")
+        surface = read_textures(textured, len(read_mesh(textured).faces))
         return [material.picture_bytes() for material in surface.materials]
 
     return one_of(surface_folder, name, read)
@@ -1049,6 +1058,13 @@ def read_conversation(path: Path) -> object:
     (path.parent / "partner").mkdir(exist_ok=True)
     shutil.copy(path, path.parent / "partner" / "clip.npy")
     return conversation_file(path.parent, "partner", "clip")
+
+
+def read_words(path: Path) -> object:
+    """The words that a recording of people says."""
+    from facediff.models import transcribed
+
+    return transcribed.read_words(path)
 
 
 def channel_array(path: Path) -> None:
@@ -1152,10 +1168,11 @@ READERS = {
     "exported model, at a glance": Reader(".json", exported_model, read_whether_it_may_have_weights, 0.3),
     "parameters, a style": Reader(".csv", recorded("live_link"), read_recorded_style, 0.5),
     "parameters, a clip of a corpus": Reader(".npy", channel_array, read_channel_array, 0.5),
+    "words of a recording": Reader(".txt", lambda path: path.write_text("ſo saß sie da\n", "utf-8"), read_words, 0.3),
     "conversation": Reader(".npy", channel_array, read_conversation, 0.5),
     **{
         f"surface, {name}": Reader(Path(name).suffix, *surface(name), 0.5)
-        for name in ("face.obj", "face.mtl", "skin.png")
+        for name in ("face.obj", "face.mtl", "skin.png", "face.glb")
     },
     **{
         f"audio2face, {name}": Reader(Path(name).suffix, *audio2face(name), 0.3)

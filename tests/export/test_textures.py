@@ -1,4 +1,4 @@
-"""Texture coordinates, materials and pictures of an .obj in what is written, as other programs read it."""
+"""Texture coordinates, materials and pictures of an .obj or .glb in what is written, as other programs read it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.mesh import read_mesh
-from facediff.mesh.obj_surface import read_surface
+from facediff.mesh.glb import open_glb
+from facediff.mesh.textures import read_textures
+from tests.fakes.avatar import write_avatar
+from tests.fakes.glb_targets import pack
 
 FRAMES = 3
 
@@ -97,11 +100,11 @@ def test_obj_frames_share_materials_and_may_be_written_again(
     scene = trimesh.load(folder / "a_0000.obj", process=False, split_object=False, group_material=True, force="scene")
     parts = parts_of(scene)
     assert both(parts) == pytest.approx(truth, abs=1e-5)
-    again = read_surface(folder / "a_0002.obj", 12)
+    again = read_textures(folder / "a_0002.obj", 12)
     assert [material.name for material in again.materials] == ["skin", "cloth"]
     assert again.materials[1].colour == (0.2, 0.4, 0.6)
     assert np.array_equal(read_mesh(folder / "a_0002.obj").vertices, animation.vertices[2])
-    assert np.array_equal(again.uvs[again.corners], read_surface(source, 12).uvs[read_surface(source, 12).corners])
+    assert np.array_equal(again.uvs[again.corners], read_textures(source, 12).uvs[read_textures(source, 12).corners])
 
 
 def test_usd_has_coordinates_materials_and_the_picture(
@@ -136,7 +139,7 @@ def test_the_mesh_of_a_point_cache_has_coordinates_materials_and_pictures(
     for _ in range(2):
         written = write_animations(tmp_path / "a.mdd", [animation], into=source)
     assert [path.name for path in written] == ["a.mdd", "a.mtl", "a.obj", "a_0.png"]
-    again, before = (read_surface(path, 12) for path in (tmp_path / "a.obj", source))
+    again, before = (read_textures(path, 12) for path in (tmp_path / "a.obj", source))
     assert np.array_equal(again.uvs[again.corners], before.uvs[before.corners])
     assert [material.picture for material in again.materials] == [tmp_path / "a_0.png", None]
     assert np.array_equal(read_mesh(tmp_path / "a.obj").vertices, animation.template)
@@ -151,7 +154,7 @@ def test_a_picture_with_the_programs_mark_is_the_same_picture(tmp_path: Path, so
 
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3)).astype(np.uint8)
     Image.fromarray(pixels).save(source.parent / "skin.png", form)
-    ((name, data),) = pictures_of(read_surface(source, 12), "a").values()
+    ((name, data),) = pictures_of(read_textures(source, 12), "a").values()
     assert name == ("a_0.png" if form == "PNG" else "a_0.jpg")
     assert (np.asarray(Image.open(io.BytesIO(data))) == np.asarray(Image.open(source.parent / "skin.png"))).all()
     assert b"facediff" in data[:200]
@@ -163,13 +166,13 @@ def test_what_is_missing_or_lies_elsewhere_is_left_out_and_said(tmp_path: Path, 
     (source.parent / "loop.png").symlink_to("loop.png")
     for name in ("../secret.png", str(secret), "none.png", "mine.mtl", "loop.png", "a\0b.png", 300 * "long" + ".png"):
         (source.parent / "mine.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
-        surface = read_surface(source, 12)
+        surface = read_textures(source, 12)
         assert surface.materials[0].picture is None
         assert any(name in sentence for sentence in surface.lost)
     (source.parent / "mine.mtl").unlink()
-    assert "mine.mtl" in read_surface(source, 12).lost[0]
+    assert "mine.mtl" in read_textures(source, 12).lost[0]
     (source.parent / "mine.mtl").write_text("newmtl skin\nd 0.5\nmap_Bump skin.png\nnewmtl cloth\nd 1.0\n")
-    (sentence,) = read_surface(source, 12).lost
+    (sentence,) = read_textures(source, 12).lost
     assert "d, map_Bump of mine.mtl" in sentence
     text = source.read_text()
     for broken in (
@@ -180,7 +183,7 @@ def test_what_is_missing_or_lies_elsewhere_is_left_out_and_said(tmp_path: Path, 
     ):
         source.write_text(broken)
         with pytest.raises(FaceDiffError, match=r"mine\.obj"):
-            read_surface(source, 12)
+            read_textures(source, 12)
 
 
 def test_the_commands_take_the_surface(
@@ -196,13 +199,77 @@ def test_the_commands_take_the_surface(
 
 
 def test_coordinates_and_materials_after_a_tab_are_read_too(source: Path) -> None:
-    usual = read_surface(source, 12)
+    usual = read_textures(source, 12)
     source.write_text(source.read_text().replace("vt ", "vt\t"))
     library = source.parent / "mine.mtl"
     text = library.read_text()
     library.write_text(re.sub(r"^(\w+) ", r"\1\t", text, flags=re.MULTILINE))
-    read = read_surface(source, 12)
+    read = read_textures(source, 12)
     np.testing.assert_array_equal(read.uvs, usual.uvs)
     assert [vars(material) for material in read.materials] == [vars(material) for material in usual.materials]
     library.write_text(text.replace("Kd 0.2 0.4 0.6", "Kd nan 2 -inf"))
-    assert read_surface(source, 12).materials[1].colour == (0, 1, 0)
+    assert read_textures(source, 12).materials[1].colour == (0, 1, 0)
+
+
+@pytest.fixture
+def avatar(tmp_path: Path) -> Path:
+    """A skinned figure whose parts share a picture, but for two of one name, plain and with a broken picture."""
+    write_avatar(tmp_path / "avatar.glb")
+    glb = open_glb(tmp_path / "avatar.glb")
+    looks = glb.content["materials"]
+    looks[0] = {"name": "plain suit", "pbrMetallicRoughness": {"baseColorFactor": [0.2159, 0, 1, 1]}}
+    looks[1] |= {"name": "plain suit", "normalTexture": {"index": 0}}
+    looks[1]["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 9}}
+    (tmp_path / "avatar.glb").write_bytes(pack(glb.content, glb.binary))
+    return tmp_path / "avatar.glb"
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.usda", "a.mdd", "a.glb"])
+def test_textures_of_an_avatar_are_where_its_vertices_are(tmp_path: Path, avatar: Path, name: str) -> None:
+    mesh = read_mesh(avatar)
+    rest = mesh.vertices.astype(np.float32)
+    animation = Animation("avatar", np.stack([rest, rest]), rest, 25.0, faces=mesh.faces)
+    own = read_textures(avatar, len(mesh.faces))
+    # The figure's coordinates are its vertices' places in metres, without whole ones; glTF counts them downwards.
+    off = own.uvs[own.corners] - (mesh.vertices[:, :2] * [1, -1])[mesh.faces]
+    assert np.abs(off - np.rint(off)).max() < 1e-5
+    names = [material.name for material in own.materials]
+    plain = [number for number, text in enumerate(names) if text == f"plain_suit_{number}"]
+    assert len(plain) == 2
+    assert any(own.materials[number].colour == pytest.approx((128 / 255, 0, 1), abs=1e-3) for number in plain)
+    assert sum(material.picture is None for material in own.materials) == 2
+    assert len(own.lost) == 2
+    assert "picture of plain_suit" in own.lost[0]
+    assert "normalTexture of avatar.glb left out" in own.lost[1]
+    if name == "a.usda":
+        pytest.importorskip("pxr")
+    options = ExportOptions(surface=avatar if name == "a.glb" else None)
+    written = write_animations(tmp_path / name, [animation], options, into=None if name == "a.glb" else avatar)
+    folder = written[0] if name == "a.obj" else tmp_path
+    if name == "a.glb":
+        scene = trimesh.load(written[0], process=False)
+        uvs = parts_of(scene)["HairMaterial"].visual.uv
+        assert {tuple(row) for row in uvs.round(4)} <= {tuple(row) for row in own.uvs.round(4)}
+        return
+    (picture,) = folder.glob("a_0.png")
+    data, _, _ = own.materials[names.index("TeethMaterial")].picture_bytes() or (b"", "", "")
+    assert (np.asarray(Image.open(picture)) == np.asarray(Image.open(io.BytesIO(data)))).all()
+    if name != "a.usda":
+        again = read_textures(folder / "a_0000.obj" if name == "a.obj" else tmp_path / "a.obj", len(mesh.faces))
+        assert again.uvs[again.corners] == pytest.approx(own.uvs[own.corners], abs=1e-6)
+        assert [material.name for material in again.materials] == names
+
+
+def test_damaged_coordinates_of_a_glb_are_refused(tmp_path: Path, avatar: Path) -> None:
+    faces = read_mesh(avatar).faces
+    with pytest.raises(FaceDiffError, match=r"avatar\.glb: has \d+ triangles and the animation's mesh 12"):
+        read_textures(avatar, 12)
+    glb = open_glb(avatar)
+    glb.content["meshes"][2]["primitives"][0]["attributes"]["TEXCOORD_0"] = 0
+    avatar.write_bytes(pack(glb.content, glb.binary))
+    with pytest.raises(FaceDiffError, match=r"avatar\.glb: not a readable GLB mesh"):
+        read_textures(avatar, len(faces))
+    del glb.content["materials"]
+    avatar.write_bytes(pack(glb.content, glb.binary))
+    with pytest.raises(FaceDiffError, match=r"avatar\.glb: has no texture coordinates"):
+        read_textures(avatar, len(faces))

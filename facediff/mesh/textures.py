@@ -1,0 +1,271 @@
+"""Texture coordinates, materials and pictures of an .obj or .glb, as the export formats write them.
+
+An .obj names a material file, and that names pictures. Both are looked for in the folder of the .obj alone, so that a
+file from elsewhere opens nothing outside of it. A .glb holds its pictures itself.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.errors import FaceDiffError
+from facediff.mesh.glb import Glb, attributes, open_glb, whole
+from facediff.mesh.glb_scene import placed_parts
+from facediff.utils.colours import to_srgb
+from facediff.utils.limits import LIMITS
+
+PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
+"""How pictures begin that programs for glTF and USD read, their type and suffix."""
+PICTURE_SUFFIXES = tuple(suffix for _, suffix in PICTURES.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A material: its name, its colour (sRGB from 0 to 1), and the picture that colours it instead."""
+
+    name: str
+    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    picture: Path | bytes | None = None
+
+    def picture_bytes(self) -> tuple[bytes, str, str] | None:
+        """The picture, its type, and the suffix for it."""
+        if self.picture is None:
+            return None
+        data = self.picture if isinstance(self.picture, bytes) else self.picture.read_bytes()
+        return next((data, *about) for start, about in PICTURES.items() if data.startswith(start))
+
+
+@dataclass(frozen=True, eq=False)
+class Textures:
+    """What a mesh file says of its surface.
+
+    Attributes:
+        uvs: (M, 2) texture coordinates, v upwards.
+        corners: (F, 3) which of them each corner of each triangle has, in the order of :func:`facediff.mesh.read_mesh`.
+        materials: those that triangles have.
+        of_face: (F,) number of each triangle's material.
+        lost: what is not carried over, a sentence each.
+    """
+
+    uvs: npt.NDArray[np.float64]
+    corners: npt.NDArray[np.int64]
+    materials: tuple[Material, ...]
+    of_face: npt.NDArray[np.int64]
+    lost: tuple[str, ...] = ()
+
+    def turned(self, triangles: npt.NDArray[np.integer], outward: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """The corners for triangles (F, 3) whose vertices come in another order."""
+        order = (outward[:, :, None] == triangles[:, None, :]).argmax(axis=2)
+        return np.take_along_axis(self.corners, order, axis=1)
+
+
+def has_textures(path: Path) -> bool:
+    """Whether a file is an .obj with texture coordinates, or a .glb with a material that has a picture."""
+    if not path.is_file():
+        return False
+    if path.suffix.lower() == ".glb":
+        with suppress(ValueError):  # the reader of meshes says what is wrong
+            return any(_base_picture(material) for material in open_glb(path).entries("materials"))
+    if path.suffix.lower() != ".obj":
+        return False
+    with path.open("rb") as stream:
+        return any(line.startswith((b"vt ", b"vt\t")) for line in stream)
+
+
+def read_textures(path: Path, n_triangles: int) -> Textures:
+    """Texture coordinates and materials of an .obj or .glb.
+
+    Args:
+        path: the file.
+        n_triangles: of the mesh that it is of.
+
+    Raises:
+        FaceDiffError: if it has no texture coordinates, is damaged, or is another mesh.
+    """
+    if not has_textures(path):
+        raise FaceDiffError(
+            f"{path}: has no texture coordinates; expected an .obj with lines `vt u v`, or a .glb with a picture"
+        )
+    try:
+        surface = _read_glb(path) if path.suffix.lower() == ".glb" else _read_obj(path)
+    except (ValueError, IndexError) as error:
+        kind = path.suffix[1:].upper()
+        raise FaceDiffError(f"{path}: not a readable {kind} mesh ({error}); export it again") from error
+    if len(surface.corners) != n_triangles:
+        raise FaceDiffError(
+            f"{path}: has {len(surface.corners)} triangles and the animation's mesh {n_triangles}; give the file of "
+            f"that mesh"
+        )
+    return surface
+
+
+def _read_obj(path: Path) -> Textures:
+    LIMITS.check("bytes", path.stat().st_size, path)
+    uvs: list[tuple[float, float]] = []
+    corners: list[tuple[int, int, int]] = []
+    libraries: list[str] = []
+    names, of_face, current = {"": 0}, [], 0
+    for line in path.read_bytes().decode("utf-8", errors="replace").splitlines():
+        word, _, rest = line.replace("\t", " ").partition(" ")
+        if word == "vt":
+            u, v = rest.split()[:2]
+            uvs.append((float(u), float(v)))
+        elif word == "f":
+            listed = [corner.split("/") for corner in rest.split()]
+            numbers = [int(corner[1]) if len(corner) > 1 and corner[1] else 0 for corner in listed]
+            # Numbers count from 1, or backwards from the coordinates read so far if they are negative; 0 is none.
+            places = [number - 1 if number > 0 else len(uvs) + number if number else -1 for number in numbers]
+            # Polygons become fans, as in the mesh itself.
+            corners += [(places[0], b, c) for b, c in zip(places[1:-1], places[2:], strict=True)]
+            of_face += [current] * (len(places) - 2)
+        elif word == "usemtl":
+            current = names.setdefault(rest.strip(), len(names))
+        elif word == "mtllib":
+            libraries.append(rest.strip())
+    table, coordinates = np.array(corners, np.int64), np.array(uvs, np.float64)
+    if not len(table) or table.max() >= len(uvs) or table.min() < -1 or not np.isfinite(coordinates).all():
+        raise ValueError("a face names a texture coordinate that does not exist")
+    if (table < 0).any():  # corners without a coordinate get one of their own
+        table[table < 0] = len(coordinates)
+        coordinates = np.concatenate([coordinates, np.zeros((1, 2))])
+    lost: list[str] = []
+    library = _materials(path, libraries, lost)
+    used = np.unique(np.array(of_face))
+    every = list(names)
+    materials = tuple(library.get(every[number], Material(every[number] or "surface")) for number in used)
+    return Textures(coordinates, table, materials, np.searchsorted(used, of_face), tuple(lost))
+
+
+def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, Material]:
+    """Materials by their names; adds what is missing to ``lost``."""
+    result: dict[str, Material] = {}
+    for library in libraries:
+        file = _beside(path, library)
+        if file is None:
+            lost.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
+            continue
+        LIMITS.check("bytes", file.stat().st_size, file)
+        name, left_out = "", set()
+        for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
+            word, _, rest = line.strip().replace("\t", " ").partition(" ")
+            if word == "newmtl":
+                name = rest.strip()
+                result[name] = Material(name)
+            elif word == "Kd" and name:
+                result[name] = Material(name, _colour(rest), result[name].picture)
+            elif word == "map_Kd" and name:
+                # Options such as -o 0 0 0 stand before the name, which may have spaces.
+                text = rest.split()[-1] if rest.strip().startswith("-") else rest.strip()
+                picture = _beside(path, text)
+                if picture is None or not _is_picture(picture):
+                    lost.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
+                else:
+                    result[name] = Material(name, result[name].colour, picture)
+            elif word.lower().startswith(("map_", "bump", "norm")) or (
+                word == "d" and rest.strip() not in ("1", "1.0")
+            ):
+                left_out.add(word)
+        if left_out:
+            words = ", ".join(sorted(left_out))
+            lost.append(f"colours and their pictures are carried over, and {words} of {library} left out")
+    return result
+
+
+def _colour(text: str) -> tuple[float, float, float]:
+    try:
+        red, green, blue = (min(max(0.0, float(number)), 1.0) for number in text.split()[:3])
+    except ValueError:
+        return Material("").colour
+    return red, green, blue
+
+
+def _beside(path: Path, name: str) -> Path | None:
+    """A file that an .obj names, if it lies in its folder or below; by its name alone where folders have changed."""
+    folder = path.resolve().parent
+    relative = PurePosixPath(name.replace("\\", "/"))
+    for candidate in (relative, PurePosixPath(relative.name)):
+        # Resolved first, so that neither `..` nor a link leads out of the folder: files from elsewhere name anything.
+        with suppress(OSError, RuntimeError, ValueError):  # too long, a loop of links, or no name at all
+            file = (folder / candidate).resolve()
+            if file.is_relative_to(folder) and file.is_file():
+                return file
+    return None
+
+
+def _is_picture(path: Path) -> bool:
+    LIMITS.check("bytes", path.stat().st_size, path)
+    with path.open("rb") as stream:
+        start = stream.read(8)
+    return any(start.startswith(magic) for magic in PICTURES)
+
+
+# glTF. Only what other formats have too is read: a colour, or a picture with its coordinates.
+
+ELSEWHERE = ("normalTexture", "occlusionTexture", "emissiveTexture", "alphaMode")
+
+
+def _base_picture(material: dict[str, Any]) -> dict[str, Any]:
+    """What a material says of the picture that colours it; empty if there is none."""
+    look = material.get("pbrMetallicRoughness", {})
+    texture = look.get("baseColorTexture", {}) if isinstance(look, dict) else {}
+    return texture if isinstance(texture, dict) else {}
+
+
+def _read_glb(path: Path) -> Textures:
+    glb, lost = open_glb(path), list[str]()
+    numbers: dict[int, int] = {}  # of the materials here, by those of the file's; -1 for parts without one
+    materials: list[Material] = []
+    uvs, corners, of_face, before = [], [], [], 0
+    for part in placed_parts(glb):
+        index = part.primitive["material"] if part.material else -1
+        if index not in numbers:
+            numbers[index] = len(materials)
+            materials.append(_material(glb, part.material, path, lost))
+        accessor = attributes(part.primitive).get(f"TEXCOORD_{whole(_base_picture(part.material), 'texCoord', 0)}")
+        coordinates = np.zeros((len(part.local), 2))
+        if accessor is not None:
+            coordinates += glb.numbers(accessor, "VEC2", ("f4", "u1", "u2"), len(part.local))
+        uvs.append(coordinates * [1, -1] + [0, 1])  # v upwards
+        corners.append(part.faces + before)
+        of_face.append(np.full(len(part.faces), numbers[index]))
+        before += len(part.local)
+    table = np.concatenate(uvs)
+    if not np.isfinite(table).all():
+        raise ValueError("its texture coordinates are not finite")
+    left_out = sorted({word for material in glb.entries("materials") for word in ELSEWHERE if word in material})
+    if left_out:
+        lost.append(f"colours and their pictures are carried over, and {', '.join(left_out)} of {path.name} left out")
+    # Material files of .obj need names of their own, for which glTF does not ask.
+    counts = Counter(material.name for material in materials)
+    named = [
+        replace(material, name=f"{material.name}_{number}") if counts[material.name] > 1 else material
+        for number, material in enumerate(materials)
+    ]
+    return Textures(table, np.concatenate(corners), tuple(named), np.concatenate(of_face), tuple(lost))
+
+
+def _material(glb: Glb, material: dict[str, Any], path: Path, lost: list[str]) -> Material:
+    """A material of a file as other formats have it; adds what is missing to ``lost``."""
+    name = "_".join(str(material.get("name", "")).split()) or "surface"
+    look, texture = material.get("pbrMetallicRoughness", {}), _base_picture(material)
+    factor = look.get("baseColorFactor", [1, 1, 1, 1]) if isinstance(look, dict) else [1, 1, 1, 1]
+    if not isinstance(factor, list) or not all(type(value) in (int, float) and 0 <= value <= 1 for value in factor):
+        raise ValueError("has a material whose colour is none")
+    red, green, blue = (float(value) for value in to_srgb(np.array(factor[:3], np.float64)))
+    if not texture:
+        return Material(name, (red, green, blue))
+    data = b""
+    with suppress(ValueError):  # of a kind that glTF itself does not know, in another file, or damaged
+        image = glb.entry("images", glb.entry("textures", texture.get("index")).get("source"))
+        data = glb.piece(image.get("bufferView"))
+    if "KHR_texture_transform" in str(texture.get("extensions", "")) or not data.startswith(tuple(PICTURES)):
+        lost.append(f"the picture of {name} is no .png or .jpg in {path.name}, or moved on its surface: it is left out")
+        return Material(name, (red, green, blue))
+    return Material(name, (red, green, blue), data)
