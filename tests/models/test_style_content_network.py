@@ -177,7 +177,7 @@ def test_speech_is_encoded_at_its_own_rate(tiny: Tiny, rate: float | None) -> No
     assert torch.equal(made[batch.mask], expected[batch.mask])
     before, after = model.context_frames()
     window, half = network.speech_content.window, network.speech_content.window // 2
-    assert (before, after) == (max(8, math.ceil(half / ratio)), math.ceil((window - 1 - half) / ratio))
+    assert (before, after) == (8 + math.ceil(half / ratio), math.ceil((window - 1 - half) / ratio))
 
 
 def test_kept_features_of_speech_stand_for_the_speech(tiny: Tiny, ctc_source: Path) -> None:
@@ -408,9 +408,14 @@ def test_windows_have_the_frames_that_their_first_frame_listens_to(
 ) -> None:
     """Of 32 steps at 50 a second 16 lie before the middle, ⌈16 · rate / 50⌉ frames, and 15 after it."""
     model = make(speech_rate=50.0, frame_rate=rate)
-    decoder = model.network.decoder.past_frames
-    assert decoder < 10, "or it would hide what speech needs"
-    assert model.context_frames() == (max(decoder, before), after)
+    network, ratio, frame = model.network.eval(), 50.0 / rate, 40
+    assert model.context_frames() == (network.decoder.past_frames + before, after)
+    features = torch.randn(1, round(60 * ratio), network.speech_content.embed.in_features, requires_grad=True)
+    content, style = network.speech_content(features, 60, ratio), torch.randn(1, 4)
+    motion = network.decoder(content, style, torch.ones(1, 60, dtype=torch.bool))
+    (heard,) = torch.autograd.grad(motion[0, frame].square().sum(), features)
+    steps = heard[0].abs().sum(-1).nonzero()
+    assert (int(steps.min() / ratio), int(steps.max() / ratio)) == (frame - 8 - before, frame + after)
 
 
 PUBLISHED: dict[str, object] = {
@@ -431,7 +436,7 @@ def test_every_term_of_aligned_windows_is_its_formula(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), window=8, batch_size=4)
     model = ready(data, **PUBLISHED)
     data.pair_sentences, data.aligner, data.window_context = True, model.alignments, model.context_frames()
-    assert data.window_context == (8, 8), "taps 5, 3 and 3 before; half of 32 steps at 50 a second on either side"
+    assert data.window_context == (16, 8), "half of 32 steps at 50 a second on either side; taps 5, 3 and 3 before"
     samples = next(iter(data.train_dataloader()))
     batch = samples if isinstance(samples, Batch) else collate(samples)
     assert batch.window is not None

@@ -63,7 +63,7 @@ def test_training_asks_the_data_for_what_the_options_say(
     model.setup("fit")
     assert data.pair_sentences
     assert data.aligner is (model.alignments if windows and pairs else None)
-    assert data.window_context == ((8, 7) if context else (0, 0))
+    assert data.window_context == ((16, 7) if context else (0, 0))
     model.train()
     assert model.alignment_allowed() == (windows and pairs)
     model.eval()

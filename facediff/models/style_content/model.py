@@ -243,9 +243,9 @@ class StyleContentDisentanglement(AnimationModel):
             visible.zero_()[assets.regions["face"].to(visible.device)] = 1.0
 
     def context_frames(self) -> tuple[int, int]:
-        """Frames before and after a frame that its window of speech, or before it the decoder's kernels, reach."""
-        speech, ratio = self.network.speech_content, self.network.speech_rate / self.frame_rate
-        before = max(self.network.decoder.past_frames, math.ceil(speech.before / ratio))
+        """Frames before and after a frame that its motion hears: the decoder sees contents, each of a window."""
+        speech, ratio = self.network.speech_content, self.network.ratio
+        before = self.network.decoder.past_frames + math.ceil(speech.before / ratio)
         return before, math.ceil((speech.window - 1 - speech.before) / ratio)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
