@@ -38,6 +38,9 @@ RANGES: dict[str, Any] = {
 }
 """Types and ranges of those options whose wrong values Lightning takes, or reports after minutes."""
 
+HALF = ("bf16-true", "16-true", "transformer-engine", "transformer-engine-float16")
+"""Lightning's precisions whose weights are of 16 bits."""
+
 PROCESSES = 4
 """Processes for each processor core that are believed to be meant."""
 
@@ -56,6 +59,12 @@ def check_trainer(options: Mapping[str, Any], prefix: str = "trainer.") -> None:
         expected = mismatch(hint, options[name]) if name in options else None
         if expected is not None:
             raise ArgumentError({f"{prefix}{name}": options[name]}, f"expected {expected}", located=True)
+    if (precision := options.get("precision")) in HALF:
+        raise ArgumentError(
+            {f"{prefix}precision": precision},
+            "the last map of a model and its losses need float32; expected bf16-mixed, 16-mixed or 32-true",
+            located=True,
+        )
     check_machine(options, prefix)
     devices, most = options.get("devices"), max(8, PROCESSES * (os.cpu_count() or 1))
     if options.get("accelerator") in ("cpu", "auto") and str(devices).isdecimal() and int(str(devices)) > most:

@@ -29,6 +29,7 @@ Fit = Callable[..., int]
 
 QUICK = [
     (["--model.dim=33"], "--model.dim 33"),
+    (["--trainer.precision=bf16-true"], "--trainer.precision bf16-true"),
     (["--trainer.logger.save_dir=/dev/null/x"], "/dev/null/x"),
     (
         ["--trainer.callbacks=facediff.callbacks.SamplingPreview", "--trainer.callbacks.clips=0"],
@@ -128,6 +129,8 @@ def test_no_option_of_the_trainer_takes_every_number(name: str, value: object) -
 def test_usual_options_of_the_trainer_pass() -> None:
     check_trainer({"max_epochs": -1, "limit_val_batches": 0, "limit_train_batches": 0.5, "fast_dev_run": True})
     check_trainer({"devices": "auto", "accelerator": "auto", "val_check_interval": 0.25, "gradient_clip_val": 1})
+    check_trainer({"precision": "bf16-mixed"})
+    check_trainer({"precision": 32})
 
 
 @pytest.mark.parametrize(
