@@ -120,7 +120,7 @@ class GradientNorm(Callback):
 
     Args:
         components: also log the norm of every part's gradient, ``gradient/decoder`` and the like. Their squares add up
-            to the square of ``gradient/norm``.
+            to the square of ``gradient/norm``. A part of that name is ``gradient/norm_part``.
     """
 
     @checks_arguments
@@ -136,7 +136,7 @@ class GradientNorm(Callback):
         norms = {name: get_total_norm(parts) for name, parts in gradients.items() if parts}
         if not norms:
             return
-        logged = {f"gradient/{name}": norm for name, norm in norms.items() if name}
+        logged = {f"gradient/{'norm_part' if name == 'norm' else name}": norm for name, norm in norms.items() if name}
         total = torch.linalg.vector_norm(torch.stack(list(norms.values())))
         pl_module.log_dict({**logged, "gradient/norm": total}, on_step=True, on_epoch=False)
 

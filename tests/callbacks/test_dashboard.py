@@ -63,6 +63,15 @@ def columns(folder: Path, *names: str) -> list[tuple[float, ...]]:
     return [tuple(float(row[name]) for name in names) for row in rows if all(row[name] for name in names)]
 
 
+def test_a_part_called_norm_has_a_column_of_its_own(make_trainer: MakeTrainer, tmp_path: Path) -> None:
+    module = Scaled()
+    module.inner["norm"] = module.inner.pop("b")
+    module.inner["b"] = module.inner["norm"]  # its parameters go by their first name
+    trainer = make_trainer(logger=CSVLogger(tmp_path), callbacks=[GradientNorm(components=True)])
+    trainer.fit(module, DataLoader(torch.tensor([2.0]), batch_size=1))
+    assert columns(tmp_path, "gradient/norm", "gradient/a", "gradient/norm_part") == [(26.0, 10.0, 24.0)]
+
+
 def train_scaled(make_trainer: MakeTrainer, folder: Path, values: list[float], **options: object) -> Scaled:
     module = Scaled()
     trainer = make_trainer(logger=CSVLogger(folder), callbacks=[GradientNorm(components=True)], **options)
