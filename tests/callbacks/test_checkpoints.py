@@ -226,6 +226,23 @@ def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch:
     assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
 
 
+@pytest.mark.parametrize(
+    ("fault", "reported"),
+    [("[enforce fail at inline_container.cc:672] . unexpected pos 704 vs 598", FaceDiffError), ("CUDA", RuntimeError)],
+)
+def test_the_fault_of_a_device_is_no_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, reported: type[Exception]
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError(fault)
+
+    monkeypatch.setattr(torch, "save", fail)
+    with pytest.raises(reported) as raised:
+        AtomicCheckpointIO().save_checkpoint({"a": torch.ones(3)}, tmp_path / "last.ckpt")
+    assert raised.type is reported
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_curve_of_an_earlier_run_stays_until_rows_replace_it(tmp_path: Path) -> None:
     path = tmp_path / "run" / "version_0" / "metrics.csv"
     for value in (1.0, 2.0):
