@@ -9,6 +9,7 @@ from functools import partial
 import pytest
 import torch
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from facediff import registry
 from facediff.data import Batch, collate
@@ -219,6 +220,13 @@ def test_where_no_style_is_given_motion_is_that_of_a_hidden_style(ready: Ready, 
     stranger = next(name for name in model.assets.references if name not in model.assets.identities)
     assert model.default_style(stranger) is model.assets.references[stranger]
     assert ready(style_dropout=0).default_style("A").clip == tiny.assets().references["A"].clip
+
+
+def test_a_hidden_style_of_a_model_on_a_gpu_is_on_the_processor_as_all_styles_are(ready: Ready) -> None:
+    model = ready()
+    with FakeTensorMode():  # a GPU that need not be there
+        model.network.no_style = nn.Parameter(torch.zeros(len(model.network.no_style), device="cuda"))
+        assert model.default_style("A").vector.device.type == "cpu"
 
 
 @pytest.mark.parametrize(

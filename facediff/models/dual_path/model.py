@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -615,16 +615,14 @@ class DualPathDiffusion(AnimationModel):
             index = self.assets.identity_index(identity)
             if index >= 0 and (usual := speech_style.usual(index)) is not None:
                 return Style(identity, torch.cat([usual, usual.new_ones(1)]).cpu())
-            style = super().default_style(identity)
-            if isinstance(style, Style):
-                return replace(style, vector=torch.cat([style.vector[:-1], style.vector.new_ones(1)]))
-            motion = style.motion.float()[None].to(self.device)
+            reference = cast(Reference, super().default_style(identity))  # all other styles are of person_styles
+            motion = reference.motion.float()[None].to(self.device)
             with torch.no_grad():
                 vector = self.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool, device=self.device))
-            return Style(style.clip, torch.cat([vector[0, :-1], vector.new_ones(1)]).cpu())
+            return Style(reference.clip, torch.cat([vector[0, :-1], vector.new_ones(1)]).cpu())
         if learnt is None or identity not in self.assets.identities or identity in self.person_styles:
             return super().default_style(identity)
-        return Style(identity, nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))))
+        return Style(identity, nn.functional.pad(learnt.detach(), (0, self.network.style_dim - len(learnt))).cpu())
 
     @torch.no_grad()
     def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:
