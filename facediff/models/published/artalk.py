@@ -405,10 +405,12 @@ class ChunkStream(PieceStream):
         """
         self._refuse_finished()
         self._finished = True
-        left = self.model.frames_of(len(self._wave))
-        if left:
-            self._next(F.pad(self._wave, (0, self.model.chunk_samples - len(self._wave))), left)
-        end = self._first + len(self._raw)
+        end, size = self._first + len(self._raw), self.model.chunk_samples
+        # Of all speech: at rates such as 29.97 a chunk is shorter than its frames by a part of a sample.
+        left = self.model.frames_of(end // self.model.scales[-1] * size + len(self._wave)) - end
+        if left > 0:
+            self._next(F.pad(self._wave, (0, size - len(self._wave))), left)
+            end += left
         wanted = self._left(end, frames)
         motion = self._given(end)[:, :wanted]
         return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))

@@ -518,5 +518,6 @@ def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
     padded = wave[None]
     # In two halves, as the authors do: a reflection can be no longer than the speech.
     for _ in range(2):
-        padded = F.pad(padded, (side // 2, side // 2), mode="reflect")
+        mode = "reflect" if side // 2 < padded.shape[1] else "replicate"
+        padded = F.pad(padded, (side // 2, side // 2), mode=mode)
     return F.pad(padded, (side % 2, side % 2), mode="replicate")[0]

@@ -199,7 +199,10 @@ def test_process_is_the_clipped_cosine_schedule() -> None:
     assert float(process.alphas[-1]) == pytest.approx(0.001, rel=1e-4)
 
 
-@pytest.mark.parametrize(("samples", "padded"), [(64_000, 64_080), (641, 721), (719, 721), (900, 900), (300, 400)])
+@pytest.mark.parametrize(
+    ("samples", "padded"),
+    [(64_000, 64_080), (641, 721), (719, 721), (900, 900), (300, 400), (80, 400), (2, 400)],
+)
 def test_speech_is_filled_up_to_whole_steps(samples: int, padded: int) -> None:
     wave = torch.arange(samples, dtype=torch.float32)
     result = fitted(wave)
