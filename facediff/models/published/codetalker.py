@@ -23,6 +23,7 @@ from facediff.data import Batch, Reference
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, Lengths, Waves
 from facediff.models.base import AnimationModel
+from facediff.models.checkpoint_content import IMPORTED
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
 from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_mask
 from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
@@ -155,7 +156,7 @@ class CodeTalker(AutoregressiveModel):
             "positions": positions,
         }
         self.prior = MotionPrior(n_vertices=self.n_vertices, dims=self.dims, **self.prior_options)
-        self._lacks_prior = False
+        self._lacks_prior = stage == "predictor"
         if stage == "prior":
             self.windows = type(self.windows)(above=math.inf)
             self.unseen_identity = "style_only"  # the reconstruction does not depend on the speaker
@@ -183,6 +184,11 @@ class CodeTalker(AutoregressiveModel):
 
     # The prior of a predictor.
 
+    @property
+    def lacks_prior(self) -> bool:
+        """Whether this is a predictor that was given no trained prior yet."""
+        return self._lacks_prior and IMPORTED not in self.provenance
+
     def check_training(self, *, resumed: bool) -> None:
         """Take the prior of a new predictor, before a run writes anything.
 
@@ -191,17 +197,16 @@ class CodeTalker(AutoregressiveModel):
         """
         if resumed:
             self.prior_file = None  # the checkpoint holds the prior
-        if self.stage == "prior" or resumed or self._assets is not None:
+        if resumed or not self.lacks_prior:
             return
         if self.prior_file is None:
             raise no_prior()
         self.take_prior(self.prior_file)
 
     def setup(self, stage: str) -> None:
-        """Take the prior's weights and its scale of motion, where a predictor is new."""
+        """Take the prior's weights and its scale of motion, where a predictor has none."""
         if stage == "fit" and self.prior_file is not None:
             self.check_training(resumed=False)
-        self._lacks_prior = stage == "fit" and self.stage == "predictor" and self._assets is None
         super().setup(stage)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -216,7 +221,7 @@ class CodeTalker(AutoregressiveModel):
             FaceDiffError: with what to train first.
         """
         super().on_fit_start()
-        if self._lacks_prior:
+        if self.lacks_prior:
             raise no_prior()
 
     def take_prior(self, path: str) -> None:
@@ -251,6 +256,7 @@ class CodeTalker(AutoregressiveModel):
         self.licences = merged(self.licences, trained.licences)
         # The codes stand for motion as it was scaled when they were learnt.
         self._assets = replace(trained.assets, identities=self.identities)
+        self._lacks_prior = False
 
     def prior_facts(self) -> dict[str, object]:
         """What two models must agree on to have the same prior, by the names of the options."""

@@ -287,11 +287,19 @@ def test_a_predictor_is_trained_on_a_trained_prior(
     assert whole.hparams["prior"] is None
 
 
+@pytest.mark.parametrize("validated", [False, True])
 def test_without_a_prior_no_predictor_is_trained(
-    make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer
+    validated: bool, make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer, prior_file: Path
 ) -> None:
+    trainer, model = make_trainer(limit_train_batches=1, limit_val_batches=1), make_method("CodeTalker", prior=None)
+    if validated:
+        trainer.validate(model, datamodule=tiny, verbose=False)
     with pytest.raises(FaceDiffError, match=r"--model\.prior"):
-        make_trainer().fit(make_method("CodeTalker", prior=None), datamodule=tiny)
+        trainer.fit(model, datamodule=tiny)
+    model.prior_file = str(prior_file)  # type: ignore[assignment]
+    trainer.fit(model, datamodule=tiny)
+    for name, value in load_model(prior_file).prior.state_dict().items():  # type: ignore[operator, union-attr]
+        assert torch.equal(model.prior.state_dict()[name], value), name  # type: ignore[operator, union-attr]
 
 
 def test_a_run_without_a_prior_writes_nothing(
