@@ -616,8 +616,8 @@ def build(
     check_weights(weights.source, weights.renamed, own)
     renamed = {name: value.to(own[name].dtype) for name, value in weights.renamed.items()}
     model.load_state_dict(model.state_dict() | renamed)
-    for name, parameter in model.named_parameters():
-        if not parameter.isfinite().all():
+    for name, value in model.state_dict().items():
+        if not value.isfinite().all():
             raise FaceDiffError(
                 f"{weights.source}: its tensor {weights.authors_name(name)} holds NaN or infinity; the file is damaged"
             )

@@ -142,6 +142,8 @@ def faces(weights: AuthorsWeights, options: ImportOptions) -> FaceFacts:
             f"{weights.source}: its vertices are principal components, which the checkpoint does not hold; give "
             f"{{data_root}} with the data release's {released.folder}/pca.npz and id_template.npy"
         )
+    elif options.template_row is not None:
+        raise OptionError.naming("{template_row}: is a row of the data release; give {data_root} too, or omit it")
     else:
         notes.append("no --data-root: the published code adds the neutral values of id_template.npy, here they are 0")
     space = space_of(released)

@@ -147,6 +147,13 @@ def test_imported_with_flame_animates_to_parameters_and_vertices(state: dict[str
     assert any("MIT" in str(licence) for licence in imported.licences)
 
 
+@pytest.mark.parametrize("name", ["basic_vae.motion_mean", "style_encoder.motion_std"])
+def test_statistics_that_are_not_finite_are_refused(name: str, state: dict[str, Tensor], tmp_path: Path) -> None:
+    torch.save({**state, name: torch.full_like(state[name], torch.nan)}, tmp_path / "damaged.pt")
+    with pytest.raises(FaceDiffError, match=f"{name.partition('.')[2]} holds NaN"):
+        import_checkpoint(tmp_path / "damaged.pt", codec_heads=2, audio_config=AUDIO_CONFIG)
+
+
 @pytest.mark.parametrize("levels", [torch.zeros(0), -torch.ones(4), torch.full((4,), 1e15)])
 def test_damaged_levels_are_refused(levels: Tensor, state: dict[str, Tensor], tmp_path: Path) -> None:
     torch.save({**state, "lvl_idx": levels}, tmp_path / "damaged.pt")

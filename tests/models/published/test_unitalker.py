@@ -187,6 +187,8 @@ def test_neutral_values_are_added_to_every_head(tmp_path: Path) -> None:
         torch.testing.assert_close(values, expected, rtol=0, atol=1e-5)
     with pytest.raises(FaceDiffError, match="template_row"):
         import_checkpoint(path, hparams=file, template_row=9)
+    with pytest.raises(FaceDiffError, match="template_row.*data_root"):
+        imported(path, dataset="D6", template_row=2)
 
 
 def test_a_file_of_other_speakers_is_asked_about(tmp_path: Path) -> None:
