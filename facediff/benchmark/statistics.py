@@ -87,7 +87,7 @@ class Difference:
         runs: interval over training runs (Welch); None if the chance between runs is not known.
         p_runs: of Welch's test; None as for ``runs``.
         both: interval over sentences and training runs together; None if the chance between runs is not known.
-        p: of the test with both; None as for ``both``.
+        p: of the test with both; None as for ``both``, and where nothing of the score is by chance.
         common: sentences of which both have a value.
     """
 
@@ -112,7 +112,8 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
     common = in_both(one, other)
     p_runs, runs = welch(one, other, bootstrap.level)
     if one.values is None or other.values is None or not common:
-        alone = one.values is None and other.values is None
+        # Training runs are all the chance that there is, unless nothing was trained.
+        alone = one.values is None and other.values is None and not (one.fixed and other.fixed)
         p, both = (p_runs, runs) if alone else (None, None)
         return Difference(one.mean - other.mean, None, None, runs, p_runs, both, p, len(common))
     ours, theirs = one.shares(common), other.shares(common)

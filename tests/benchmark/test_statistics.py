@@ -53,6 +53,15 @@ def test_a_row_without_training_is_a_constant() -> None:
     assert welch(one, scores(rng.normal(0, 1, (1, 6)))) == (None, None)
 
 
+def test_of_two_rows_without_training_a_score_that_is_no_mean_has_no_p() -> None:
+    """Nothing of it is by chance; against a row that was trained, its runs are."""
+    still, other = (RowScores(np.array([value]), None, np.ones(6), tuple("abcdef"), True) for value in (0.7, 0.5))
+    trained = RowScores(np.array([0.6, 0.4, 0.5]), None, np.ones(6), tuple("abcdef"))
+    gap = difference(still, other, BOOTSTRAP)
+    assert (gap.value, gap.p, gap.both) == (pytest.approx(0.2), None, None)
+    assert difference(trained, still, BOOTSTRAP).p == welch(trained, still)[0]
+
+
 @pytest.mark.parametrize("sentences", [5, 9])
 def test_the_permutation_test_is_scipys(sentences: int) -> None:
     differences = np.random.default_rng(sentences).normal(0.4, 1, sentences)
