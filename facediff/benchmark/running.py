@@ -192,7 +192,11 @@ class Runner:
         place = self.folder / training.name
         state = read_json(place / STATE) or {}
         last, best = place / LAST, place / BEST
-        if state.get("done") and not (last.is_file() or (self.setting.weights == "best" and best.is_file())):
+
+        def written() -> bool:
+            return last.is_file() or (self.setting.weights == "best" and best.is_file())
+
+        if state.get("done") and state.get("written", True) and not written():
             state = {}  # somebody deleted what it wrote: train again
         if not state.get("done"):
             refuse_changed(training, cell)
@@ -210,7 +214,7 @@ class Runner:
             self.run(training.name, [*arguments, *logger_words(place), *option_words(options), *progress_words()])
             took = self.measured[training.name]
             took["seconds"] = before + (took["seconds"] or 0.0)
-            write_json(place / STATE, {"done": True, **took})
+            write_json(place / STATE, {"done": True, "written": written(), **took})
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
         checkpoint = best if self.setting.weights == "best" else last
@@ -222,7 +226,10 @@ class Runner:
                     f"{cell}: {training.config} wrote no {BEST.name}; let it validate, with a ModelCheckpoint that has "
                     f"filename=best, or write weights: last into the plan"
                 )
-            raise FaceDiffError(f"{checkpoint}: was not written; expected a checkpoint, look at the log {self._log}")
+            raise FaceDiffError(
+                f"{cell}: {training.config} was trained and wrote no {checkpoint.name}; let it write checkpoints "
+                f"(trainer.enable_checkpointing), and look at the log {self._log}"
+            )
         return checkpoint
 
     def run(self, step: str, arguments: Sequence[str]) -> None:

@@ -137,6 +137,17 @@ def test_a_training_whose_checkpoint_was_deleted_is_done_again(folder: Path) -> 
     assert not result.problem
 
 
+def test_a_training_that_writes_no_checkpoint_is_not_done_again(folder: Path) -> None:
+    options = "options: {trainer.enable_checkpointing: false}"
+    (folder / "plan.yaml").write_text(ONE_SEED.replace("config: one.yaml}\n", f"config: one.yaml, {options}}}\n", 1))
+    for retry_failed in (False, True):
+        ran = next(cell for cell in run(folder, retry_failed=retry_failed) if cell.row == "one")
+        result = read_result(cell_file(folder / "out", ran))
+        assert result is not None
+        assert "one.yaml was trained and wrote no last.ckpt" in result.problem
+    assert [each["command"] for each in calls(folder) if "trainer.enable_checkpointing" in each] == ["fit"]
+
+
 def test_a_changed_model_folder_is_tested_again_but_its_card_may_change(folder: Path) -> None:
     (folder / "plan.yaml").write_text("corpora: {tiny: {}}\nmethods: {published: {checkpoint: published}}\n")
     (folder / "published").mkdir()
