@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from os.path import commonprefix
 from pathlib import Path
@@ -173,10 +174,15 @@ class ClipErrors:
     errors: npt.NDArray[np.float32]
 
 
+def lip_error(scores: Container[str]) -> str:
+    """The name of the lips' error among scores, or that of all vertices' by protocols which have none of the lips."""
+    return "lve" if "lve" in scores else "mve"
+
+
 def worst_clips(rows: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
-    """The rows of the model's worst clips by LVE, or else MVE, the worst first; equal ones in the rows' order."""
+    """The rows of the model's worst clips by :func:`lip_error`, the worst first; equal ones in the rows' order."""
     mine = [row for row in rows if row["method"] == "model"]
-    return sorted(mine, key=lambda row: -float(row["lve" if "lve" in row else "mve"]))[:count]
+    return sorted(mine, key=lambda row: -float(row[lip_error(row)]))[:count]
 
 
 @torch.inference_mode()

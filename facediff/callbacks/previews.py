@@ -28,6 +28,7 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor
 
 from facediff import registry
+from facediff.callbacks.dashboard import lip_error
 from facediff.callbacks.runs import run_folder
 from facediff.data import Sample, SpeechMotionDataModule, collate
 from facediff.data.corpus import Clip
@@ -390,8 +391,8 @@ def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, f
 
 
 def lip_score(clip_scores: dict[str, float]) -> str:
-    """The error of the lips, or that of all vertices by protocols which have none of the lips."""
-    title = "lve" if "lve" in clip_scores else "mve"
+    """The error of the lips, or what stands for it, with its name."""
+    title = lip_error(clip_scores)
     return f"{title.upper()} {clip_scores[title]:.3g}"
 
 
