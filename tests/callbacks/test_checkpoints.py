@@ -200,15 +200,22 @@ def test_every_way_of_training_continues_exactly(
     assert left[0] == left[1]
 
 
-def test_the_state_of_every_generator_comes_back() -> None:
+def test_the_state_of_every_generator_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     import random
 
     import numpy as np
 
+    put_back: list[torch.Tensor] = []
+    assert random_states()["mps"] is None or torch.backends.mps.is_available()
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(torch.mps, "get_rng_state", lambda: torch.tensor([7], dtype=torch.uint8))
+    monkeypatch.setattr(torch.mps, "set_rng_state", put_back.append)
     states = random_states()
     first = (torch.rand(3).tolist(), random.random(), float(np.random.rand()))  # noqa: NPY002, S311
     restore_random_states(states)
     assert (torch.rand(3).tolist(), random.random(), float(np.random.rand())) == first  # noqa: NPY002, S311
+    assert [state.tolist() for state in put_back] == [[7]]
+    restore_random_states({name: state for name, state in states.items() if name != "mps"})  # of an earlier version
 
 
 def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
