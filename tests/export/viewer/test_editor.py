@@ -243,8 +243,15 @@ def test_keys_are_added_and_moved_by_a_finger(show: Show) -> None:
     (key,) = keys_in(page).channels["expressiveness"]
     assert key.time == pytest.approx(1.4)
     assert key.value == pytest.approx(3.0, abs=0.1)
-    for _ in range(2):
-        touch(at(page, "expressiveness", 0.4, 0.25))
+    place = at(page, "expressiveness", 0.4, 0.25)
+
+    def added() -> bool:
+        """Tap twice: the browser takes taps that a busy machine brings late for single ones. On a key they add none."""
+        touch(place)
+        touch(place)
+        return len(keys_in(page).channels["expressiveness"]) > 1
+
+    wait_until(added)
     assert [key.time for key in keys_in(page).channels["expressiveness"]] == [0.4, 1.4]
 
 
