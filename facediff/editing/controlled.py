@@ -299,6 +299,12 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     direction = keys_of(controls.direction, animation.frame_rate)
     if direction is not None:
         direction.refuse_model_channels()
+        for option in direction.instead_of:
+            if f"{option} (" in animation.metadata.get(PROCEDURAL, ""):
+                raise FaceDiffError(
+                    f"{direction.source}: instead_of: the keys do what --{option} did, and {animation.name} has that "
+                    f"already; give the animation as it was before"
+                )
     acted = None
     if controls.acting is not None:
         from facediff.editing.acting import act, read_acting

@@ -263,11 +263,13 @@ class Direction:
         return json_text(self.source, self._content(), indent=None)
 
     def save(self, path: str | Path) -> Path:
-        """Write a .json or .csv file that :func:`read_direction` reads; a table has no place for ``instead_of``."""
+        """Write a .json file that :func:`read_direction` reads, or a .csv, which has no place for ``instead_of``."""
         path = Path(path)
         if path.suffix.lower() == ".json":
             write_json(path, self._content())
         elif path.suffix.lower() == ".csv":
+            if self.instead_of:
+                raise FaceDiffError(f"{path}: instead_of: a table has no place for it; choose .json")
             empty = {"slope": ""} if any(key.slope is not None for key in self.keys) else {}
             write_rows(path, [{**empty, **row} if empty else row for row in self.rows()], line_end="\n")
         else:

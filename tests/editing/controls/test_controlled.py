@@ -124,6 +124,11 @@ def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[...
     later = Direction([Key(0, "brows", 1.0)], instead_of=("acting",))
     again = apply_controls(made, AnimationControls(direction=later))
     assert Direction.parse(again.metadata["direction"], "again").instead_of == ("blinks", "acting")
+    # Nor is it done again in an animation that it is part of already.
+    blinking = apply_controls(make_animation(2), parsed("--blinks"))
+    with pytest.raises(FaceDiffError, match="blinks.json: instead_of: .*as it was before"):
+        apply_controls(blinking, parsed("--direction", str(blinks)))
+    apply_controls(blinking, AnimationControls(direction=later))
 
 
 def test_shape_keys_add_their_displacements(make_animation: Callable[..., Animation]) -> None:
