@@ -129,6 +129,19 @@ def test_keys_come_back_as_they_were_and_their_curves_are_those_of_python(show: 
     assert {"acting", "head.pitch", "expressiveness.lips", f"expressivity.{LOW}"} < set(offered)
     assert "head" not in offered
     assert page.evaluate("window.hacked") is None
+    # Lanes that have left the page are not drawn any more, when the colours change.
+    page.evaluate(
+        "(async () => { for (const number of [1, 0]) {"
+        " directed.value = number; directed.dispatchEvent(new Event('change')); }"
+        " for (let i = 0; i < 2; i++) await new Promise(requestAnimationFrame);"
+        " const paper = CanvasRenderingContext2D.prototype, { clearRect } = paper;"
+        " window.drawn = { true: 0, false: 0 };"
+        " paper.clearRect = function (...box) {"
+        " drawn[this.canvas.isConnected] += 1; clearRect.apply(this, box); }; })()"
+    )
+    page.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    page.wait_for("matchMedia('(prefers-color-scheme: dark)').matches && drawn.true >= 3")
+    assert page.evaluate("drawn.false") == 0
 
 
 def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp_path: Path) -> None:
@@ -216,7 +229,11 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
         ('{"keys": [{"time": 1, "channel": "brow", "value": 1}]}', "row 1: channel"),
         ('{"keys": [{"time": 1, "channel": "expressiveness", "value": 5}]}', "row 1: value"),
         ('{"keys": [{"time": "1 s", "channel": "expressiveness", "value": 1}]}', "row 1: time"),
-        ('{"keys": [{"frame": 1, "channel": "expressiveness", "value": 1}], "frame_rate": 0}', "row 1: time"),
+        ('{"keys": [{"frame": 1, "channel": "expressiveness", "value": 1}], "frame_rate": 0}', "frame_rate: "),
+        ('{"keys": [], "frame_rate": "25"}', "frame_rate: "),
+        ('{"keys": [], "framerate": 25}', "framerate: "),
+        ('{"keys": [], "format": null}', "no keys file"),
+        ('{"keys": [], "version": null}', "version null"),
         ('{"keys": [null]}', "row 1: channel"),
         ("null", "keys.json: holds no list"),
         ("{", "nothing was changed"),

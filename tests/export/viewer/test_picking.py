@@ -310,3 +310,30 @@ def test_parts_can_be_hidden(serve: Serve, picking: Picking, browser: Chromium) 
     assert min(corners()) >= count
     assert page.problems == page.evaluate("facediffPicking.errors") == []
     page.close()
+
+
+@pytest.mark.slow
+def test_the_box_around_a_face_turns_with_it(serve: Serve, picking: Picking, browser: Chromium) -> None:
+    """Where a face lies on its side, a wide picture has room for a larger one."""
+    page = browser.open(f"{serve(''.join(picking_page(picking)))}/", width=1700, height=500)
+    page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
+    target = "document.querySelector('#target {}')"
+
+    def mouth() -> float:
+        """Width of the mouth in pixels."""
+        ends = [3 * own(name) for name in ("mouth_corner_left", "mouth_corner_right")]
+        left, right = (
+            page.evaluate(f"facediffPicking.seen('target', facediffPicking.positions('target').slice({i}, {i} + 3))")
+            for i in ends
+        )
+        return float(np.hypot(left[0] - right[0], left[1] - right[1]))
+
+    before = mouth()
+    turn = target.format('[data-turn="2"]') + ".dispatchEvent(new MouseEvent('click', { shiftKey: true }))"
+    for _ in range(6):  # 15 degrees
+        page.evaluate(turn)
+    page.evaluate(f"{target.format('[data-action=whole]')}.click()")
+    assert page.evaluate(f"{target.format('.face')}.clientWidth > 1.3 * {target.format('.face')}.clientHeight")
+    assert 1.2 < mouth() / before < 1.9 / 1.5
+    assert page.problems == page.evaluate("facediffPicking.errors") == []
+    page.close()

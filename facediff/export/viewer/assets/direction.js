@@ -4,6 +4,8 @@ const KINDS = ["step", "linear", "smooth"];
 const SAME_TIME = 1e-6; // s
 const LATEST = 86_400; // s
 const MOST_SLOPE = 1e6; // a second
+const FRAME_RATES = [0.1, 1000]; // a second
+const FIELDS = ["format", "version", "frame_rate", "instead_of", "keys"];
 const COLUMNS = ["time", "frame", "channel", "value", "interpolation", "slope"];
 
 /** Change a second at each key: as given, or else such that a smooth curve does not overshoot. */
@@ -202,16 +204,21 @@ class Direction {
 
   /** Replace all keys by those of a file's content, in one change that can be undone. */
   open(text) {
-    const content = JSON.parse(text);
-    const rows = Array.isArray(content) ? content : content?.keys;
-    if (!Array.isArray(rows)) throw new Error('holds no list called "keys"');
-    if ((content.format ?? this.facts.format) !== this.facts.format) throw new Error("is no keys file");
-    if ((content.version ?? this.facts.version) !== this.facts.version) throw new Error(`has version ${content.version}`);
-    const { instead_of: turned = [] } = content;
-    if (!Array.isArray(turned) || turned.some((name) => !this.facts.insteadOf.includes(name))) {
-      throw new Error(`instead_of: expected a list of ${this.facts.insteadOf.join(", ")}`);
+    const parsed = JSON.parse(text), content = Array.isArray(parsed) ? { keys: parsed } : parsed, { facts } = this;
+    if (!Array.isArray(content?.keys)) throw new Error('holds no list called "keys"');
+    const other = Object.keys(content).find((name) => !FIELDS.includes(name));
+    if (other !== undefined) throw new Error(`${other}: expected ${FIELDS.join(", ")}`);
+    const { format = facts.format, version = facts.version, frame_rate: rate, instead_of: turned = [], keys: rows } = content;
+    if (format !== facts.format) throw new Error("is no keys file");
+    if (version !== facts.version) throw new Error(`has version ${version}`);
+    const [least, most] = FRAME_RATES;
+    if ((rate ?? null) !== null && !(typeof rate === "number" && rate >= least && rate <= most)) {
+      throw new Error(`frame_rate: expected ${least} to ${most}`);
     }
-    const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`, content.frame_rate ?? this.facts.frameRate));
+    if (!Array.isArray(turned) || turned.some((name) => !facts.insteadOf.includes(name))) {
+      throw new Error(`instead_of: expected a list of ${facts.insteadOf.join(", ")}`);
+    }
+    const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`, rate ?? facts.frameRate));
     const seen = new Set();
     keys.forEach(({ channel, time }, i) => {
       if (seen.has(`${time} ${channel}`)) throw new Error(`row ${i + 1}: ${channel} has a key at ${time} s already`);

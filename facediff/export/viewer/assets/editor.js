@@ -210,7 +210,7 @@ class Editor {
   direct(number) {
     this.number = number;
     find("directed").value = number;
-    for (const lane of this.lanes) lane.element.remove();
+    for (const lane of this.lanes) lane.leave();
     this.lanes = [];
     this.chosen = [];
     this.changed();
@@ -227,7 +227,7 @@ class Editor {
 
   removeLane(lane) {
     this.lanes = this.lanes.filter((each) => each !== lane);
-    lane.element.remove();
+    lane.leave();
     this.direction.removeChannel(lane.name);
     this.changed();
   }

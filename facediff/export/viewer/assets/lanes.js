@@ -51,6 +51,11 @@ class Lane extends Plot {
     this.element.append(head, plot);
   }
 
+  leave() {
+    this.element.remove();
+    this.gone.abort();
+  }
+
   get keys() {
     return this.editor.direction.of(this.name);
   }

@@ -63,6 +63,7 @@ class Side {
     this.root.querySelector(".file").textContent = facts.name;
     this.box.setAttribute("aria-label", `${this.root.getAttribute("aria-label")}, ${facts.name}: arrow keys move a cross, Enter places the point`);
     this.extent = facts.extent;
+    this.halves = facts.extent.map((half, axis) => [0, 1, 2].map((k) => (k === axis ? half : 0))); // they turn with it
     face.centre = facts.centre;
     this.edges = false;
     this.at = [0.5, 0.5]; // the cross, in shares of the box
@@ -174,11 +175,13 @@ class Side {
     };
     const { positions } = this.face;
     for (let i = 0; i < positions.length; i += 3) turn(positions.subarray(i, i + 3));
+    const turnAway = (v) => sub(turn(v.map((value, k) => value + centre[k])), centre);
     const [x, y, z, offset] = this.facts.plane;
-    const origin = turn([x * offset, y * offset, z * offset]);
-    const normal = sub(turn([x + centre[0], y + centre[1], z + centre[2]]), centre);
+    const origin = turn([x * offset, y * offset, z * offset]), normal = turnAway([x, y, z]);
     this.facts.plane = [...normal, dot(normal, origin)];
     this.facts.centre = turn([...this.facts.centre]);
+    this.halves = this.halves.map(turnAway);
+    this.facts.extent = [0, 1, 2].map((k) => this.halves.reduce((sum, half) => sum + Math.abs(half[k]), 0));
     for (let k = 0; k < 3; k++) extent[k] = 0;
     for (let i = 0; i < positions.length; i++) extent[i % 3] = Math.max(extent[i % 3], Math.abs(positions[i] - centre[i % 3]));
     const whole = this.root.querySelector("[data-action=whole]");

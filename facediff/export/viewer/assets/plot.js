@@ -55,8 +55,11 @@ class Plot {
     if (view) this.listenToZoom();
     this.listen();
     new ResizeObserver(() => this.draw()).observe(canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    const dark = matchMedia("(prefers-color-scheme: dark)"), { signal } = this.gone;
+    dark.addEventListener("change", () => this.draw(), { signal });
   }
+
+  gone = new AbortController(); // aborted when the plot has left the page for good
 
   /** A press or a drag goes to a moment; plots that can be edited listen to more. */
   listen() {
