@@ -269,7 +269,7 @@ def remove_rigid_motion(
         frames: (T, V, 3) vertices.
         target: (V, 3) the face to align them with.
         stable: indices of the vertices that the fit uses; all if None.
-        out: where to write the result, shape (T, V, 3); may be ``frames`` itself. A new array if None.
+        out: where to write the result, floating point (T, V, 3); may be ``frames`` itself. A new array if None.
         chunk_bytes: how much to read into memory at a time.
 
     Raises:
@@ -281,9 +281,12 @@ def remove_rigid_motion(
             f"expected (frames, vertices, 3) and (vertices, 3)"
         )
     if out is None:
-        out = np.empty(frames.shape, frames.dtype)
-    if out.shape != frames.shape:
-        raise FaceDiffError(f"rigid motion: out has shape {out.shape}, expected that of the frames, {frames.shape}")
+        out = np.empty(frames.shape, frames.dtype if frames.dtype.kind == "f" else np.float64)
+    if out.shape != frames.shape or out.dtype.kind != "f":
+        raise FaceDiffError(
+            f"rigid motion: out has shape {out.shape} and numbers {out.dtype}; expected floating point in the shape of "
+            f"the frames, {frames.shape}"
+        )
     every = np.arange(len(target)) if stable is None else np.asarray(stable)
     goal = np.asarray(target, np.float64)[every]
     count = len(frames)
@@ -364,6 +367,8 @@ def _refuse_not_finite(frames: Array, numbers: npt.NDArray[np.integer]) -> None:
 
 def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
     """Evenly spread frames, each moved to the origin."""
+    if not len(frames):
+        raise FaceDiffError("rigid motion: there are no frames; expected at least one")
     taken = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
     some = np.array(frames[taken], np.float64)
     _refuse_not_finite(some, taken)

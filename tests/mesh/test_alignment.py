@@ -200,6 +200,19 @@ def test_frames_that_cannot_be_laid() -> None:
         remove_rigid_motion(frames, face()[1:])
     with pytest.raises(FaceDiffError, match="out has shape"):
         remove_rigid_motion(frames, face(), out=np.empty((4, *face().shape)))
+    with pytest.raises(FaceDiffError, match="out has .*int64"):
+        remove_rigid_motion(frames, face(), out=np.empty(frames.shape, np.int64))
+    for function in (stable_vertices, median_face):
+        with pytest.raises(FaceDiffError, match="no frames"):
+            function(frames[:0])
+
+
+def test_frames_of_whole_numbers_are_not_rounded() -> None:
+    target = np.rint(1000 * face())
+    frames = np.stack([target, target @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), target + 1]).astype(np.int32)
+    found = remove_rigid_motion(frames, target)
+    np.testing.assert_allclose(found.frames, np.broadcast_to(target, frames.shape), atol=1e-6)
+    assert found.residuals.max() < 1e-6
 
 
 def test_stable_vertices_are_those_that_do_not_move() -> None:

@@ -81,6 +81,7 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     # OBJ
     "obj of 1e999": (".obj", b"v 0 0 1e999\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj of nan": (".obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    "obj of a colour of nan": (".obj", b"v 0 0 0 1 1 nan\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n"),
     "obj of 1e308": (".obj", b"v 0 0 1e308\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj with vertex 0": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n"),
     "obj with vertex 4": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"),
