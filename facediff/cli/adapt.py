@@ -292,7 +292,7 @@ def corpus_of_face(face: str, root: Path | None) -> SpeechMotionDataModule:
     from facediff.data.check.layouts import by_name
 
     find_own_module(face)
-    module: type[SpeechMotionDataModule] = by_name(face, None) if "." in face else registry.corpus.get(face)
+    module: type[SpeechMotionDataModule] = by_name(face, None, "--face") if "." in face else registry.corpus.get(face)
     if root is not None:
         module.check_root(root)
     try:

@@ -172,7 +172,9 @@ def refuse_repeated(arguments: Sequence[str]) -> None:
     change_values(arguments, note)
 
 
-def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None, option: str) -> None:
+def import_corpus(
+    path: Path, checkpoint: Mapping[str, Any], chosen: str | None, option: str
+) -> type[SpeechMotionDataModule] | None:
     """Import the corpus's class that the user names, which may be a file of the working folder.
 
     It is never imported because a checkpoint names it; the error then says how the user can.
@@ -182,6 +184,9 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
         checkpoint: its content.
         chosen: the class that the user names; None if the checkpoint's is to be used.
         option: the command's option for it.
+
+    Returns:
+        the class of an import path that the user names; else None.
     """
     from facediff.cli.data import find_own_module
     from facediff.data import SpeechMotionDataModule
@@ -192,8 +197,8 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
     named = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")
     if chosen is not None and "." in chosen:
         find_own_module(chosen)
-        by_name(chosen, None)
-    elif (
+        return by_name(chosen, None, option.rstrip(" ="))
+    if (
         chosen is None
         and is_path(named)
         and registry.find_class(registry.corpus, named, SpeechMotionDataModule) is None
@@ -203,6 +208,7 @@ def import_corpus(path: Path, checkpoint: Mapping[str, Any], chosen: str | None,
             f"own, add  {option}{named}  and run the command in the folder of its file; docs/own_data.md says how to "
             f"register it once and for all"
         )
+    return None
 
 
 def import_model(arguments: Sequence[str]) -> str | None:
@@ -365,6 +371,7 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     import yaml
 
     from facediff.cli.lightning_cli import LINKS
+    from facediff.data import SpeechMotionDataModule
     from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.models.checkpoint import build_model, corpus_of, read_checkpoint
 
@@ -388,10 +395,11 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     chosen = value_of(arguments, "--data")
     if chosen is not None and chosen.endswith((".yaml", ".yml")) and Path(chosen).is_file():
         chosen = class_of(chosen)
-    import_corpus(path, checkpoint, chosen, "--data=")
+    imported = import_corpus(path, checkpoint, chosen, "--data=")
     trained = str((checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path"))
-    package, _, short = trained.rpartition(".")  # or by its name alone, or that which the package has in its front
-    if chosen in (None, trained, short, f"{package.rpartition('.')[0]}.{short}"):
+    if imported is not None and imported is registry.find_class(registry.corpus, trained, SpeechMotionDataModule):
+        chosen = trained
+    if chosen in (None, trained, trained.rpartition(".")[2]):
         corpus, corpus_options = corpus_of(path, checkpoint)
         if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in arguments):
             tell_folder(path, corpus_options)

@@ -22,9 +22,10 @@ import yaml
 
 from facediff.cli.app import main
 from facediff.cli.lightning import tell_replaced_loggers, words_of_checkpoint
+from facediff.errors import FaceDiffError
 from facediff.models import load_model
 from tests.cli.conftest import SMALL
-from tests.fakes import processes
+from tests.fakes import processes, tiny
 
 Fit = Callable[..., int]
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -100,8 +101,12 @@ def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.yaml").write_text("class_path: tests.fakes.tiny.Tiny\ninit_args: {batch_size: 3}\n")
     words = ["predict", f"--ckpt_path={checkpoint}", "--trainer.enable_progress_bar=false", "--model.sampler.steps=1"]
-    options = [words_of_checkpoint("test", checkpoint, [f"--data={name}Tiny"]) for name in ("tests.fakes.tiny.", "")]
-    assert options[0] == options[1] != []
+    monkeypatch.setitem(sys.modules, "elsewhere", tiny)
+    places = ("tests.fakes.tiny.", "", "elsewhere.")
+    options = [words_of_checkpoint("test", checkpoint, [f"--data={place}Tiny"]) for place in places]
+    assert options[0] == options[1] == options[2] != []
+    with pytest.raises(FaceDiffError, match="--data elsewhere.Large: cannot be imported"):
+        words_of_checkpoint("test", checkpoint, ["--data=elsewhere.Large"])
     assert main([*words, "--data=part.yaml"]) == 0
     assert "batch_size: 3" in (tmp_path / "runs/predict/version_0/config.yaml").read_text()
     files = sorted(tmp_path.glob("runs/predict/version_0/predictions/*.npy"))

@@ -229,18 +229,18 @@ def _raw_distribution(root: Path) -> tuple[str, str] | None:
 # The data module that reads it.
 
 
-def by_name(name: str, n_vertices: int | None) -> Module:
+def by_name(name: str, n_vertices: int | None, option: str = "--corpus") -> Module:
     """The data module of a corpus name (``biwi``), a class name (``Biwi``) or an import path (``package.Class``).
 
-    The vertices found in the folder decide between several modules of one corpus.
+    The vertices found in the folder decide between several modules of one corpus; errors name the option.
     """
     if "." in name:
-        return _import(name)
+        return _import(name, option)
     fitting = [m for m in _known() if name.lower() in (m.corpus_name.lower(), m.__name__.lower())]
     if not fitting:
         names = dict.fromkeys(module.corpus_name for module in _known())
         raise FaceDiffError(
-            f'--corpus: there is no "{name}": {choices(name, names)}; a data module of your own is given by its import '
+            f'{option}: there is no "{name}": {choices(name, names)}; a data module of your own is given by its import '
             f"path, package.module.Class"
         )
     return next((module for module in fitting if module.n_vertices == n_vertices), fitting[0])
@@ -290,16 +290,16 @@ def _known() -> list[Module]:
     return sorted(concrete, key=lambda module: not module.__module__.startswith("facediff."))
 
 
-def _import(path: str) -> Module:
+def _import(path: str, option: str) -> Module:
     from facediff.data import SpeechMotionDataModule
 
     place, _, name = path.rpartition(".")
     try:
         module = getattr(importlib.import_module(place), name)
     except Exception as error:  # a module can fail in any way while it is imported
-        raise FaceDiffError(f"--corpus {path}: cannot be imported ({error}); expected package.module.Class") from error
+        raise FaceDiffError(f"{option} {path}: cannot be imported ({error}); expected package.module.Class") from error
     if not (isinstance(module, type) and issubclass(module, SpeechMotionDataModule)) or inspect.isabstract(module):
-        raise FaceDiffError(f"--corpus {path}: is no data module; expected a subclass of SpeechMotionDataModule")
+        raise FaceDiffError(f"{option} {path}: is no data module; expected a subclass of SpeechMotionDataModule")
     return module
 
 
