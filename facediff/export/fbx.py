@@ -11,7 +11,6 @@ from pathlib import Path
 
 from facediff.animation import Animation
 from facediff.errors import FaceDiffError
-from facediff.utils.files import put_in_place, scratch_folder
 
 SCRIPT = Path(__file__).with_name("glb_to_fbx.py")
 """What Blender runs."""
@@ -41,12 +40,13 @@ def refuse_without_blender(path: Path) -> None:
 
 
 def write_fbx(
-    path: Path, animation: Animation, sound: str | None, write_glb: Callable[[Path], list[Path]]
+    path: Path, folder: Path, animation: Animation, sound: str | None, write_glb: Callable[[Path], list[Path]]
 ) -> list[Path]:
     """Write one animation; the sound lies next to it, since .fbx has no place for it.
 
     Args:
         path: the file.
+        folder: hidden one, in which the files are written, to be moved to their places.
         animation: for its frame rate.
         sound: name of the file of its sound; None if there is none.
         write_glb: writes the .glb of that name, and returns its files.
@@ -55,19 +55,14 @@ def write_fbx(
         FaceDiffError: if Blender fails.
     """
     refuse_without_blender(path)
-    with scratch_folder(path) as hidden:
-        glb, *wav = write_glb(hidden / f"{path.stem}.glb")
-        made = hidden / path.name
-        rate = f"{animation.frame_rate:.9g}", f"{len(animation.vertices)}"
-        words = [*(command() or []), str(glb), str(made), "--frame-rate", rate[0], "--frames", rate[1]]
-        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603
-        if done.returncode != 0 or not made.is_file():
-            said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
-            raise FaceDiffError(
-                f"{path}: {words[0]} ended with status {done.returncode} ({said[:200]}); run {SCRIPT} by hand"
-            )
-        put_in_place(made, path)
-        if sound is None:
-            return [path]
-        put_in_place(wav[0], path.with_name(sound))
-    return [path, path.with_name(sound)]
+    glb, *wav = write_glb(folder / f"{path.stem}.glb")
+    made = folder / path.name
+    rate = f"{animation.frame_rate:.9g}", f"{len(animation.vertices)}"
+    words = [*(command() or []), str(glb), str(made), "--frame-rate", rate[0], "--frames", rate[1]]
+    done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603
+    if done.returncode != 0 or not made.is_file():
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
+        raise FaceDiffError(
+            f"{path}: {words[0]} ended with status {done.returncode} ({said[:200]}); run {SCRIPT} by hand"
+        )
+    return [made] if sound is None else [made, wav[0].rename(folder / sound)]

@@ -81,12 +81,17 @@ def write_animations(
     check_export(path, options, len(animations), weights=seeks_weights(path, options) and have_weights(animations))
     if path.suffix.lower() == ".fbx":
         names = [path] if len(animations) == 1 else _targets(path, FORMATS[".glb"], len(animations))
-        written = []
-        for name, animation in zip(names, animations, strict=True):
-            glb = partial(write_animations, animations=[animation], options=options, into=into, own_shapes=own_shapes)
-            sound = _speech_file(name, FORMATS[".glb"], animation, options)
-            written += write_fbx(name, animation, sound, glb)
-        return written
+        sounds = [
+            _speech_file(name, FORMATS[".glb"], one, options) for name, one in zip(names, animations, strict=True)
+        ]
+        glb = partial(write_animations, options=options, into=into, own_shapes=own_shapes)
+        files: list[Path] = []
+        with scratch_folder(path) as hidden:
+            for name, animation, sound in zip(names, animations, sounds, strict=True):
+                files += write_fbx(name, hidden, animation, sound, partial(glb, animations=[animation]))
+            for file in files:
+                put_in_place(file, path.with_name(file.name))
+        return [path.with_name(file.name) for file in files]
     form = FORMATS[path.suffix]
     if z_up and options.up is None and "z" in form.up_axes:
         options = replace(options, up="z")

@@ -26,7 +26,7 @@ from tests.fakes.glb_reader import Reader
 
 @pytest.fixture
 def blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A program on PATH, which keeps its words and the .glb, and writes the .fbx unless that is called fails.fbx."""
+    """A program on PATH, which keeps its words and the .glb, and writes the .fbx, but no fails and second_sample2."""
     folder = tmp_path / "bin"
     folder.mkdir()
     program = folder / "blender"
@@ -37,7 +37,7 @@ def blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "(kept / 'words.json').write_text(json.dumps(sys.argv[1:]))\n"
         "glb, made = sys.argv[sys.argv.index('--') + 1:][:2]\n"
         "shutil.copy(glb, kept / 'seen.glb')\n"
-        "if made.endswith('fails.fbx'):\n    sys.exit('cannot import')\n"
+        "if made.endswith(('fails.fbx', 'second_sample2.fbx')):\n    sys.exit('cannot import')\n"
         "pathlib.Path(made).write_bytes(b'Kaydara FBX Binary')\n"
     )
     program.chmod(0o755)
@@ -79,6 +79,11 @@ def test_several_samples_and_a_failure(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="cannot import"):
         write_animations(tmp_path / "fails.fbx", [clicks()])
     assert not (tmp_path / "fails.fbx").exists()
+    # All or none: the first of two is not left behind where the second fails.
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(FaceDiffError, match="cannot import"):
+        write_animations(tmp_path / "second.fbx", [clicks(), clicks()])
+    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.usefixtures("blender")
