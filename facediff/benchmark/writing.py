@@ -313,7 +313,8 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
     """Put the tables into a Markdown page, between two comments that bear the plan's name."""
     name = report.outline.name
     begin, end = BEGIN.format(name=name), END.format(name=name)
-    text = path.read_text(encoding="utf-8")
+    with path.open(encoding="utf-8", newline="") as stream:  # as its lines end
+        text = stream.read()
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(end) < text.index(begin):
         raise FaceDiffError(
             f"{path}: has no place for {name}; write the two lines  {begin}  and  {end}  where it shall be"
@@ -321,9 +322,11 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
     # Headings of the page stand above those of the tables.
     blocks = body(report, {})
     lowered = [replace(block, level=block.level + 1) if isinstance(block, Title) else block for block in blocks]
-    text = f"{text[: text.index(begin)]}{begin}\n\n{markdown(lowered)}\n{text[text.index(end) :]}"
+    block = f"{begin}\n\n{markdown(lowered)}\n".replace("\n", "\r\n" if "\r\n" in text else "\n")
     with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(
+            f"{text[: text.index(begin)]}{block}{text[text.index(end) :]}", encoding="utf-8", newline=""
+        )
 
 
 # CSV.

@@ -85,7 +85,8 @@ def generation_metrics(
     for name in splits or ():
         if name not in SPLITS:
             raise FaceDiffError(f"--splits {name}: there is no such split; expected one of {', '.join(SPLITS)}")
-    if against is not None and against.suffix == ".json":
+    stored = None
+    if against is not None and against.suffix.lower() == ".json":
         from facediff.utils.plain_files import load_json
 
         stored = load_json(against, name=f"--against {against}")
@@ -100,7 +101,7 @@ def generation_metrics(
     factor = None if expressivity is None else ranges.EXPRESSIVITY.read("--expressivity", expressivity)
     sampling = SamplingOptions(samples, references, sampler, steps, seed, factor, low_latency)
     device = usable_device(device)
-    reference = means_of(stored, f"--against {against}") if against is not None and against.suffix == ".json" else {}
+    reference = {} if stored is None else means_of(stored, f"--against {against}")
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
     splits = list(dict.fromkeys(splits)) if splits else data.test_splits
     others = [] if against is None or reference else [against]

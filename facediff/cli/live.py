@@ -41,7 +41,8 @@ def live(
 
     Frames leave at their rate, each at its time; frames that come too late are dropped. How long after the speech that
     is (the lag) is reported every few seconds and at the end. Ctrl-C ends the performance. Frames are generated one by
-    one, with low latency, unless --window or --overlap are given.
+    one, with low latency, unless --window or --overlap are given. --blinks, --gaze and --sway need recordings as a
+    whole: they are for `facediff animate`.
 
     For example:
       facediff live --microphone --to browser

@@ -176,6 +176,10 @@ def test_the_block_of_a_page_is_replaced_and_the_rest_stays(tmp_path: Path) -> N
     assert "was here" not in once
     replace_block(file, made())
     assert file.read_text() == once
+    windows = once.replace("\n", "\r\n").encode()
+    file.write_bytes(windows.replace(b"last", b"the last"))
+    replace_block(file, made())
+    assert file.read_bytes() == windows.replace(b"last", b"the last")
     file.write_text("nothing\n")
     with pytest.raises(FaceDiffError, match="made"):
         replace_block(file, made())

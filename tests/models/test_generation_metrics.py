@@ -245,7 +245,20 @@ def test_the_command_writes_what_it_prints(
     assert "ddim with 3 steps" in printed
     content = json.loads((tmp_path / "a.json").read_text())
     assert content["clips"] == {"test_a": 1, "test_b": 1}
-    assert main([*words, "--sampler", "ddpm", "--steps", "2", "--against", str(tmp_path / "a.json")]) == 0
+    assert (
+        main(
+            [
+                *words,
+                "--sampler",
+                "ddpm",
+                "--steps",
+                "2",
+                "--against",
+                str((tmp_path / "a.json").rename(tmp_path / "b.JSON")),
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     assert "ddpm with 2 steps" in printed
     assert "[1.000]" in printed
