@@ -280,7 +280,7 @@ class ControlledFace:
             if set(direction.channels) & set(before.channels):  # both have changed it, one after the other
                 name = f"{METADATA}, afterwards"
             else:
-                instead_of = tuple(dict.fromkeys((*before.instead_of, *direction.instead_of)))
+                instead_of = (*before.instead_of, *direction.instead_of)
                 direction = Direction((*before.keys, *direction.keys), METADATA, instead_of)
         return replace(animation, metadata={**animation.metadata, name: direction.text()})
 

@@ -184,6 +184,7 @@ class Direction:
                 )
             taken.add((key.channel, key.time))
         object.__setattr__(self, "keys", tuple(ordered))
+        object.__setattr__(self, "instead_of", tuple(dict.fromkeys(self.instead_of)))
 
     @cached_property
     def channels(self) -> dict[str, tuple[Key, ...]]:
@@ -308,7 +309,7 @@ class Direction:
         if not isinstance(instead_of, list) or not all(name in INSTEAD_OF for name in instead_of):
             raise FaceDiffError(f"{source}: instead_of {shown(instead_of)}: expected a list of {', '.join(INSTEAD_OF)}")
         keys = tuple(_read_keys(enumerate(content["keys"], 1), source, frame_rate))
-        return cls(keys, source, tuple(dict.fromkeys(instead_of)))
+        return cls(keys, source, instead_of)
 
 
 def _mood(**values: float) -> tuple[Key, ...]:
