@@ -49,6 +49,15 @@ Progress = Callable[[int, int], object]
 """Called with what is done and the total, in denoising steps or seconds of speech."""
 
 
+def check_directed(options: AnimationOptions) -> None:
+    """Refuse animation controls that contradict each other, and keys of what an option says."""
+    check_controls(options)
+    if (keys := keys_of(options.direction)) is not None:
+        for name in ("style", "condition", "expressivity", "guidance"):
+            if getattr(options, name) is not None:
+                keys.refuse_both(name)
+
+
 def check_options(options: AnimationOptions) -> None:
     """Refuse options that contradict each other and files that are not there, before a model is loaded."""
     from facediff.speech.voice_activity import OFF, read_gate
@@ -56,15 +65,11 @@ def check_options(options: AnimationOptions) -> None:
     expressivity_of(options)
     read_scales(options.guidance)
     read_gate(options.voice_gate or OFF)
-    check_controls(options)
+    check_directed(options)
     if options.acting is not None:
         from facediff.editing.acting import read_acting
 
         read_acting(options.acting)
-    if (keys := keys_of(options.direction)) is not None:
-        for name in ("style", "condition", "expressivity", "guidance"):
-            if getattr(options, name) is not None:
-                keys.refuse_both(name)
     for name in ("frame_rate", "mesh"):
         if getattr(options, name) is not None and not is_audio2face(options.checkpoint):
             raise OptionError(

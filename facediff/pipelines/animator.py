@@ -24,7 +24,7 @@ from facediff.animation.options import (
 )
 from facediff.editing.controls import keys_of, refuse_folder
 from facediff.errors import FaceDiffError, OptionError
-from facediff.pipelines.animate import AnimationPipeline, check_options, direction_for
+from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hub import EXPECTED_TO_ANIMATE, check_animating_source, is_audio2face, is_exported, model_or_bundled
@@ -236,6 +236,7 @@ class SpeechAnimator(ABC):
                 elif chosen.direction is not None:
                     direction = direction_for(chosen.direction, Path(recording))
                     if direction is not chosen.direction:
+                        check_directed(replace(chosen, direction=direction))
                         pipeline.direct(keys_of(direction, pipeline.frame_rate))
                 spoken = speech_of(recording, rate, chosen.max_seconds)
                 with pipeline.animations(replace(spoken, name=name or spoken.name)) as finished:

@@ -15,10 +15,10 @@ import numpy as np
 
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.animation.style_files import style_paths
-from facediff.editing.controls import check_controls, keys_file
+from facediff.editing.controls import keys_file
 from facediff.errors import FaceDiffError, OptionError, choices, printable
 from facediff.export import FORMATS, check_export
-from facediff.pipelines.animate import check_options
+from facediff.pipelines.animate import check_directed, check_options
 from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
 from facediff.utils import SAMPLE_RATE
@@ -134,7 +134,7 @@ def check_directions(options: AnimationOptions, found: Sequence[Path], folder: P
         raise OptionError("direction", f"has no keys for any recording; expected {expected}", folder)
     for file in files.values():
         if file is not None:
-            check_controls(replace(options.controls, direction=file))
+            check_directed(replace(options, direction=file))
     if without:
         shown = ", ".join(without[:5]) + (" …" if len(without) > 5 else "")
         print(f"note: {folder}: has no keys for {len(without)} of {len(found)} recordings ({shown})")

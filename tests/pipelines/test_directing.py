@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -235,7 +236,9 @@ def test_acting_is_off_unless_it_is_asked_for_and_rests_in_silence(model: facedi
         facediff.Animation("x", plain.vertices, plain.template, 25.0, plain.faces).control(acting="prosody")
 
 
-def test_a_batch_takes_the_keys_of_each_recording(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_batch_takes_the_keys_of_each_recording(
+    model: facediff.Animator, workplace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recordings = workplace / "in"
     recordings.mkdir()
     for name in "abc":
@@ -254,6 +257,12 @@ def test_a_batch_takes_the_keys_of_each_recording(workplace: Path, capsys: pytes
     (recordings / "b.csv").write_text("time,channel,value\n0,brows,99\n")
     with pytest.raises(FaceDiffError, match=r"b\.csv: row 2"):
         animate_folder(options, **run)
+    # Keys of a folder are compared with the options as those of one file are.
+    (recordings / "b.csv").write_text("time,channel,value\n0,expressivity,1\n")
+    with pytest.raises(FaceDiffError, match=r"b\.csv: channel expressivity: --expressivity"):
+        animate_folder(replace(options, expressivity="0.5"), **run)
+    with pytest.raises(FaceDiffError, match=r"b\.csv: channel expressivity: --expressivity"):
+        model.animate(recordings / "b.wav", direction=recordings, expressivity=0.5, **QUICK)
 
 
 @pytest.mark.slow
