@@ -36,6 +36,8 @@ Kind = Literal["ARKit", "Oculus", "VRM"]
 
 JAW = np.deg2rad(25.0)
 """Turn of a jaw's bone at a weight of 1 of jawOpen, where no shape opens the mouth."""
+ROUND_ABOUT = (-1.0, 1.0, -1.0)
+"""Signs of a turn's axis for an avatar that looks along -z."""
 ENOUGH = {"Oculus": 8, "VRM": 3}
 """So many visemes of a set must be there for the set to be the avatar's."""
 BONES = {
@@ -145,7 +147,7 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
         named = has_arkit_weights(animation)
         weights = arkit_weights(animation) if named else _solved(glb, own, animation)
         if named and _looks_back(glb) and weights.head is not None:  # solved for, it is in the avatar's axes already
-            weights = replace(weights, head=weights.head * [-1.0, 1.0, -1.0])
+            weights = replace(weights, head=weights.head * ROUND_ABOUT)
         _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
         raise _unreadable(target, error) from error
@@ -321,7 +323,7 @@ def _animate(
 def _turns(own: OwnShapes, weights: Weights, looks_back: bool) -> list[tuple[int, Array]]:
     """Nodes and the quaternions (T, 4) by which they turn about the scene's axes."""
     none = np.zeros(len(weights.values))
-    round_about = np.array([1.0, -1.0, 1.0, -1.0]) if looks_back else np.ones(4)
+    round_about = np.array([1.0, *ROUND_ABOUT]) if looks_back else np.ones(4)
     result = []
     for bone in ("head", "neck"):
         if bone in own.bones and weights.head is not None:
