@@ -103,9 +103,14 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
         kinds = b"".join(line[:1] for line in lines if line[:2] in (b"v ", b"v\t", b"f ", b"f\t"))
         if b"fv" in kinds:
             raise ValueError("faces between its vertices count backwards from where they stand")
-    if width >= 6 and not np.isfinite(table[:, 3:6]).all():
-        raise ValueError("its colours are not finite")
-    colours = np.rint(table[:, 3:6].clip(0, 1) * 255).astype(np.uint8) if width >= 6 else None
+    colours = None
+    if width >= 6:
+        shares = table[:, 3:6]
+        if not np.isfinite(shares).all():
+            raise ValueError("its colours are not finite")
+        if shares.max() >= 2:  # some tools write bytes; a little above 1 is a rounding
+            shares = shares / 255
+        colours = np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
     return Mesh(table[:, :3].copy(), _triangles(listed, len(table)).copy(), colours)
 
 

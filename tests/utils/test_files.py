@@ -149,6 +149,10 @@ def test_an_obj_keeps_vertices_that_no_face_uses_and_its_colours(tmp_path: Path)
     assert mesh.faces.tolist() == [[0, 2, 3], [0, 2, 3]]
     assert mesh.colours is not None
     assert mesh.colours.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]]
+    (tmp_path / "m.obj").write_text("v 0 0 0 255 51 0\nv 1 0 0 0 0 1\nv 0 1 0 0 0 0\nf 1 2 3\n")  # in bytes
+    colours = read_mesh(tmp_path / "m.obj").colours
+    assert colours is not None
+    assert colours.tolist() == [[255, 51, 0], [0, 0, 1], [0, 0, 0]]
 
 
 def test_an_atomic_folder_is_whole_or_absent(tmp_path: Path) -> None:
