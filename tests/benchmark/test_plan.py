@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from facediff.benchmark import cells_of, read_plan
@@ -71,6 +73,19 @@ def test_a_bad_plan_meets_one_sentence(folder: Path) -> None:
             cells_of(read_plan(folder / "plan.yaml"))
         assert named in str(caught.value), new
     assert not (folder / "out").exists()
+
+
+def test_the_plan_of_the_manual_is_accepted(folder: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "benchmark.md").read_text()
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    corpus, predictions = folder / "BIWI", folder / "out" / "theirs"
+    (folder / "codetalker.ckpt").write_bytes(b"a model")
+    for place in (corpus, predictions):
+        place.mkdir(parents=True)
+    np.save(predictions / "F2_e37.npy", np.zeros((2, 3), np.float32))
+    (folder / "plan.yaml").write_text(text)
+    plan = read_plan(folder / "plan.yaml", {"biwi": corpus})
+    assert {cell.row for cell in cells_of(plan)} == {"ours", "faceformer", "codetalker", "imported", "theirs"}
 
 
 def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path) -> None:
