@@ -209,7 +209,7 @@ class ControlledFace:
         """
         if procedural.moves_head(animation):
             raise FaceDiffError(
-                f"{animation.name}: its head sways already; apply the controls to the animation as it was before"
+                f"{animation.name}: its head moves already; apply the controls to the animation as it was before"
             )
         seed = seed if self.controls.controls_seed is None else self.controls.controls_seed
         frames, rate, eyes = len(animation.vertices), animation.frame_rate, self.eyes

@@ -36,11 +36,11 @@ def check_controls(controls: AnimationControls) -> None:
         )
     if controls.controls_seed is not None and not is_procedural(controls):
         raise OptionError(
-            "controls_seed", "has no effect without {blinks}, {gaze} or {sway}; give one of them, or omit it"
+            "controls_seed", "has no effect without {blinks}, {gaze}, {sway} or {acting}; give one of them, or omit it"
         )
     if controls.eyes is not None and controls.is_off:
         raise OptionError(
-            "eyes", "has no effect without {expressiveness}, {blinks} or {gaze}; give one of them, or omit it"
+            "eyes", "has no effect without {expressiveness}, {blinks}, {gaze} or {acting}; give one of them, or omit it"
         )
     if (keys := keys_of(controls.direction)) is not None:
         for name in ("expressiveness", "blinks", "gaze", "sway", *keys.instead_of):

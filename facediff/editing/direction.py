@@ -231,8 +231,8 @@ class Direction:
                 )
                 if exported:
                     reason = (
-                        "changes within a recording with a checkpoint only (.ckpt of a training; this model is an "
-                        "exported one); leave these keys out, or give one"
+                        "needs a checkpoint (.ckpt of a training), and this model is an exported one; leave these keys "
+                        "out, or give the checkpoint"
                     )
                 raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
 

@@ -125,7 +125,7 @@ def test_head_keys_turn_the_head_by_their_angles(model: facediff.Animator, speec
     assert angle == pytest.approx(np.hypot(8, 5), abs=1e-3)
     assert turn[1, 2] < 0, "what points forwards points down"
     assert turn[0, 2] < 0, "and to the face's right"
-    with pytest.raises(FaceDiffError, match="head sways already"):
+    with pytest.raises(FaceDiffError, match="head moves already"):
         made.control(blinks=True)
 
 

@@ -71,7 +71,7 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
     own = apply_controls(animation, parsed("--blinks", "--controls-seed", "3"), seed=7)
     assert own.metadata["procedural"] == "blinks (17 a minute, seed 3)"
     assert apply_controls(animation, parsed("--sway"), seed=9).metadata["procedural"] == "head sway (2 degrees, seed 9)"
-    with pytest.raises(FaceDiffError, match="F1: its head sways already"):
+    with pytest.raises(FaceDiffError, match="F1: its head moves already"):
         apply_controls(made, parsed("--blinks"))
 
 
@@ -85,6 +85,7 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
         (["--sway", "0"], "--sway 0: "),
         (["--eyes", "none.json"], "eyes none.json: no such file"),
         (["--controls-seed", "-1"], "--controls-seed -1: "),
+        (["--controls-seed", "1"], "acting"),
     ],
 )
 def test_words_are_checked_before_anything_is_made(words: list[str], sentence: str) -> None:
