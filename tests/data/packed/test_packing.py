@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,6 +51,17 @@ def test_zarr_reads_the_same_numbers(corpus: Path, packed: Path) -> None:
         vertices = steps.reshape(len(rows), -1, 3) * record["step"] + face
         was = np.load(corpus / "vertices_npy" / f"{clip['name']}.npy").reshape(vertices.shape)
         assert np.abs(vertices - was).max() <= 0.01 * MM
+
+
+def test_the_lines_of_the_manual_read_steps_and_exact_clips(corpus: Path, packed: Path, tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "packed.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    packing.pack(corpus, tmp_path / "exact.zarr", corpus=TINY, lossless=True, workers=1)
+    for store, most in ((packed, 0.01 * MM), (tmp_path / "exact.zarr", 0.0)):
+        names: dict[str, Any] = {}
+        exec(lines.replace("BIWI.zarr", str(store)), names)  # noqa: S102 - the manual's own
+        was = np.load(corpus / "vertices_npy" / f"{names['clip']['name']}.npy")
+        assert np.abs(names["vertices"] - was.reshape(len(was), -1)).max() <= most
 
 
 def test_what_scores_are_computed_from_keeps_every_bit(corpus: Path, tmp_path: Path) -> None:
