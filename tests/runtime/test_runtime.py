@@ -273,7 +273,7 @@ def test_a_bare_motion_is_completed_by_a_folder(folder: Path, tmp_path: Path) ->
         [*({*exported.model.description.faces} - {*exported.identities})],
     )
     keys = [{"time": 0, "channel": "style", "value": "A"}]
-    with pytest.raises(FaceDiffError, match="with a checkpoint only"):
+    with pytest.raises(FaceDiffError, match="needs a checkpoint"):
         exported.animate(sound(0.5), 16_000, direction=keys)
 
 
