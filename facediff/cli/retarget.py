@@ -101,7 +101,7 @@ def retarget(
     from facediff.export.glb_own_shapes import unused_shapes
     from facediff.export.pictures import draw_correspondence
     from facediff.mesh.glb import wears_more
-    from facediff.mesh.textures import has_textures
+    from facediff.mesh.textures import hands_on_textures
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
@@ -144,8 +144,7 @@ def retarget(
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
         notes += unused_shapes(target_mesh)
     notes += surface_notes(target_mesh, output, made)
-    is_bare = holds_glb(output) and target_mesh.suffix.lower() == ".glb"
-    into = target_mesh if dressed or own_shapes or (has_textures(target_mesh) and not is_bare) else None
+    into = target_mesh if dressed or own_shapes or hands_on_textures(target_mesh, output) else None
     written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes, z_up=has_z_up(found))
     if show is not None:
         written.append(show)

@@ -19,6 +19,7 @@ from facediff.errors import FaceDiffError
 from facediff.mesh.glb import Glb, attributes, open_glb, whole
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
+from facediff.utils.files import holds_glb
 from facediff.utils.limits import LIMITS
 
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
@@ -77,6 +78,11 @@ def has_textures(path: Path) -> bool:
         return False
     with path.open("rb") as stream:
         return any(line.startswith((b"vt ", b"vt\t")) for line in stream)
+
+
+def hands_on_textures(path: Path, output: Path) -> bool:
+    """Whether an output gets a mesh file's textures without being a copy of it: a .glb's own go into its copy alone."""
+    return not (path.suffix.lower() == ".glb" and holds_glb(output)) and has_textures(path)
 
 
 def read_textures(path: Path, n_triangles: int) -> Textures:

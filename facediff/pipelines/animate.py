@@ -275,13 +275,12 @@ class AnimationPipeline(ABC):
             the files, and the first animation.
         """
         from facediff.export import write_animations
+        from facediff.mesh.textures import hands_on_textures
 
         # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates and pictures.
-        wears_more, has_textures = self._target_beyond_surface
         target = Path(self.options.target_mesh or "")
-        is_dressed = holds_glb(output) and export.output_unit is None and wears_more
-        is_bare = holds_glb(output) and target.suffix.lower() == ".glb"
-        into = target if is_dressed or (has_textures and not is_bare) else None
+        is_dressed = holds_glb(output) and export.output_unit is None and self._target_wears_more
+        into = target if is_dressed or hands_on_textures(target, output) else None
         own_shapes = self.options.own_shapes
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
@@ -299,15 +298,11 @@ class AnimationPipeline(ABC):
         return has_z_up(self._correspondence)
 
     @cached_property
-    def _target_beyond_surface(self) -> tuple[bool, bool]:
-        """Whether the target mesh is a .glb that wears more than its surface, and whether it has textures."""
-        if self.options.target_mesh is None:
-            return False, False
+    def _target_wears_more(self) -> bool:
+        """Whether the target mesh is a .glb that wears more than its surface."""
         from facediff.mesh.glb import wears_more
-        from facediff.mesh.textures import has_textures
 
-        target = Path(self.options.target_mesh)
-        return wears_more(target), has_textures(target)
+        return self.options.target_mesh is not None and wears_more(Path(self.options.target_mesh))
 
     @contextmanager
     def animations(
