@@ -190,7 +190,7 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         raise MissingExtraError(*form.requires, f"writing {suffix}")
     for target in _targets(path, form, n_animations):
         check_writable(target)
-        if suffix == ".json" and target.exists() and is_free(target):
+        if suffix == ".json" and target.exists() and target.stat().st_size and is_free(target):
             raise FaceDiffError(f"{target}: describes {target.with_suffix('.csv').name}; choose another -o")
         if form.is_folder:
             check_free(folder_of(target))
@@ -249,7 +249,7 @@ def _speech_file(path: Path, form: Format, animation: Animation, options: Export
 
 
 def is_free(path: Path) -> bool:
-    """Whether a path does not exist or was written by facediff; for a folder, whether all of its files were."""
+    """Whether a path is not there, empty, or of facediff; for a folder, whether all of its files are."""
     if not path.exists():
         return True
     try:
@@ -258,7 +258,8 @@ def is_free(path: Path) -> bool:
             recorded = not files or (path / RECORD) in files
             return recorded and all(file.is_file() and is_free(file) for file in files)
         with path.open("rb") as stream:
-            return MARK in stream.read(200)
+            start = stream.read(200)
+            return not start or MARK in start
     except OSError as error:
         raise FaceDiffError(
             f"{path}: is in the way and cannot be read ({error.strerror}); choose another -o"

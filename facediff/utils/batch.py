@@ -97,12 +97,11 @@ def _attempt(
     try:
         outcome = Outcome(work(task))
     except FaceDiffError as error:
-        disk_full = isinstance(error.__cause__, OSError) and error.__cause__.errno in NO_SPACE
-        if disk_full or isinstance(error, SetupError | MissingExtraError):
+        if _is_full(error) or isinstance(error, SetupError | MissingExtraError):
             return Outcome(problem=error.on_command_line, fatal=True)
         outcome = Outcome(problem=error.on_command_line)
     except OSError as error:
-        if error.errno in NO_SPACE:
+        if _is_full(error):
             return Outcome(problem=f"{task}: {error.strerror}", fatal=True)
         outcome = Outcome(problem=f"{task}: {error.strerror or error}; check that it exists and may be used")
     except Exception as error:
@@ -114,6 +113,11 @@ def _attempt(
     if record is not None:
         record(task, outcome.problem, outcome.result)
     return replace(outcome, seconds=time.monotonic() - started)
+
+
+def _is_full(error: BaseException | None) -> bool:
+    """Whether there was no room, in however many errors that is told."""
+    return error is not None and (getattr(error, "errno", None) in NO_SPACE or _is_full(error.__cause__))
 
 
 # Is an output still current? One small file records what it was made of.

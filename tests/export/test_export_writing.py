@@ -193,6 +193,9 @@ def test_files_next_to_an_export_never_replace_the_users_own(animation: Animatio
         write_animations(tmp_path / "face.mdd", [animation])
     assert (tmp_path / "face.obj").read_text() == "v 0 0 0\n"
     assert (tmp_path / "hello.wav").read_bytes() == (tmp_path / "hello_speech.wav").read_bytes() == before
+    (tmp_path / "hello.wav").write_bytes(b"")  # a run before was cut off here; nobody loses anything
+    written = write_animations(tmp_path / "hello.usda", [animation])
+    assert [path.name for path in written] == ["hello.usda", "hello.wav"]
     assert {file.name for file in tmp_path.iterdir()} == {
         "face.obj",
         "hello.glb",

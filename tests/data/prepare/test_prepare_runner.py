@@ -157,8 +157,10 @@ def test_damaged_files_of_a_failing_clip_are_removed(tmp_path: Path) -> None:
 
 
 def full_disk() -> FaceDiffError:
-    error = FaceDiffError("out: cannot be written (No space left on device)")
-    error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    """As writers of several files raise it, which name the file that was asked for."""
+    error, first = FaceDiffError("out: cannot be written (No space left on device)"), FaceDiffError("hidden")
+    first.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    error.__cause__ = first
     return error
 
 
