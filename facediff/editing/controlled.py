@@ -18,7 +18,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.editing import procedural
 from facediff.editing.controls import keys_of, refuse_folder
-from facediff.editing.direction import METADATA, Direction, channel_of, curve
+from facediff.editing.direction import METADATA, Direction, channel_of, curve, direction_of
 from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
 from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, noted
 from facediff.errors import FaceDiffError, OptionError
@@ -271,9 +271,8 @@ class ControlledFace:
             return animation
         name, direction = METADATA, self.direction
         if METADATA in animation.metadata:
-            try:
-                before = Direction.parse(animation.metadata[METADATA], METADATA)
-            except FaceDiffError:  # of a file from elsewhere
+            before = direction_of(animation)
+            if before is None:  # of a file from elsewhere
                 return animation
             if set(direction.keys) <= set(before.keys):
                 return animation
@@ -299,8 +298,14 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     direction = keys_of(controls.direction, animation.frame_rate)
     if direction is not None:
         direction.refuse_model_channels()
+        before = direction_of(animation)
+        if before is not None and set(direction.keys) <= set(before.keys):
+            raise FaceDiffError(
+                f"{direction.source}: {animation.name} has these keys already; give the animation as it was before"
+            )
         for option in direction.instead_of:
-            if f"{option} (" in animation.metadata.get(PROCEDURAL, ""):
+            turned = before is not None and option in before.instead_of
+            if turned or f"{option} (" in animation.metadata.get(PROCEDURAL, ""):
                 raise FaceDiffError(
                     f"{direction.source}: instead_of: the keys do what --{option} did, and {animation.name} has that "
                     f"already; give the animation as it was before"

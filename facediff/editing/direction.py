@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,9 @@ from facediff.utils import ranges
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_table, write_json, write_rows
 from facediff.utils.ranges import Range, shown
+
+if TYPE_CHECKING:
+    from facediff.animation import Animation
 
 Array = npt.NDArray[np.float64]
 
@@ -379,6 +382,14 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
             raise FaceDiffError(f"{path}: was made without a direction; give keys over time, .json or .csv")
         return Direction.parse(text, str(path), frame_rate)
     raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected .json, .csv or .npz')
+
+
+def direction_of(animation: Animation) -> Direction | None:
+    """The keys that an animation was made with; None without any, or if its metadata hold something else."""
+    try:
+        return Direction.parse(animation.metadata.get(METADATA), animation.name, animation.frame_rate)
+    except FaceDiffError:
+        return None
 
 
 def direction_file(folder: Path, recording: Path) -> Path | None:

@@ -219,17 +219,6 @@ def _direction_facts() -> dict[str, Any]:
     }
 
 
-def _direction_of(animation: Animation) -> direction.Direction | None:
-    """The keys that an animation was made with; None without any, or if its metadata hold something else."""
-    text = animation.metadata.get(direction.METADATA)
-    if text is None:
-        return None
-    try:
-        return direction.Direction.parse(text, animation.name, animation.frame_rate)
-    except FaceDiffError:
-        return None  # the page shows it as it shows other metadata
-
-
 def _head_in_mm(head: npt.NDArray[np.float64], animation: Animation) -> bytes:
     """The motion of the head (T, 6), its shifts in mm."""
     return (head * np.repeat([1.0, millimetres(animation)], 3)).astype("<f4").tobytes()
@@ -250,7 +239,7 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
     opening = mouth_opening(animation)
     pairs = animation.inner_lip_pairs
     template = np.asarray(animation.template, np.float64) * millimetres(animation)
-    made_with = _direction_of(animation)
+    made_with = direction.direction_of(animation)
     return {
         "name": animation.name,
         "vertices": len(animation.template),

@@ -130,6 +130,16 @@ def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[...
     with pytest.raises(FaceDiffError, match="blinks.json: instead_of: .*as it was before"):
         apply_controls(blinking, parsed("--direction", str(blinks)))
     apply_controls(blinking, AnimationControls(direction=later))
+    others = Direction([Key(1, "lids", 0.2)], "others", instead_of=("blinks",))
+    with pytest.raises(FaceDiffError, match="others: instead_of: .*as it was before"):
+        apply_controls(again, AnimationControls(direction=others))
+
+
+def test_keys_are_not_applied_twice(make_animation: Callable[..., Animation]) -> None:
+    keys = Direction([Key(0, "shape.jawOpen", 0.5), Key(1, "brows", 1.0)], "keys")
+    moved = apply_controls(make_animation(2), AnimationControls(direction=keys))
+    with pytest.raises(FaceDiffError, match="keys: F1 has these keys already"):
+        apply_controls(moved, AnimationControls(direction=Direction(keys.keys[:1], "keys")))
 
 
 def test_shape_keys_add_their_displacements(make_animation: Callable[..., Animation]) -> None:
