@@ -73,7 +73,7 @@ def has_textures(path: Path) -> bool:
         return False
     if path.suffix.lower() == ".glb":
         with suppress(ValueError):  # the reader of meshes says what is wrong
-            return any(_base_picture(material) for material in open_glb(path).entries("materials"))
+            return _has_picture(open_glb(path))
     if path.suffix.lower() != ".obj":
         return False
     with path.open("rb") as stream:
@@ -95,15 +95,16 @@ def read_textures(path: Path, n_triangles: int) -> Textures:
     Raises:
         FaceDiffError: if it has no texture coordinates, is damaged, or is another mesh.
     """
-    if not has_textures(path):
-        raise FaceDiffError(
-            f"{path}: has no texture coordinates; expected an .obj with lines `vt u v`, or a .glb with a picture"
-        )
+    reader = {".glb": _read_glb, ".obj": _read_obj}.get(path.suffix.lower()) if path.is_file() else None
     try:
-        surface = _read_glb(path) if path.suffix.lower() == ".glb" else _read_obj(path)
+        surface = None if reader is None else reader(path)
     except (ValueError, IndexError) as error:
         kind = path.suffix[1:].upper()
         raise FaceDiffError(f"{path}: not a readable {kind} mesh ({error}); export it again") from error
+    if surface is None:
+        raise FaceDiffError(
+            f"{path}: has no texture coordinates; expected an .obj with lines `vt u v`, or a .glb with a picture"
+        )
     if len(surface.corners) != n_triangles:
         raise FaceDiffError(
             f"{path}: has {len(surface.corners)} triangles and the animation's mesh {n_triangles}; give the file of "
@@ -112,7 +113,7 @@ def read_textures(path: Path, n_triangles: int) -> Textures:
     return surface
 
 
-def _read_obj(path: Path) -> Textures:
+def _read_obj(path: Path) -> Textures | None:
     LIMITS.check("bytes", path.stat().st_size, path)
     uvs: list[tuple[float, float]] = []
     corners: list[tuple[int, int, int]] = []
@@ -135,6 +136,8 @@ def _read_obj(path: Path) -> Textures:
             current = names.setdefault(rest.strip(), len(names))
         elif word == "mtllib":
             libraries.append(rest.strip())
+    if not uvs:
+        return None
     table, coordinates = np.array(corners, np.int64), np.array(uvs, np.float64)
     if not len(table) or table.max() >= len(uvs) or table.min() < -1 or not np.isfinite(coordinates).all():
         raise ValueError("a face names a texture coordinate that does not exist")
@@ -224,8 +227,14 @@ def _base_picture(material: dict[str, Any]) -> dict[str, Any]:
     return texture if isinstance(texture, dict) else {}
 
 
-def _read_glb(path: Path) -> Textures:
+def _has_picture(glb: Glb) -> bool:
+    return any(_base_picture(material) for material in glb.entries("materials"))
+
+
+def _read_glb(path: Path) -> Textures | None:
     glb, lost = open_glb(path), list[str]()
+    if not _has_picture(glb):
+        return None
     numbers: dict[int, int] = {}  # of the materials here, by those of the file's; -1 for parts without one
     materials: list[Material] = []
     uvs, corners, of_face, before = [], [], [], 0

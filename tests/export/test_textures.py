@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -260,8 +261,11 @@ def test_textures_of_an_avatar_are_where_its_vertices_are(tmp_path: Path, avatar
         assert [material.name for material in again.materials] == names
 
 
-def test_damaged_coordinates_of_a_glb_are_refused(tmp_path: Path, avatar: Path) -> None:
+def test_damaged_coordinates_of_a_glb_are_refused(avatar: Path) -> None:
     faces = read_mesh(avatar).faces
+    with patch("facediff.mesh.textures.open_glb", wraps=open_glb) as opened:
+        read_textures(avatar, len(faces))
+    assert opened.call_count == 1
     with pytest.raises(FaceDiffError, match=r"avatar\.glb: has \d+ triangles and the animation's mesh 12"):
         read_textures(avatar, 12)
     glb = open_glb(avatar)
