@@ -103,15 +103,17 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
         kinds = b"".join(line[:1] for line in lines if line[:2] in (b"v ", b"v\t", b"f ", b"f\t"))
         if b"fv" in kinds:
             raise ValueError("faces between its vertices count backwards from where they stand")
-    colours = None
-    if width >= 6:
-        shares = table[:, 3:6]
-        if not np.isfinite(shares).all():
-            raise ValueError("its colours are not finite")
-        if shares.max() >= 2:  # some tools write bytes; a little above 1 is a rounding
-            shares = shares / 255
-        colours = np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
+    colours = _colours(table[:, 3:6]) if width >= 6 else None
     return Mesh(table[:, :3].copy(), _triangles(listed, len(table)).copy(), colours)
+
+
+def _colours(shares: Array) -> npt.NDArray[np.uint8]:
+    """Colours (V, 3) that a text says, from 0 to 1 or to 255."""
+    if not np.isfinite(shares).all():
+        raise ValueError("its colours are not finite")
+    if shares.max(initial=0) >= 2:  # some tools write bytes; a little above 1 is a rounding
+        shares = shares / 255
+    return np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
 
 
 # The frames of a sequence and the shapes of a set repeat the same face lines, and parsing them takes most of the time.
@@ -396,7 +398,7 @@ def _stl_text(data: bytes, path: Path) -> Array:
 
 def _read_off(data: bytes, path: Path) -> Mesh:
     LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
-    head = re.match(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?C?N?OFF\b", data)
+    head = re.match(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?(C?)(N?)OFF\b", data)
     if head is None:
         raise ValueError("it does not begin with OFF")
     lines = [cells for line in data[head.end() :].splitlines() if (cells := line.partition(b"#")[0].split())]
@@ -407,14 +409,19 @@ def _read_off(data: bytes, path: Path) -> Mesh:
     LIMITS.check("vertices", n_faces, path)
     if len(lines) < 1 + n_vertices + n_faces:
         raise ValueError(f"it is cut short: its {n_vertices} vertices and {n_faces} faces are not all there")
-    points = np.array([[float(word) for word in line[:3]] for line in lines[1 : 1 + n_vertices]]).reshape(n_vertices, 3)
+    rows = lines[1 : 1 + n_vertices]
+    points = np.array([[float(word) for word in row[:3]] for row in rows]).reshape(n_vertices, 3)
+    colours, first = None, 6 if head[2] else 3  # after the normal
+    if head[1] and all(len(row) >= first + 3 for row in rows):
+        table = [[float(word) for word in row[first : first + 3]] for row in rows]
+        colours = _colours(np.array(table).reshape(n_vertices, 3))
     polygons = []
     for line in lines[1 + n_vertices : 1 + n_vertices + n_faces]:
         corners = [int(word) for word in line[1 : 1 + max(0, int(line[0]))]]
         if len(corners) != int(line[0]):
             raise ValueError("a face has fewer corners than it declares")
         polygons.append(corners)
-    return Mesh(points, _cut(polygons, n_vertices, path))
+    return Mesh(points, _cut(polygons, n_vertices, path), colours)
 
 
 READERS: dict[str, Callable[[bytes, Path], Mesh]] = {

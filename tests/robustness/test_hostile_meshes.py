@@ -251,6 +251,18 @@ def test_colours_of_a_ply_are_those_of_a_screen_whatever_their_type(kind: str, c
     assert read.tolist() == [[255, 51, 0]] * 4
 
 
+@pytest.mark.parametrize(
+    ("head", "after"),
+    [("COFF", "255 51 0 255"), ("STCOFF", "1 0.2 0 1 0.5 0.5"), ("CNOFF", "0 0 1 255 51 0"), ("NOFF", "0 0 1")],
+)
+def test_colours_of_an_off_are_where_its_head_says(head: str, after: str, tmp_path: Path) -> None:
+    body = "".join(f"{row} {after}\n" for row in SQUARE.splitlines())
+    (tmp_path / "a.off").write_text(f"{head}\n4 1 0\n{body}3 0 1 2\n")
+    mesh = read_mesh(tmp_path / "a.off")
+    assert mesh.vertices.tolist() == CORNERS.tolist()
+    assert (None if mesh.colours is None else mesh.colours.tolist()) == ([[255, 51, 0]] * 4 if "C" in head else None)
+
+
 def test_sparse_changes_of_a_glb_are_made(tmp_path: Path) -> None:
     content = json.loads(json.dumps(GOOD))
     content["bufferViews"] += [
