@@ -313,8 +313,11 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
     """Put the tables into a Markdown page, between two comments that bear the plan's name."""
     name = report.outline.name
     begin, end = BEGIN.format(name=name), END.format(name=name)
-    with path.open(encoding="utf-8", newline="") as stream:  # as its lines end
-        text = stream.read()
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:  # as its lines end
+            text = stream.read()
+    except UnicodeDecodeError as error:
+        raise FaceDiffError(f"{path}: is not UTF-8 (byte {error.start}); save it as UTF-8") from error
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(end) < text.index(begin):
         raise FaceDiffError(
             f"{path}: has no place for {name}; write the two lines  {begin}  and  {end}  where it shall be"

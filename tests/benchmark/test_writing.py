@@ -183,6 +183,9 @@ def test_the_block_of_a_page_is_replaced_and_the_rest_stays(tmp_path: Path) -> N
     file.write_text("nothing\n")
     with pytest.raises(FaceDiffError, match="made"):
         replace_block(file, made())
+    file.write_bytes(once.replace("Title", "Straße").encode("latin-1", "replace"))
+    with pytest.raises(FaceDiffError, match=r"page\.md: is not UTF-8 \(byte 6\)"):
+        replace_block(file, made())
 
 
 def test_the_command_writes_a_report_from_results_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
