@@ -333,7 +333,8 @@ def data_class(class_path: str) -> type[SpeechMotionDataModule]:
 
     if "." in class_path and not class_path.startswith("facediff."):
         find_own_module(class_path)
-    return by_name(class_path if not class_path.startswith("facediff.data.") else class_path.rpartition(".")[2], None)
+    own = class_path.startswith("facediff.data.")
+    return by_name(class_path.rpartition(".")[2] if own else class_path, None, "class_path")
 
 
 def data_of(

@@ -94,7 +94,7 @@ def check(
 
     Args:
         root: the corpus folder, or a packed corpus: its folder or its address
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, beat, live_link,
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, beat, live_link,
             flame_clips:LAYOUT, or package.module.Class
         split: count the clips of one way to split the corpus only (3DMEAD: sentence, identity, both)
         quick: read headers only, and compare files by size
@@ -251,7 +251,7 @@ def pack(
     Args:
         root: the corpus folder
         out: packed corpus to write, a name that ends in .zarr: a new one, or one that this command has begun
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, or package.module.Class
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, or package.module.Class
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
         exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
@@ -429,7 +429,7 @@ def regions(
     Args:
         root: the corpus folder
         output: the picture (.png)
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, or package.module.Class
+        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, or package.module.Class
         lips: file in the folder, e.g. regions/lve.txt or FLAME_masks.pkl:lips (default: the corpus's own)
         upper_face: file in the folder, e.g. regions/fdd.txt or FLAME_masks.pkl:forehead+eye_region (default: the
             corpus's own)

@@ -8,7 +8,8 @@ import pytest
 
 from facediff.benchmark import cells_of, read_plan
 from facediff.cli.app import main
-from facediff.cli.benchmark import check_cells
+from facediff.cli.benchmark import check_cells, data_class
+from facediff.errors import FaceDiffError
 
 
 @pytest.fixture
@@ -55,6 +56,12 @@ def test_a_checkpoint_of_another_corpus_or_of_none_is_refused(
     assert not more
     assert ("row_1" in line) == bool(named)
     assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["facediff.data.Biwii", "tests.fakes.tiny.Tinyy"])
+def test_a_wrong_class_of_a_config_is_named_as_the_config_does(name: str) -> None:
+    with pytest.raises(FaceDiffError, match="^class_path"):
+        data_class(name)
 
 
 def test_a_built_in_corpus_that_was_never_made_is_no_obstacle(
