@@ -143,8 +143,8 @@ def make(
     tell(
         f"{output}: {counted(len(plan.videos), 'video')} ({drawn} drawn, {len(plan.videos) - drawn} up to date) of "
         f"{counted(len(plan.clips), 'clip')} of {', '.join(study.conditions)}",
-        f"a rater sees {len(trials)} videos, {controls} of them controls, in about {plan.minutes:.0f} minutes; sides "
-        f"and orders are balanced over {len(study.schedules)} raters",
+        f"a rater sees {counted(len(trials), 'video')}, {controls} of them controls, in about "
+        f"{plan.minutes:.0f} minutes; sides and orders are balanced over {len(study.schedules)} raters",
         f"hand out {output / 'page'}, or run  facediff study serve {output}",
     )
 
@@ -185,7 +185,10 @@ def serve(
 
     raters = run(study, host=host, port=port, name=name, most_raters=max_raters, ready=ready).raters()
     finished = sum(rater.finished is not None for rater in raters)
-    tell(f"{study}: {len(raters)} raters, {finished} of them finished; `facediff study report {study}` analyses them")
+    tell(
+        f"{study}: {counted(len(raters), 'rater')}, {finished} of them finished; "
+        f"`facediff study report {study}` analyses them"
+    )
 
 
 def report(
@@ -285,11 +288,12 @@ def print_plan(
         needed = raters_needed(
             difference, power=power, level=level, per_rater=answers, correlation=correlation, comparisons=pairs
         )
+        worth = f"correlated by {correlation:g}, count as {answers / needed.design_effect:.2f}"
+        repeated = f"{answers} of a rater, {worth}; " if answers > 1 else ""
         tell(
             f"{name}{': ' if name else ''}{needed.raters} raters notice a preference of {50 + 100 * difference:g} to "
             f"{50 - 100 * difference:g} with a chance of {power:.0%} at the level {level:g}",
-            f"({needed.answers} independent answers to each of {pairs} comparison{'s' * (pairs != 1)}; {answers} of a "
-            f"rater, correlated by {correlation:g}, count as {answers / needed.design_effect:.2f}; those that are not "
-            f"counted come on top)",
+            f"({needed.answers} independent answers to each of {counted(pairs, 'comparison')}; {repeated}those that "
+            f"are not counted come on top)",
         )
     return 0

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import without_head
+from facediff.errors import counted
 from facediff.live.frames import LiveFrame, Receiver
 from facediff.live.model import LiveModel
 from facediff.live.sources import Speech, SpeechSource
@@ -79,7 +80,8 @@ class LiveSummary:
     def sentences(self) -> list[str]:
         """The report at the end."""
         lines = [
-            f"{self.frames} frames of {self.speech:.1f} s; lag {self.lag}; {dropped_text(self.dropped, self.lost)}",
+            f"{counted(self.frames, 'frame')} of {self.speech:.1f} s; lag {self.lag}; "
+            f"{dropped_text(self.dropped, self.lost)}",
             f"computing {self.computing} a window (real-time factor {self.factor:.2f}); sending {self.sending} a frame",
         ]
         return lines + [f"{name}: {status}" for name, status in self.receivers.items() if status]
@@ -92,7 +94,7 @@ def dropped_text(frames: int, speech: float) -> str:
         frames: that came too late to be sent, or were left out.
         speech: seconds that were never animated.
     """
-    return f"{frames} frames dropped" + (f", {speech:.1f} s of speech" if speech else "")
+    return f"{counted(frames, 'frame')} dropped" + (f", {speech:.1f} s of speech" if speech else "")
 
 
 class Backlog:

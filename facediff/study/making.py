@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, counted
 from facediff.render import Camera, Renderer, side_by_side, write_video
 from facediff.study.definition import DATABASE, PAGE_FOLDER, STUDY_FILE, VIDEO_FOLDER, Study, Trial
 from facediff.study.design import STILL, TRUTH, Design, Pairs, Showing, make_forms, make_pairs, make_schedules
@@ -264,7 +264,8 @@ def plan_study(
         unit=unit,
     )
     notes = [
-        f"{name}: {len(left)} clips that others lack are left out: {', '.join(left[:3])}{' …' if len(left) > 3 else ''}"
+        f"{name}: {counted(len(left), 'clip')} that others lack, left out: "
+        f"{', '.join(left[:3])}{' …' if len(left) > 3 else ''}"
         for name, left in material.left_out.items()
         if left and name != TRUTH
     ]

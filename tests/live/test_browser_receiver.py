@@ -54,7 +54,7 @@ def visitor(served: Browser) -> Iterator[ClientConnection]:
     with visit(served) as connection:
         assert json.loads(connection.recv(PATIENCE))["format"] == "facediff live page 1"
         connection.recv(PATIENCE)
-        wait_for(served, "1 pages")
+        wait_for(served, "1 page at")
         yield connection
 
 
@@ -71,7 +71,7 @@ def test_the_description_the_mesh_and_frames(served: Browser, performance: Perfo
         np.testing.assert_allclose(rest, 1000 * performance.neutral, rtol=1e-6)
         faces = np.frombuffer(mesh, "<u4", offset=HEADER + 12 * count).reshape(-1, 3)
         assert [set(row) for row in faces.tolist()] == [set(row) for row in performance.faces.tolist()]
-        wait_for(served, "1 pages")
+        wait_for(served, "1 page at")
         for index in (4, 6):
             served.send(frame(index, dropped=3))
             data = connection.recv(PATIENCE)
@@ -135,7 +135,7 @@ def test_whoever_says_anything_else_is_shown_out(
     with visit(served) as another:
         another.recv(PATIENCE)
         another.recv(PATIENCE)
-        wait_for(served, "1 pages")
+        wait_for(served, "1 page at")
         served.send(frame(1))
         another.recv(PATIENCE)
 
@@ -218,7 +218,7 @@ def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: py
     monkeypatch.setattr("facediff.live.receivers.browser.MOST_VIEWERS", 1)
     with visit(served) as first:
         first.recv(PATIENCE)
-        wait_for(served, "1 pages")
+        wait_for(served, "1 page at")
         with pytest.raises(InvalidStatus), visit(served):
             pass
 

@@ -110,7 +110,7 @@ def test_the_page_shows_frames_plays_speech_and_comes_back(browser: Chromium, pu
     page.wait_for("document.body.classList.contains('lost')")
     with serving(puppet, port) as receiver:
         page.wait_for("facediff.connections === 2")
-        wait_for(receiver, "1 pages")
+        wait_for(receiver, "1 page at")
         receiver.send(moved(puppet, 1))
         page.wait_for("facediff.stats.index === 1 && facediff.state === 'Live'")
         assert page.evaluate("facediff.errors") == []
@@ -144,7 +144,7 @@ def test_a_minute_in_the_browser(browser: Chromium, puppet: Performance) -> None
     with serving(puppet) as receiver:
         page = browser.open(receiver.url, width=600, height=500)
         page.wait_for("window.facediff && facediff.ready")
-        wait_for(receiver, "1 pages")
+        wait_for(receiver, "1 page at")
         acting = Acting(receiver, puppet)
         acting.start()
         page.wait_for("facediff.stats.received > 3")

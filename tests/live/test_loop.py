@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from facediff.errors import FaceDiffError
 from facediff.live.frames import LiveFrame
-from facediff.live.loop import Backlog, Loop
+from facediff.live.loop import Backlog, LiveSummary, Loop
 from facediff.live.sources import Deliver
 from facediff.live.timing import MARGIN
 from facediff.speech.audio import samples_for
@@ -126,6 +126,7 @@ def test_one_long_window_is_not_blamed_on_the_model(clock: SimulatedTime, monkey
     assert summary.lost == 0
     assert summary.dropped > 5
     assert f"{summary.dropped} frames dropped" in reports[-1]
+    assert "1 frame of 0.0 s" in LiveSummary(frames=1).sentences()[0]
 
 
 def test_click_is_in_the_frame_in_which_it_was_spoken(clock: SimulatedTime) -> None:

@@ -182,7 +182,9 @@ def test_the_table_has_a_column_for_every_data_set_and_hostile_names_stay_text(t
 
 def test_the_plan_is_printed_without_and_with_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["study", "report", "--plan", "0.1"]) == 0
-    assert capsys.readouterr().out.startswith("210 raters")
+    printed = capsys.readouterr().out
+    assert printed.startswith("210 raters")
+    assert "each of 1 comparison; those that are not counted" in printed  # nothing of one answer's being correlated
     folder = write_study(tmp_path / "study", small_study(clips=8))
     assert main(["study", "report", str(folder), "--plan", "0.1", "--correlation", "0"]) == 0
     found = re.match(r"study: (\d+) raters", capsys.readouterr().out)

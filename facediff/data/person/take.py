@@ -11,7 +11,7 @@ import numpy.typing as npt
 from facediff.data.person.fitting import loudness
 from facediff.data.person.importer import MIN_SECONDS, NAME, SILENCE, EntryClip, check_output, cut, write_record
 from facediff.data.prepare.runner import write_speech
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.spaces.files import ParameterClip, even, read_parameters
 from facediff.spaces.files.tables import write_live_link
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech
@@ -71,7 +71,7 @@ class TakeReport:
         return [
             f"{self.frames} frames at {self.frame_rate:g} a second, {self.dropped} of them dropped and interpolated",
             f"offset {self.offset.seconds:+.3f} s ({before}), {origin}; correlation {self.offset.correlation:.2f}",
-            f"{self.clips} clips, {self.seconds:.1f} s",
+            f"{counted(self.clips, 'clip')}, {self.seconds:.1f} s",
             *(f"warning: {warning}" for warning in self.warnings),
         ]
 

@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.live.frames import OPTION, Address, Array, LiveFrame, Performance, Receiver
 from facediff.live.receivers.sending import Outbox, endpoint, listen, log
 from facediff.registry import receiver
@@ -241,8 +241,8 @@ class Browser(Receiver):
         with self._lock:
             viewers = list(self._viewers.values())
             missed = self._missed + sum(viewer.missed for viewer in viewers)
-            parts = [f"{len(viewers)} pages at {self.url}", f"{self._came} so far"]
-            parts += [f"{missed} frames missed by slow ones"] if missed else []
+            parts = [f"{counted(len(viewers), 'page')} at {self.url}", f"{self._came} so far"]
+            parts += [f"{counted(missed, 'frame')} missed by slow ones"] if missed else []
             parts += [f"{self._refused} refused"] if self._refused else []
         return ", ".join(parts)
 

@@ -195,7 +195,7 @@ class _Stream:
     def status(self, written: int, dropped: int) -> str:
         # What waits is written before the end, unless nothing can be written any more.
         frames = written if self.wanted else self._frames
-        return f"{frames} frames" + (f", {dropped} dropped" if dropped else "")
+        return counted(frames, "frame") + (f", {dropped} dropped" if dropped else "")
 
 
 class _Unfinished(Exception):  # noqa: N818 - no error: it takes a half-written file away
@@ -295,4 +295,4 @@ class _Clients:
         with self._lock:
             missed = dropped + self._missed + sum(outbox.dropped for outbox in self._clients.values())
             parts = [counted(sent, "frame"), counted(len(self._clients), "client"), f"{self.connected} so far"]
-        return ", ".join(parts + ([f"{missed} frames missed by slow ones"] if missed else []))
+        return ", ".join(parts + ([f"{counted(missed, 'frame')} missed by slow ones"] if missed else []))

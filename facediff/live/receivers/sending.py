@@ -14,7 +14,7 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiver
 from facediff.spaces.arkit import ARKIT
 
@@ -118,7 +118,7 @@ class Datagrams:
 
     def status(self) -> str:
         """Numbers of frames that were sent, refused and lost."""
-        parts = [f"{self.sent} frames sent"]
+        parts = [f"{counted(self.sent, 'frame')} sent"]
         parts += [f"{self.refused} refused: no program listened"] if self.refused else []
         parts += [f"{self.lost} lost"] if self.lost else []
         return ", ".join(parts)
