@@ -285,8 +285,8 @@ class DiffPoseTalk(ParametricModel):
 
     @staticmethod
     def standard_speech(audio: Float[Tensor, " samples"]) -> Float[Tensor, " samples"]:
-        """(x − mean)/(s + 1e-5) with the unbiased deviation s of the whole file."""
-        return (audio - audio.mean()) / (audio.std() + 1e-5)
+        """(x − mean)/(s + 1e-5) with the unbiased deviation s of the whole file, which is 0 of one sample."""
+        return (audio - audio.mean()) / (audio.std(correction=min(1, len(audio) - 1)) + 1e-5)
 
     def hear_wave(self, wave: Float[Tensor, " samples"], frames: int) -> Float[Tensor, "frames dim"]:
         """Speech of so many frames that ``wave``, standardised already, lasts for."""

@@ -199,6 +199,10 @@ def test_process_is_the_clipped_cosine_schedule() -> None:
     assert float(process.alphas[-1]) == pytest.approx(0.001, rel=1e-4)
 
 
+def test_one_sample_is_silence() -> None:
+    assert DiffPoseTalk.standard_speech(torch.tensor([0.5])).tolist() == [0.0]
+
+
 @pytest.mark.parametrize(
     ("samples", "padded"),
     [(64_000, 64_080), (641, 721), (719, 721), (900, 900), (300, 400), (80, 400), (2, 400)],
