@@ -391,9 +391,9 @@ class ChunkStream(PieceStream):
         """
         for chunk in self._pieces(samples, self.model.chunk_samples):
             self._next(chunk, self.model.scales[-1])
-        end = self._first + len(self._raw)
+        end = min(self._first + len(self._raw), self._spoken)
         certain = end - LONGEST_FILTER // 2 if end >= LONGEST_FILTER else 0
-        return self._given(certain if self.model.smooth else end)
+        return self._given(certain if self.model.smooth else end, end)
 
     @torch.inference_mode()
     def finish(self, frames: int | None = None) -> Motion:
@@ -406,13 +406,12 @@ class ChunkStream(PieceStream):
         self._refuse_finished()
         self._finished = True
         end, size = self._first + len(self._raw), self.model.chunk_samples
-        # Of all speech: at rates such as 29.97 a chunk is shorter than its frames by a part of a sample.
-        left = self.model.frames_of(end // self.model.scales[-1] * size + len(self._wave)) - end
-        if left > 0:
-            self._next(F.pad(self._wave, (0, size - len(self._wave))), left)
-            end += left
-        wanted = self._left(end, frames)
-        motion = self._given(end)[:, :wanted]
+        last = self._spoken
+        if last > end:
+            self._next(F.pad(self._wave, (0, size - len(self._wave))), last - end)
+        self._raw = self._raw[: last - self._first]
+        wanted = self._left(last, frames)
+        motion = self._given(last, last)[:, :wanted]
         return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
 
     def _next(self, wave: Tensor, frames: int) -> None:
@@ -420,9 +419,15 @@ class ChunkStream(PieceStream):
         motion, _, self._state = self.model.next_chunk(wave, self._token, self._state)
         self._raw = torch.cat([self._raw, self.model.placed(motion[:frames])])
 
-    def _given(self, until: int) -> Motion:
-        """The frames up to one that can be smoothed as within the whole recording."""
-        start, end = self.frames, self._first + len(self._raw)
+    @property
+    def _spoken(self) -> int:
+        """Frames of all speech: at rates such as 29.97 a chunk lasts a part of a sample less than its frames."""
+        chunks = (self._first + len(self._raw)) // self.model.scales[-1]
+        return self.model.frames_of(chunks * self.model.chunk_samples + len(self._wave))
+
+    def _given(self, until: int, end: int) -> Motion:
+        """The frames up to one that can be smoothed as within the whole recording, of the speech up to another one."""
+        start = self.frames
         finished = self.model.finished(self._raw)[max(0, start - self._first) : max(0, until - self._first)]
         motion = finished.view(1, len(finished), self.model.n_vertices, self.model.dims)
         # Frames that later ones are smoothed with stay, and as many as the fit at the very end needs.

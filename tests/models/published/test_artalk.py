@@ -122,10 +122,11 @@ def test_stream_equals_the_file_bit_for_bit(pieces: list[int], model: ARTalk) ->
 def test_stream_has_the_frames_of_the_file_where_a_chunk_is_no_whole_samples(
     model: ARTalk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(model, "frame_rate", 29.97)
     clip = Reference("clip", style_clip()[..., None])
-    for samples in (11_745, 11_800, 2 * 5338, 2 * 5338 + 1):  # just below 22 frames, in chunks of 5338 samples
-        audio = speech(23)[:samples]
+    cases = [(29.97, samples) for samples in (11_745, 11_800, 2 * 5338, 2 * 5338 + 1)]  # chunks of 5338
+    for rate, samples in [*cases, (388.37, 43 * 411)]:  # of which 43 chunks last 429 frames
+        monkeypatch.setattr(model, "frame_rate", rate)
+        audio = speech(28)[:samples]
         whole, stream = model.animate(audio, identity="0", style=clip).vertices, model.stream(identity="0", style=clip)
         parts = [stream.feed(audio), stream.finish()]
         assert torch.equal(torch.cat(parts, 1)[0], whole)
