@@ -243,7 +243,10 @@ class StyleContentDisentanglement(AnimationModel):
             visible.zero_()[assets.regions["face"].to(visible.device)] = 1.0
 
     def context_frames(self) -> tuple[int, int]:
-        """Frames before and after a frame that its motion hears: the decoder sees contents, each of a window."""
+        """Frames before and after a frame that its motion hears: the decoder sees contents, each of a window.
+
+        A term that decodes twice, such as the cycle with content of motion, hears the decoder's past frames twice.
+        """
         speech, ratio = self.network.speech_content, self.network.ratio
         before = self.network.decoder.past_frames + math.ceil(speech.before / ratio)
         return before, math.ceil((speech.window - 1 - speech.before) / ratio)
