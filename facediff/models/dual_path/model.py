@@ -628,7 +628,9 @@ class DualPathDiffusion(AnimationModel):
     def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:
         """What speech says of the style, from each training clip's own style.
 
-        Training gathers it on the way, from encoders that still change and styles of other clips in the same mood.
+        Training gathers it on the way, from encoders that still change and styles of other clips in the same mood. As
+        there, a style counts by its distance from the mean of its identity's clips so far, itself included: in one pass
+        over n clips of an identity, the changes are too small by H_n / n of them on average, H_n = 1 + 1/2 + … + 1/n.
         """
         network, speech_style = self.eval().network, self.network.speech_style
         if speech_style is None:
