@@ -221,9 +221,9 @@ class SamplingPreview(Callback):
                 print(f"preview after epoch {epochs}: {names} in {seconds:.1f} s, written to {folder}", flush=True)
 
     def _clip(self, trainer: Trainer, model: AnimationModel, sample: Sample, folder: Path, epochs: int) -> ClipPreview:
-        precision = trainer.precision_plugin.forward_context()
-        with borrowed(model, self.sampler, self.steps), precision, torch.inference_mode():
-            clip = model.with_person_styles(collate([sample]).to(model.device))
+        precision = trainer.precision_plugin
+        with borrowed(model, self.sampler, self.steps), precision.forward_context(), torch.inference_mode():
+            clip = model.with_person_styles(precision.convert_input(collate([sample]).to(model.device)))
             motion = model.generate(clip, seed=self.seed)[0].float().cpu()
         scale = self._scale or default_error_scale([sample])
         return draw_clip(model, sample, motion, folder, epochs, error_scale=scale, size=self.size, view=self.view)

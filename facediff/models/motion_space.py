@@ -150,9 +150,9 @@ class PrincipalComponents(nn.Module):
             return self._projection()(motion)
 
     def projection(self, scale: float) -> Projection:
-        """The same for unscaled offsets, by itself and on the processor, for the processes that read clips."""
+        """The same for unscaled offsets, by itself, on the processor and in float32 as clips are read."""
         own = self._projection()
-        return Projection((own.into * scale).cpu(), own.offset.cpu())
+        return Projection((own.into * scale).float().cpu(), own.offset.float().cpu())
 
     def _projection(self) -> Projection:
         weighted = self.basis * self.weights if self.unweighted is None else self.basis @ self.weights

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.cli import instantiate_module
 
 from facediff import registry
-from facediff.callbacks import PredictionWriter, ScoreTable
+from facediff.callbacks import PredictionWriter, SamplingPreview, ScoreTable
 from facediff.cli.app import main
 from facediff.data import Puppet, collate
 from facediff.data.batch import FORMAT_KEY
@@ -229,6 +229,16 @@ def test_mixed_precision_trains_with_clipped_gradients(make_model: Make, tiny: T
     assert after.dtype == torch.float32
     assert torch.isfinite(after).all()
     assert not torch.equal(before, after)
+
+
+def test_double_precision_trains_previews_and_scores(make_model: Make, tiny: Tiny, make_trainer: MakeTrainer) -> None:
+    model = make_model(style_from_speech=True)
+    preview = SamplingPreview(clips=1, size=64, seconds=0.2)  # a preview that fails is a warning, which fails a test
+    trainer = make_trainer(precision="64-true", callbacks=[preview])
+    trainer.fit(model, datamodule=tiny)
+    trainer.test(model, datamodule=tiny, verbose=False)
+    assert model.network.unembed.weight.dtype == torch.float64
+    assert np.isfinite(float(trainer.callback_metrics["test_b/usual_style/lve"]))
 
 
 def test_a_training_without_an_end_warms_up_and_takes_no_cosine(

@@ -652,8 +652,8 @@ class DualPathDiffusion(AnimationModel):
         return nn.functional.pad(style, (0, self.network.style_dim - style.shape[1]))
 
     def _scaled(self, motion: Tensor) -> Tensor:
-        """Offsets in the network's unit; components of training motion are in it already."""
-        return motion if motion.dim() == 3 else motion * self.scale
+        """Offsets in the network's unit and precision; components of training motion are in that unit already."""
+        return motion if motion.dim() == 3 else motion.to(self.dtype) * self.scale
 
     def graphs(self) -> Graphs:
         """Audio encoder, denoising step and last map; the sampler as numbers."""

@@ -479,9 +479,9 @@ class SpeechStyle(nn.Module):
             memory: share of what is known that stays.
         """
         known = identity >= 0
-        style, identity = style.float()[known], identity[known]
+        style, identity = style.to(self.styles.dtype)[known], identity[known]
         with torch.autocast(features.device.type, enabled=False):
-            numbers = self._numbers(features[known], mask[known])
+            numbers = self._numbers(features[known], mask[known]).to(style.dtype)
             for vector, index in zip(style, identity.tolist(), strict=True):
                 self.counts[index] += 1
                 self.styles[index].lerp_(vector, max(1 / float(self.counts[index]), 1 - memory**8))
