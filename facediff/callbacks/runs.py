@@ -143,7 +143,8 @@ def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
         return Path(asked)
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
         job = os.environ.get("SLURM_JOB_ID", "")
-        for run in runs_folder(trainer).glob("*"):
+        folder = runs_folder(trainer)
+        for run in folder.glob("*") if trainer.logger else [folder]:
             if (run / JOB_FILE).is_file() and (run / JOB_FILE).read_text(encoding="utf-8") == job:
                 return run / LAST
     return None

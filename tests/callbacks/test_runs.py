@@ -30,16 +30,18 @@ def test_what_a_run_that_was_killed_in_its_first_save_left_is_swept(tmp_path: Pa
         assert [*checkpoints.iterdir()] == [own]  # this process is at work
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1"])
+@pytest.mark.parametrize(("name", "logs"), [("SIGTERM", True), ("SIGUSR1", True), ("SIGUSR1", False)])
 def test_a_job_of_slurm_that_was_stopped_continues_its_run(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, logs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = {"JOB_ID": 77, "JOB_NAME": "facediff", "NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0}
     for variable, value in job.items():
         monkeypatch.setenv(f"SLURM_{variable}", str(value))
     asked: list[None] = []
     monkeypatch.setattr(checkpoints, "requeue", lambda: asked.append(None))
-    trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", devices=1, enable_progress_bar=False)
+    logger = CSVLogger(tmp_path, name="small") if logs else False
+    options = {"accelerator": "cpu", "devices": 1, "enable_progress_bar": False, "default_root_dir": tmp_path}
+    trainer = Trainer(logger=logger, **options)
     last = LastCheckpoint()
     last.path(trainer).parent.mkdir(parents=True)
     with pytest.raises(SystemExit):
