@@ -140,11 +140,11 @@ def raised_in(error: BaseException, package: str) -> bool:
 def spoken_of(message: str, options: Mapping[str, Any], prefix: str) -> str:
     """The trainer's options that an error of Lightning's speaks of, with their values; ``--trainer`` if of none."""
     text = message.lower()
-    # What is left to Lightning (null, auto, switches) is no fault of the user's.
+    # What is left to Lightning (null, auto) is no fault of the user's; a switch is where the error names it.
     chosen = {
-        name: value
+        name: str(value).lower() if isinstance(value, bool) else value
         for name, value in options.items()
-        if isinstance(value, str | int | float) and not isinstance(value, bool) and value != "auto"
+        if isinstance(value, str | int | float) and value != "auto" and (name in text or not isinstance(value, bool))
     }
     named = [name for name, value in chosen.items() if name in text or (isinstance(value, str) and value in text)]
     of_machine = [name for name in ("accelerator", "strategy", "devices", "precision") if name in chosen]
@@ -187,4 +187,4 @@ def without_warnings(*messages: str) -> Iterator[None]:
 
 
 def _no_advertisement(record: logging.LogRecord) -> bool:
-    return "litlogger" not in record.getMessage()
+    return "try installing [lit" not in record.getMessage()

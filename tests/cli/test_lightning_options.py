@@ -30,6 +30,7 @@ Fit = Callable[..., int]
 QUICK = [
     (["--model.dim=33"], "--model.dim 33"),
     (["--trainer.precision=bf16-true"], "--trainer.precision bf16-true"),
+    (["--trainer.enable_checkpointing=false"], "--trainer.enable_checkpointing false"),
     (["--trainer.logger.save_dir=/dev/null/x"], "/dev/null/x"),
     (
         ["--trainer.callbacks=facediff.callbacks.SamplingPreview", "--trainer.callbacks.clips=0"],
@@ -88,7 +89,7 @@ SLOW = [
     (["--trainer.val_check_interval=1000"], "val_check_interval"),
     (["--trainer.max_time=x"], "--trainer.max_time x"),
     (["--trainer.profiler=nope"], "--trainer.profiler nope"),
-    (["--trainer.barebones=true"], "barebones"),
+    (["--trainer.barebones=true"], "--trainer.barebones true"),
     (["--trainer.deterministic=maybe"], "--trainer.deterministic maybe"),
     (["--model.optoin=3"], "--model.optoin"),
     (["--weights_only=maybe"], "--weights_only maybe"),
