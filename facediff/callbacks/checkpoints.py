@@ -389,7 +389,23 @@ def requeue() -> None:
     except OSError as error:
         failed = error.errno or 1
     if failed:
-        print(f"facediff fit: `scontrol requeue {job}` failed; start the job again", file=sys.stderr, flush=True)
+        print(f"facediff: `scontrol requeue {job}` failed; start the job again", file=sys.stderr, flush=True)
+
+
+def requeue_on_signal(trainer: Trainer) -> None:
+    """Have SIGUSR1 end a job of SLURM and start it again where :class:`LastCheckpoint` does not take it.
+
+    Lightning would write ``hpc_ckpt_1.ckpt`` into the working folder and go on; under SLURM, every later training in
+    that folder begins from this file, whatever it trains.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if trainer.is_global_zero:
+            print(f"facediff: stopped by {signal.Signals(number).name}", file=sys.stderr, flush=True)
+            requeue()
+        raise Stopped(128 + number)
+
+    trainer._signal_connector._slurm_sigusr_handler_fn = stop  # type: ignore[assignment, method-assign]
 
 
 def throughput_monitors(trainer: Trainer) -> list[ThroughputMonitor]:

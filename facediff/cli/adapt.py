@@ -137,7 +137,7 @@ def adapt(
         return
     from lightning.pytorch import Trainer, seed_everything
 
-    from facediff.callbacks.checkpoints import AtomicCheckpointIO
+    from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal
     from facediff.cli.lightning import exit_statuses
     from facediff.cli.trainer_options import IDLE_WARNINGS, explained, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
@@ -183,6 +183,7 @@ def adapt(
             enable_progress_bar=not quiet and on_terminal(),
             plugins=[AtomicCheckpointIO()],
         )
+    requeue_on_signal(trainer)
     with exit_statuses(), without_warnings(*IDLE_WARNINGS):
         trainer.fit(model, data)
     for parameter in model.parameters():

@@ -35,7 +35,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from facediff import registry
 from facediff.callbacks import EpochLines, GradientNorm, LastCheckpoint, PredictionWriter, RunDescription, ScoreTable
-from facediff.callbacks.checkpoints import AtomicCheckpointIO
+from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal
 from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, locked_run, resumable, share_folder
 from facediff.cli.configs import PARTS, guard_configs
 from facediff.cli.trainer_options import IDLE_WARNINGS, explained, raised_in, sentence_of, without_warnings
@@ -363,6 +363,7 @@ class FaceDiffCLI(LightningCLI):
             kwargs["enable_progress_bar"] = False
         with explained({**chosen, **kwargs}):
             trainer = super().instantiate_trainer(**kwargs)
+        requeue_on_signal(trainer)
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         named = {type(callback) for callback in callbacks if callback not in built_in}

@@ -9,6 +9,7 @@ import logging
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -20,10 +21,11 @@ import pytest
 import torch
 import yaml
 
+from facediff.callbacks import checkpoints
 from facediff.cli.app import main
 from facediff.cli.lightning import tell_replaced_loggers, words_of_checkpoint
 from facediff.errors import FaceDiffError
-from facediff.models import load_model
+from facediff.models import DualPathDiffusion, load_model
 from tests.cli.conftest import SMALL
 from tests.fakes import processes, tiny
 
@@ -54,6 +56,26 @@ def test_a_saved_config_runs_again(fitted: Path, fit: Fit, tmp_path: Path) -> No
     first = yaml.safe_load((fitted / "config.yaml").read_text())
     assert again["model"] == first["model"]
     assert again["data"] == first["data"]
+
+
+@pytest.mark.parametrize("command", ["test", "fit"])
+def test_a_signal_of_slurm_outside_of_training_requeues_and_leaves_no_state(
+    command: str, checkpoint: Path, fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lightning's hpc_ckpt_1.ckpt would be what every later training in this folder begins from."""
+    monkeypatch.chdir(tmp_path)
+    job = {"JOB_ID": 77, "JOB_NAME": "facediff", "NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0}
+    for variable, value in job.items():
+        monkeypatch.setenv(f"SLURM_{variable}", str(value))
+    asked: list[None] = []
+    monkeypatch.setattr(checkpoints, "requeue", lambda: asked.append(None))
+    step = "test_step" if command == "test" else "validation_step"  # before training, to see that it works
+    monkeypatch.setattr(DualPathDiffusion, step, lambda *_: os.kill(os.getpid(), signal.SIGUSR1))
+    with pytest.raises(SystemExit) as stop:
+        main(["test", "--ckpt_path", str(checkpoint)]) if command == "test" else fit("--trainer.logger=CSVLogger")
+    assert stop.value.code == 128 + signal.SIGUSR1
+    assert len(asked) == 1
+    assert not list(tmp_path.rglob("*.ckpt"))
 
 
 def test_test_takes_everything_from_the_checkpoint(
