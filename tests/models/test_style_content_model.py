@@ -451,3 +451,11 @@ def test_the_basis_starts_from_principal_components(tiny: Tiny) -> None:
     for shape, spread, axis in zip(shapes.double().numpy(), spreads, axes, strict=False):
         assert np.linalg.norm(shape) == pytest.approx(spread, rel=1e-4)
         assert abs(shape @ axis) == pytest.approx(spread, rel=1e-4)
+
+
+def test_double_precision_trains_and_scores(tiny: Tiny, make_trainer: Callable[..., Trainer]) -> None:
+    model, trainer = make(), make_trainer(precision="64-true")
+    trainer.fit(model, datamodule=tiny)
+    trainer.test(model, datamodule=tiny, verbose=False)
+    assert {weight.dtype for weight in model.parameters()} == {torch.float64}
+    assert np.isfinite(float(trainer.callback_metrics["test_b/lve"]))

@@ -196,9 +196,9 @@ class StyleContentDecoder(nn.Module):
             columns = nn.functional.pad(columns, (kernel - 1, 0))
             x = nn.functional.leaky_relu(conv(columns).transpose(1, 2), SLOPE)
         coefficients = self.connected(x)
-        # In mixed precision the last map stays in float32: differences over time of half-precision motion are noise.
+        # The last map is not of half precision in mixed precision: differences over time of such motion are noise.
         with torch.autocast(x.device.type, enabled=False):
-            return self.basis(coefficients.float())
+            return self.basis(coefficients.to(self.basis.weight.dtype))
 
 
 class WindowedTransformer(nn.Module):
