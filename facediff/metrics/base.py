@@ -122,6 +122,7 @@ class Clips:
         """The same sequences with their neutral vertices: (batch, vertices, 3), or (vertices, 3) for all sequences."""
         if template is None:
             return self
+        check_tensor(name, template)
         batch, vertices, dims = len(self.clips), self.n_vertices, self.dims
         if template.shape not in ((batch, vertices, dims), (vertices, dims)):
             raise ValueError(
@@ -156,6 +157,13 @@ class Clips:
                 )
 
 
+def check_tensor(name: str, motion: object) -> None:
+    """Refuse what is no tensor, such as an array."""
+    if not isinstance(motion, Tensor):
+        kind = type(motion).__name__
+        raise ValueError(f"{name} is of type {kind}; expected a tensor (torch.from_numpy), or use the function")
+
+
 def align(
     prediction: Tensor,
     truth: Tensor,
@@ -182,6 +190,8 @@ def align(
             lengths.
     """
     check_option("length rule", rule, LengthRule)
+    check_tensor("prediction", prediction)
+    check_tensor("truth", truth)
     prediction, truth = prediction.detach(), truth.detach()  # scores are read, not optimised: keep no graph
     single = truth.ndim == 3
     for name, motion in (("prediction", prediction), ("truth", truth)):
@@ -509,8 +519,15 @@ class SequenceMetric(ExactMetric):
         if not clips.clips:
             self.latest = self.total.new_empty(0)
             return
-        values = torch.stack([self.clip_value(clip) for clip in clips.clips])
-        self.latest = values
+        of_clips = [self.clip_value(clip) for clip in clips.clips]
+        for value in of_clips:  # a number for each frame would be added up, and weigh as one
+            if not isinstance(value, Tensor) or value.ndim:
+                shape = f" of shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
+                raise ValueError(
+                    f"clip_value of {type(self).__name__} gave a {type(value).__name__}{shape}; expected a tensor of "
+                    "one number, such as .mean() of its frames"
+                )
+        values = self.latest = torch.stack(of_clips)
         weights = torch.tensor([self.clip_weight(clip) for clip in clips.clips], device=values.device)
         # A NaN that comes out of a metric that has a value everywhere must stay visible.
         scored = ~values.isnan() if self.leaves_out else torch.ones_like(weights, dtype=torch.bool)

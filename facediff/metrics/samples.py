@@ -26,6 +26,7 @@ from facediff.metrics.base import (
     UpdateOptions,
     align,
     check_option,
+    check_tensor,
     functional,
 )
 from facediff.metrics.one_pass import ErrorOf, one_pass
@@ -46,6 +47,7 @@ def align_samples(
     ``samples`` are (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3); without
     ``truth`` only their number of frames counts, and ``n_samples`` is None where there may be any number.
     """
+    check_tensor("samples", samples)
     if samples.ndim not in (4, 5) or samples.shape[-4] == 0:
         raise ValueError(
             f"samples have shape {tuple(samples.shape)}; expected (batch, samples, frames, vertices, 3) or "

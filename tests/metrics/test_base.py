@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from facediff.errors import NotFiniteError
 from facediff.metrics import (
+    Clip,
     Coverage,
+    EnergyScore,
     FaceDynamicsDeviation,
     LipVertexError,
     MeanVertexError,
@@ -100,6 +103,7 @@ def test_one_sequence_without_batch_axis() -> None:
         ({"truth": motion()[0]}, "prediction has shape"),
         ({"truth": motion()[..., :2]}, "truth has shape"),
         ({"prediction": motion().long()}, "must be floating point"),
+        ({"prediction": motion().tolist()}, "prediction is of type list; expected a tensor"),
         ({"lengths": [5]}, "must hold 2 whole numbers"),
         ({"lengths": [5, 6]}, "lengths holds 6"),
         ({"lengths": torch.tensor([5.0, 2.0])}, "whole numbers"),
@@ -121,6 +125,30 @@ def test_one_sequence_without_batch_axis() -> None:
 def test_misfits_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         mean_vertex_error(**({"prediction": motion(), "truth": motion()} | changes))
+
+
+def test_classes_name_what_is_no_tensor() -> None:
+    for options in ({"truth": motion().numpy()}, {"template": np.zeros((4, 3))}):
+        with pytest.raises(ValueError, match=f"{next(iter(options))} is of type ndarray; expected a tensor"):
+            FaceDynamicsDeviation([0]).update(**({"prediction": motion(), "truth": motion()} | options))
+    with pytest.raises(ValueError, match="samples is of type ndarray"):
+        EnergyScore().update(motion()[None].numpy(), motion())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("value", [torch.ones(5, dtype=torch.float64), 1.0])
+def test_a_sequence_has_one_number(value: torch.Tensor) -> None:
+    """A number for each frame of a single sequence would be added up, and weigh as one."""
+
+    class PerFrame(SequenceMetric):
+        words = "distance"
+
+        def clip_value(self, clip: Clip) -> torch.Tensor:
+            return value
+
+    metric = PerFrame()
+    with pytest.raises(ValueError, match="clip_value of PerFrame gave a .*; expected a tensor of one number"):
+        metric.update(motion()[0], motion()[0])
+    assert metric.coverage().sequences == 0
 
 
 def test_a_region_of_a_larger_mesh_is_refused() -> None:
