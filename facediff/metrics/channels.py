@@ -375,6 +375,7 @@ class FrechetDistance(DistributionMetric):
         definition = f"Fréchet distance between Gaussians of {whose}, over {{region}}, all sequences together [unit²]"
         super().__init__(region, definition=definition, **options)
         self.with_partner = with_partner
+        self.dims = dims
         size = len(self.region.indices) * dims * (2 if with_partner else 1) if self.region is not None else 0
         self.add_state("sums", torch.zeros(2, size, dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("products", torch.zeros(2, size, size, dtype=torch.float64), dist_reduce_fx="sum")
@@ -396,6 +397,8 @@ class FrechetDistance(DistributionMetric):
             partner: motion of whom the person talks with, of the truth's shape; for ``with_partner``.
         """
         clips = self.align(prediction, truth, **batch)
+        if clips.dims != self.dims:
+            raise ValueError(f"a point of the motion has {clips.dims} numbers, the metric's have {self.dims}; set dims")
         if self.with_partner:
             if partner is None:
                 raise ValueError("the Fréchet distance of both people needs partner=")
@@ -526,6 +529,13 @@ class ShannonIndex(DistributionMetric):
         """Forget all frames."""
         super().reset()
         self._begin()
+
+    def add(self, clips: Clips) -> None:
+        """Check aligned sequences and keep their frames; nothing is kept where one is refused."""
+        width = clips.dims * (clips.n_vertices if self.region is None else self.region.count)
+        if int(self.width) not in (0, width):
+            raise ValueError(f"frames of {width} numbers after others of {int(self.width)} cannot be compared")
+        super().add(clips)
 
     def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
         """Keep the frames."""

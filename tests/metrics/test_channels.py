@@ -110,7 +110,15 @@ def test_what_is_missing_is_named() -> None:
         residual_partner_correlation(motion, motion, partner=motion[:, :1])
     with pytest.raises(ValueError, match="frames"):
         residual_partner_correlation(motion, motion, partner=motion[:2])
-    metric = FrechetDistance([0])
+    metric = FrechetDistance([0, 1])
+    with pytest.raises(ValueError, match="set dims"):
+        metric.update(motion.expand(4, 2, 3), motion.expand(4, 2, 3))
+    assert metric.coverage().frames == 0
+    index = ShannonIndex(clusters=2)
+    index.update(motion, motion)
+    with pytest.raises(ValueError, match="frames of 1 numbers after others of 2"):
+        index.update(motion[:, :1], motion[:, :1])
+    assert index.coverage().frames == 4
     metric.update(motion[:1], motion[:1])
     with pytest.raises(ValueError, match="covariance"):
         metric.compute()
