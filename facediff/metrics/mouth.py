@@ -8,8 +8,8 @@ names so that a :class:`torchmetrics.MetricCollection` can pass both.)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Unpack
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ from facediff.metrics.base import (
     functional,
 )
 from facediff.metrics.one_pass import frames_per_step, squared_norm
-from facediff.metrics.regions import LipPairs, LipPairsLike, as_lip_pairs
+from facediff.metrics.regions import LipPairs, LipPairsLike, as_lip_pairs, whole
 from facediff.registry import metric
 
 
@@ -379,10 +379,14 @@ def _checked(clip: Clip, intervals: object) -> tuple[Interval, ...]:
     """The intervals of one clip, each checked, as far as they lie in its frames."""
     kept: list[Interval] = []
     earlier = 0
-    for pair in intervals if isinstance(intervals, Sequence) else [intervals]:
-        if not isinstance(pair, Sequence) or [type(frame) for frame in pair] != [int, int]:
-            raise ValueError(f"the closures of {clip.name} must be a list of pairs of whole numbers (first frame, end)")
-        start, end = pair
+    pairs: Iterable[Any] = intervals if isinstance(intervals, Sequence) else [intervals]
+    for pair in pairs:
+        try:
+            start, end = (whole(frame) for frame in pair)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"the closures of {clip.name} must be a list of pairs of whole numbers (first frame, end)"
+            ) from None
         if start < earlier or end <= start:
             raise ValueError(
                 f"the closures of {clip.name} hold the interval {(start, end)}; expected intervals that are not empty, "

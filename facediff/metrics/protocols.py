@@ -24,7 +24,7 @@ from facediff.metrics.base import (
     check_option,
 )
 from facediff.metrics.by_name import Request, parse
-from facediff.metrics.regions import TOPOLOGIES, Region
+from facediff.metrics.regions import TOPOLOGIES, Region, RegionLike, as_region
 from facediff.metrics.vertex_errors import (
     FaceDynamicsDeviation,
     LipVertexError,
@@ -131,14 +131,15 @@ class Protocol:
         """Sign of each face dynamics deviation by its name."""
         return {f"fdd_{sign}" if place else "fdd": sign for place, sign in enumerate(self.fdd)}
 
-    def build(self, lips: Region, upper: Region | None = None, *, scale: float = 1.0) -> ProtocolMetrics:
+    def build(self, lips: RegionLike, upper: RegionLike | None = None, *, scale: float = 1.0) -> ProtocolMetrics:
         """The metrics of this protocol for a topology, without the further ones, which :meth:`further` gives.
 
         Args:
-            lips: lip vertices; channels where the protocol is of channels.
-            upper: upper-face vertices; needed if the protocol has FDD.
+            lips: lip vertices, a :class:`Region` or indices; channels where the protocol is of channels.
+            upper: the same of the upper face; needed if the protocol has FDD.
             scale: factor of all lengths, by which the motion's unit becomes the protocol's.
         """
+        lips, upper = as_region(lips, "lips"), None if upper is None else as_region(upper, "upper")
         if self.topology is not None:
             topology = TOPOLOGIES[self.topology]
             lips, upper = topology.bind(lips), None if upper is None else topology.bind(upper)

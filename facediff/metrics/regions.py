@@ -292,13 +292,18 @@ class LipPairs:
 
         Args:
             name: what to call them.
-            pairs: two integers each, or an integer tensor (pairs, 2).
+            pairs: two integers each, or an integer tensor or array (pairs, 2).
 
         >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
         middle (1 pairs, de4cd82d)
         """
-        listed = [list(pair) for pair in (pairs.tolist() if isinstance(pairs, Tensor) else pairs)]
-        if any(len(pair) != 2 or any(type(index) is not int for index in pair) for pair in listed):
+        try:
+            rows = getattr(pairs, "tolist", lambda: pairs)()  # of a tensor or an array
+            listed = [[whole(index) for index in pair] for pair in rows]
+            fit = all(len(pair) == 2 for pair in listed)
+        except TypeError:
+            fit = False
+        if not fit:
             raise ValueError(f"{cls.what} {name!r} must be pairs of two whole numbers, vertex indices")
         distinct = sorted({(min(pair), max(pair)) for pair in listed})
         return cls(name, tuple(distinct), duplicates=len(listed) - len(distinct))
@@ -319,6 +324,17 @@ class LipPairs:
             return cls.from_pairs(name or path.stem, zip(indices[::2], indices[1::2], strict=True))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+def whole(value: object) -> int:
+    """A whole number of Python, NumPy or torch as Python's.
+
+    Raises:
+        TypeError: if it is none; a boolean is none.
+    """
+    if isinstance(value, bool):
+        raise TypeError
+    return operator.index(value)  # type: ignore[arg-type]  # whatever has no index is refused
 
 
 class EyelidPairs(LipPairs):

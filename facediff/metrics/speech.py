@@ -293,8 +293,9 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         if len(values) != count or values.is_floating_point() or values.dtype == torch.bool:
             raise ValueError(f"identities must be {count} whole numbers, one per sequence")
         numbers: list[int] = values.tolist()
-        if any(not 0 <= number < self.n_identities for number in numbers):
-            raise ValueError(f"identities hold {max(numbers)}; the metric was made for 0 to {self.n_identities - 1}")
+        wrong = [number for number in numbers if not 0 <= number < self.n_identities]
+        if wrong:
+            raise ValueError(f"identities hold {wrong[0]}; the metric was made for 0 to {self.n_identities - 1}")
         return numbers
 
     def clip_value(self, clip: Clip) -> Tensor:

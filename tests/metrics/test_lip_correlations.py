@@ -156,6 +156,7 @@ def test_options_and_identities_that_do_not_fit_are_refused() -> None:
         ([0], "must be 2 whole numbers"),
         ([0.0, 1.0], "must be 2 whole numbers"),
         ([0, 2], "identities hold 2; the metric was made for 0 to 1"),
+        ([1, -1], "identities hold -1; the metric was made for 0 to 1"),
     ):
         with pytest.raises(ValueError, match=message):
             metric.update(motion(0), motion(1), intensity=ADDED["intensity"], identities=numbers)  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -69,7 +70,7 @@ def test_a_mask_is_runs_of_closures() -> None:
     truth = torch.stack([mouth([0.0, 1.0, 1.0, 0.0, 1.0]), mouth([0.0, 0.0, 1.0, 1.0, 1.0])])
     prediction = truth.flip(1)
     mask = torch.tensor([[True, True, False, True, True], [False, False, True, True, True]])
-    intervals = [[(0, 2), (3, 5)], [(2, 5)]]
+    intervals = [[(0, 2), (3, 5)], list(np.array([[2, 5]]))]
     for options in ({}, {"count": "closures"}, {"pooling": "sequences"}, {"lengths": [5, 3]}):
         by_mask, by_interval = (
             bilabial_closure_rate(prediction, truth, [(0, 1)], closures, **options)  # type: ignore[arg-type]
@@ -124,6 +125,8 @@ def test_pairs_are_sorted_distinct_and_counted_once(tmp_path: Path) -> None:
     pairs = LipPairs.from_pairs("inner", [(9, 2), (1, 3), (2, 9)])
     assert (pairs.pairs, pairs.count, pairs.duplicates) == (((1, 3), (2, 9)), 2, 1)
     assert LipPairs.from_pairs("other", torch.tensor([[3, 1], [2, 9]])).hash == pairs.hash
+    assert LipPairs.from_pairs("other", np.array([[3, 1], [2, 9]])).hash == pairs.hash
+    assert LipPairs.from_pairs("other", list(np.array([[3, 1], [2, 9]]))).hash == pairs.hash
     assert LipPairs.from_pairs("other", [(1, 29)]).hash != pairs.hash
     path = tmp_path / "lips.txt"
     path.write_text("9 2\n1, 3\n2,9")

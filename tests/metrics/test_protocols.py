@@ -100,6 +100,9 @@ def test_summary_names_regions_frames_and_cuts(corpus: Corpus, lips: tuple[int, 
     }
     assert (plain["frames"], plain["sequences"], plain["cut_truth"]) == (35, 2, 2)
     assert "lips (4 vertices" in metrics.describe()
+    bare = protocol("paper").build(lips, upper)  # indices, which the metrics take too
+    bare.update(**batch, prediction_lengths=[5, 30])
+    assert str(bare.summary()) == str(summary)
 
 
 def test_a_topology_tells_usual_regions_from_others() -> None:
