@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -171,9 +172,14 @@ def report(error: BaseException) -> int:
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
     if isinstance(error, UnicodeError):
         return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
+    if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
+        error = list(_chain(error))[-1]
+        text = " ".join(str(error).split())
+    own = _own_classes(error)
+    whose = f"unless the fault is in {own}, it is one of facediff" if own else "this is a fault of facediff"
     return fail(
-        f"unexpected {type(error).__name__}: {text[:300]} ({_place(error)}, facediff {facediff.__version__}); this is "
-        f"a fault of facediff: run the command again with {TRACEBACK}=1 and report what it prints",
+        f"unexpected {type(error).__name__}: {text[:300]} ({_place(error)}, facediff {facediff.__version__}); "
+        f"{whose}: run the command again with {TRACEBACK}=1 and report what it prints",
         FAULT,
     )
 
@@ -184,6 +190,27 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         seen.add(id(error))
         yield error
         error = error.__cause__ or error.__context__
+
+
+def _own_classes(error: BaseException) -> str:
+    """Classes from elsewhere that extend facediff's, such as a decoder of the user's, in the calls of an error."""
+    import traceback
+
+    held: list[Any] = []
+    for cause in _chain(error):
+        for frame, _ in traceback.walk_tb(cause.__traceback__):
+            held += frame.f_locals.values()
+    torch: Any = sys.modules.get("torch")
+    for thing in list(held):
+        if isinstance(thing, partial):
+            held += [thing.func, *thing.args]
+        elif torch is not None and isinstance(thing, torch.nn.Module):
+            with suppress(AttributeError):  # of a module whose constructor has failed
+                held += [part for module in thing.modules() for part in (module, *vars(module).values())]
+    classes = {base for thing in held for base in (thing if isinstance(thing, type) else type(thing)).__mro__}
+    ours = {cls for cls in classes if cls.__module__.startswith("facediff.")}
+    own = {f"{cls.__module__}.{cls.__qualname__}" for cls in classes - ours if ours & set(cls.__mro__)}
+    return " or ".join(sorted(own))
 
 
 def _place(error: BaseException) -> str:
