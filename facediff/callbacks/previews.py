@@ -152,7 +152,7 @@ class SamplingPreview(Callback):
         sharded = isinstance(trainer.strategy, DeepSpeedStrategy) or not isinstance(trainer.strategy, DDPStrategy)
         if pl_module.assets.scored.faces is None:
             if trainer.is_global_zero:  # no fault: the bundled configs ask for previews, whatever the corpus has
-                files = " or ".join(data.mesh_files)
+                files = " or ".join(data.mesh_files) or "its class names no mesh_files"
                 print(f"no previews in this run: {data.root} holds no mesh to draw ({files})", flush=True)
         elif trainer.world_size > 1 and sharded:
             self._warn(trainer, f"{type(trainer.strategy).__name__} spreads a model over processes, and one draws")

@@ -229,6 +229,10 @@ def explain(message: str) -> str:
         missing = [f"--{option}.{name}" if option else f"--{name.partition('.')[2]}" for name in match[1].split(", ")]
         return f"{' and '.join(missing)} must be given, as an option or in a file with --config; {see}"
     if match := re.search(r"Expected a path but (\S+) either not accessible or invalid", message):
+        module, _, name = match[1].rpartition(".")
+        lacking = ", ".join(sorted(getattr(getattr(sys.modules.get(module), name, None), "__abstractmethods__", ())))
+        if lacking:
+            return f"--{option} {match[1]}: the class lacks {lacking}; define what it lacks"
         return f"--{option} {match[1]}: no file, no name that `facediff components` lists, and no class of this kind"
     types = re.findall(r"Expected (?:a |an )?<class '([\w.]+)'>|Literal\[(.*?)\]", message)
     expected = [word for pair in dict.fromkeys(types) for word in pair if word not in ("", "NoneType")]

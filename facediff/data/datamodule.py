@@ -141,7 +141,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     n_vertices: int
     space: Space = VERTICES
     identities: list[str]
-    mesh_files: ClassVar[tuple[str, ...]]
+    mesh_files: ClassVar[tuple[str, ...]] = ()
     region_sources: ClassVar[dict[str, tuple[str, ...]]] = {
         "lips": ("regions/lve.txt",),
         "upper_face": ("regions/fdd.txt",),
@@ -184,6 +184,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         further_corpora: dict[str, dict[str, Any]] | None = None,
     ) -> None:
         super().__init__()
+        facts = ("corpus_name", "unit", "frame_rate", "n_vertices", "identities")
+        missing = [name for name in facts if not hasattr(self, name)]
+        if missing:
+            raise FaceDiffError(
+                f"{type(self).__name__}: the class states no {' and no '.join(missing)}; every corpus has {facts[0]}, "
+                f"{', '.join(facts[1:])}"
+            )
         if not str(root):
             raise ArgumentError({"root": root}, "expected the corpus's folder")
         self.source = address_of(root) or str(root)

@@ -36,7 +36,6 @@ class ParametricDataModule(SpeechMotionDataModule):
     """
 
     unit = "m"
-    mesh_files: ClassVar[tuple[str, ...]] = ()
     identities: list[str] = []  # noqa: RUF012 - of a class, as those of all corpora; those of a folder are found in it
     suffixes: ClassVar[tuple[str, ...]] = USUAL_SUFFIXES
     layout_name: str | None = None

@@ -61,6 +61,21 @@ def test_its_splits_are_multifaces(root: Path) -> None:
     assert data.dataset("test_b")[0].reference_name == "1_05"
 
 
+def test_what_a_class_lacks_is_named(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Facts and methods; a mesh is needed for pictures only."""
+    source = Path("multiface.py").read_text()
+    for name, pattern, words in (
+        ("NoUnit", r"    unit = .*\n", "NoUnit: the class states no unit"),
+        ("NoSplits", r"    def split_of(.|\n)*", "the class lacks split_of"),
+        ("NoMesh", r"    mesh_files.*\n", ""),
+    ):
+        Path(f"lacking_{name}.py").write_text(re.sub(pattern, "", source.replace("Multiface(", f"{name}(")))
+        assert (main(["data", "check", str(root), "--corpus", f"lacking_{name}.{name}"]) == 2) == bool(words)
+        assert words in capsys.readouterr().err
+    assert main(["fit", "--config", "configs/experiment/puppet.yaml", "--data=lacking_NoSplits.NoSplits"]) == 2
+    assert "--data lacking_NoSplits.NoSplits: the class lacks split_of" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_it_trains_and_tests_from_the_command_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--config", "configs/experiment/puppet.yaml", "--data=multiface.Multiface", f"--data.root={root}"]

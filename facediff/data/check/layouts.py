@@ -298,8 +298,11 @@ def _import(path: str, option: str) -> Module:
         module = getattr(importlib.import_module(place), name)
     except Exception as error:  # a module can fail in any way while it is imported
         raise FaceDiffError(f"{option} {path}: cannot be imported ({error}); expected package.module.Class") from error
-    if not (isinstance(module, type) and issubclass(module, SpeechMotionDataModule)) or inspect.isabstract(module):
+    if not (isinstance(module, type) and issubclass(module, SpeechMotionDataModule)):
         raise FaceDiffError(f"{option} {path}: is no data module; expected a subclass of SpeechMotionDataModule")
+    if inspect.isabstract(module):
+        lacking = ", ".join(sorted(module.__abstractmethods__))
+        raise FaceDiffError(f"{option} {path}: the class lacks {lacking}; define what it lacks")
     return module
 
 
