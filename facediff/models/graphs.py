@@ -142,7 +142,10 @@ def update_table(sampler: Sampler) -> list[list[float]]:
     """
     name = type(sampler).__name__
     if not sampler.linear:
-        raise FaceDiffError(f"sampler: {name} is no fixed linear combination; choose ddim, ddpm or dpm_solver")
+        raise FaceDiffError(
+            f"sampler: {name} is no fixed linear combination; choose ddim, ddpm or dpm_solver, or set linear = True "
+            "in its class if it is one"
+        )
     zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
     table = []
     for i in range(sampler.steps):

@@ -97,6 +97,14 @@ def test_table_of_updates_runs_the_sampler(make: Callable[..., Sampler]) -> None
     torch.testing.assert_close(noisy, wanted)
 
 
+def test_a_sampler_that_is_not_declared_linear_is_told_how() -> None:
+    class Undeclared(DdimSampler):
+        linear = False
+
+    with pytest.raises(FaceDiffError, match=r"Undeclared is no fixed linear combination; .* linear = True"):
+        update_table(Undeclared(process=NoiseProcess(), steps=4))
+
+
 @pytest.fixture(scope="module")
 def model(tiny_root: Path) -> AnimationModel:
     """A tiny trained-like model with every part that an export has."""
