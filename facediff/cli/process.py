@@ -175,7 +175,9 @@ def report(error: BaseException) -> int:
     if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
         error = list(_chain(error))[-1]
         text = " ".join(str(error).split())
-    own = _own_classes(error)
+    own = ""
+    with suppress(Exception):  # of objects from elsewhere; the error itself is to be said in any case
+        own = _own_classes(error)
     whose = f"unless the fault is in {own}, it is one of facediff" if own else "this is a fault of facediff"
     return fail(
         f"unexpected {type(error).__name__}: {text[:300]} ({_place(error)}, facediff {facediff.__version__}); "
