@@ -49,7 +49,8 @@ def run(path: Path, kernel: KernelManager, folder: Path) -> NotebookNode:
     (cell,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     names = [name for name in PARAMETERS if f"\n{name} = " in f"\n{cell.source}"]
     cell.source += "".join(f"\n{name} = {PARAMETERS[name]!r}" for name in names)
-    first = f"%reset -f\n%cd -q {folder}\n{SMALL}"
+    # First into a folder that is there: that of the notebook before went with its test.
+    first = f"import os; os.chdir({str(folder)!r})\n%reset -f\n{SMALL}"
     notebook.cells.insert(0, nbformat.v4.new_code_cell(first))
     runner = NotebookClient(notebook, timeout=240, km=kernel)
     try:

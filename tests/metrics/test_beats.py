@@ -70,6 +70,8 @@ def test_a_head_that_pauses_on_the_beat_is_aligned_and_one_between_the_beats_is_
     ]
     assert scores[0] > 0.9
     assert scores[1] < 0.1
+    narrow = {"waveform": clicks(times), "frames_per_second": FPS, "smoothing": 1.0, "variance": 0.5}
+    assert head_beat_alignment(nodding(0.7), nodding(0.6), **narrow).item() < scores[0]  # type: ignore[arg-type]
     still = torch.zeros(100, 1, 1)
     assert head_beat_alignment(still, nodding(0.6), waveform=clicks(times), frames_per_second=FPS).item() == 0
     with pytest.raises(ValueError, match="onset"):

@@ -57,6 +57,7 @@ def test_scores_follow_the_definitions(
 def test_there_are_these_of_vertices_and_paper_is_the_default() -> None:
     assert [name for name, setting in PROTOCOLS.items() if not setting.of_parameters] == list(SCORES)
     assert protocol() is PROTOCOLS["paper"]
+    assert not protocol("dualtalk").lve  # its tables have channels and no lips
     with pytest.raises(ValueError, match=r'unknown protocol .codtalker.: did you mean "codetalker".*meshtalk'):
         protocol("codtalker")
 

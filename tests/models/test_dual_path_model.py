@@ -256,6 +256,11 @@ def test_samples_of_few_steps_are_taken_further_from_the_mean(make_model: Make) 
             factors.append(model.sampler.spread)
         wanted = [1.31, 1.18, 1.07, 1.0, 1.0] if wider else [1.0] * 5
         assert factors == pytest.approx(wanted, abs=0.005)
+    made_wide = partial(sampler, spread=1.9)
+    model = make_model(diffusion_steps=1000, sampler=made_wide, motion_space=registry.motion_space.components)
+    for steps, factor in ((2, 2.0), (10, 1.9)):  # at most twice
+        model.choose_sampler(steps=steps)
+        assert model.sampler.spread == pytest.approx(factor)
 
 
 def test_sizes_that_do_not_fit_are_named(make_model: Make, tiny: Tiny) -> None:

@@ -198,6 +198,19 @@ def test_without_guidance_training_draws_what_it_always_drew(ready: Ready) -> No
     assert model.network.no_speech is model.network.no_style is None
 
 
+def test_a_hidden_identity_is_a_strangers(ready: Ready, batch: Batch) -> None:
+    model = ready(speech_dropout=0, style_dropout=0)
+    model.training = True  # and not its parts, whose dropout would differ
+    strangers = replace(batch, identity=torch.full_like(batch.identity, -1))
+
+    def condition(share: float, clips: Batch) -> torch.Tensor:
+        model.identity_dropout = share
+        return model.conditions(clips).style
+
+    torch.testing.assert_close(condition(1.0, batch), condition(0.0, strangers))
+    assert not torch.equal(condition(0.0, batch), condition(0.0, strangers))
+
+
 def test_learnt_stand_ins_get_a_gradient_in_every_step(ready: Ready, batch: Batch) -> None:
     model = ready().train()
     for share in (0.0, 1.0):
