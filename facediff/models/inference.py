@@ -199,6 +199,11 @@ class Inference(ABC):
         stream = SpeechStream(self, clip, seeds=seeds)
         return torch.cat(list(stream.parts(clip.audio[0].cpu().numpy(), frames=frames, progress=progress)), 1)
 
+    @property
+    def stream_timing(self) -> tuple[float, float] | None:
+        """Look-ahead and length in seconds of windows of its own that streams have; None if they follow a plan."""
+        return None
+
     @torch.inference_mode()
     def stream(
         self,

@@ -191,9 +191,15 @@ class AnimationPipeline(ABC):
         """What an animation says of the model and its choices."""
 
     @property
+    def stream_timing(self) -> tuple[float, float]:
+        """Seconds of speech that a frame of a stream waits for the model, at most, and from one window to the next."""
+        plan = self.windows.in_frames(self.frame_rate)  # a frame may be longer than planned
+        return max(self.windows.look_ahead, plan.look_ahead / self.frame_rate), plan.hop / self.frame_rate
+
+    @property
     def hop(self) -> float:
         """Seconds from one window of a stream to the next."""
-        return self.windows.in_frames(self.frame_rate).hop / self.frame_rate
+        return self.stream_timing[1]
 
     @property
     def has_weights(self) -> bool:
@@ -377,8 +383,7 @@ class AnimationPipeline(ABC):
     def look_ahead(self) -> float:
         """Seconds of speech, at most, that must arrive after an instant before its frame of a stream is certain."""
         return max(
-            self.windows.look_ahead,
-            self.windows.in_frames(self.frame_rate).look_ahead / self.frame_rate,  # a frame may be longer than planned
+            self.stream_timing[0],
             0.0 if self.acting is None else self.acting.look_ahead,
             0.0 if self.rest is None else self.rest.openness().look_ahead,
         )

@@ -168,9 +168,10 @@ class Audio2FacePipeline(AnimationPipeline):
         )
 
     @property
-    def hop(self) -> float:
-        """A frame: each has a window of its own."""
-        return 1 / self.frame_rate
+    def stream_timing(self) -> tuple[float, float]:
+        """What a window has after its frame's moment, and a frame: each has a window of its own."""
+        facts = self.model.folder.facts
+        return (facts.buffer - facts.before) / SAMPLE_RATE, 1 / self.frame_rate
 
     @property
     def has_weights(self) -> bool:
@@ -182,13 +183,6 @@ class Audio2FacePipeline(AnimationPipeline):
     def corpus(self) -> str:
         """What errors call the model's face."""
         return f"Audio2Face-3D's {self.actor}"
-
-    @property
-    def look_ahead(self) -> float:
-        """What a window has after its frame's moment, if nothing else looks further."""
-        facts = self.model.folder.facts
-        own = (facts.buffer - facts.before) / SAMPLE_RATE
-        return max(own, 0.0 if self.rest is None else self.rest.openness().look_ahead)
 
     def frames_of(self, samples: int) -> int:
         """How many frames there are for so many samples of speech."""

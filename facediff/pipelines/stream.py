@@ -46,7 +46,7 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
         stream = pipeline.stream(rate)
         report(
             f"ready; look-ahead {pipeline.look_ahead:.2f} s and the time that a window takes; "
-            f"{pipeline.windows.in_frames(pipeline.frame_rate).hop} frames at a time, {pipeline.frame_rate:g} a "
+            f"{round(pipeline.hop * pipeline.frame_rate)} frames at a time, {pipeline.frame_rate:g} a "
             f"second, {len(template)} vertices; reading {rate} Hz, 16 bit"
         )
         for samples in pcm(sys.stdin.buffer, rate, read):

@@ -163,6 +163,11 @@ class TrainedPipeline(AnimationPipeline):
 
             yield [*blend(motions, self.runs, self.frame_rate).numpy()]
 
+    @property
+    def stream_timing(self) -> tuple[float, float]:
+        """That of the model's own windows, where it has such."""
+        return self.model.stream_timing or super().stream_timing
+
     def generator(self) -> FirstSample:
         """What generates points while speech arrives."""
         return FirstSample(self._directed([self.seed]))

@@ -11,10 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import torch
 
 import facediff
+from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
+from facediff.cli.live import live_model
+from facediff.models import import_checkpoint
+from facediff.models.published.importing import save_model
 from facediff.speech.audio import read_speech
+from tests.fakes import published_parameters
+from tests.fakes.published import AUDIO_CONFIG
 from tests.fakes.waiting import PATIENCE, wait_until_read
 
 WINDOWS = {"window": 0.6, "overlap": 0.2, "voice_gate": "off"}
@@ -48,6 +55,26 @@ def test_live_frames_are_those_of_a_stream(
     found = np.array([frame["vertices"] for frame in frames]) + np.array(head["neutral"])
     assert np.allclose(found, wanted[index], atol=3e-6)
     assert [frame["time"] for frame in frames] == pytest.approx([each / head["frame_rate"] for each in index])
+
+
+@pytest.mark.parametrize("method", ["ARTalk", "DiffPoseTalk", "facediff's windows"])
+def test_live_knows_how_late_a_models_own_windows_are(method: str, tmp_path: Path) -> None:
+    path, plan = tmp_path / "tiny.ckpt", {"window": 0.8} if method == "facediff's windows" else {}
+    if method == "ARTalk":
+        torch.save(published_parameters.artalk_state(), tmp_path / "artalk.pt")
+        imported = import_checkpoint(tmp_path / "artalk.pt", audio_config=AUDIO_CONFIG, codec_heads=2)
+    else:
+        numbers, files = published_parameters.statistics(), published_parameters.write_diffposetalk(tmp_path, head=True)
+        imported = import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=numbers)
+    save_model(imported, path)
+    model = live_model(AnimationOptions(checkpoint=path, **plan))
+    stream, frame, waits, hops = model.start(), round(16_000 / model.frame_rate), [], []
+    for heard in range(1, 70):
+        if given := len(stream.feed(np.zeros(frame, np.float32))):
+            waits.append((heard - sum(hops)) / model.frame_rate)  # of the first frame of those
+            hops.append(given)
+    assert max(waits) == pytest.approx(model.look_ahead, abs=0.6 / model.frame_rate)  # in whole frames
+    assert hops[-1] / model.frame_rate == pytest.approx(model.hop)
 
 
 @pytest.mark.parametrize(

@@ -334,6 +334,12 @@ class ARTalk(ParametricModel):
         memory = torch.cat([state.memory[:, own.shape[1] :], own], 1)
         return motion[0], logits[0], ChunkState(again, memory)
 
+    @property
+    def stream_timing(self) -> tuple[float, float]:
+        """A chunk and half of the longest filter, and a chunk; see the base class."""
+        chunk = self.scales[-1]
+        return (chunk + LONGEST_FILTER // 2 * self.smooth) / self.frame_rate, chunk / self.frame_rate
+
     def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
         """Animate speech of any length while it arrives, chunk by chunk; see the base class."""
         whole = super().stream(plan=plan, **choices)

@@ -333,6 +333,12 @@ class DiffPoseTalk(ParametricModel):
         """Samples of a window's speech."""
         return round(SAMPLE_RATE / self.frame_rate * self.window_frames)
 
+    @property
+    def stream_timing(self) -> tuple[float, float] | None:
+        """A window each, unless others were chosen; see the base class."""
+        window = self.window_frames / self.frame_rate
+        return (window, window) if math.isinf(self.windows.above) else None
+
     def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
         """Animate speech of any length while it arrives, in the method's own windows; see the base class.
 
