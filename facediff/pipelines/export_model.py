@@ -7,7 +7,7 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -157,8 +157,8 @@ def record(graph: Graph) -> onnx.ModelProto:
             )
     except Exception as error:  # whatever a component of anybody's does while it is recorded
         raise FaceDiffError(
-            f"{graph.name}: PyTorch cannot record this part of the model as a graph ({brief(error)}); "
-            f"choose components that do not depend on values, or report it"
+            f"{graph.name}: PyTorch cannot record this part of the model as a graph "
+            f"({brief(error.__cause__ or error)}); choose components that do not depend on values, or report it"
         ) from error
     if program is None:
         raise FaceDiffError(f"{graph.name}: PyTorch gave no graph; install the PyTorch that facediff was tested with")
@@ -181,7 +181,7 @@ def record(graph: Graph) -> onnx.ModelProto:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without the exporter's remarks about packages that nobody needs here, and without checks of shapes.
+    """Without the exporter's remarks and graphs, which help nobody here, and without checks of shapes.
 
     While a graph is recorded, symbols stand for numbers. Where shapes are checked at run time, as in facediff's tests,
     the checks would take them for wrong types.
@@ -190,12 +190,12 @@ def quiet() -> Iterator[None]:
 
     checked = config.jaxtyping_disable
     config.update("jaxtyping_disable", True)
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.fx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), redirect_stderr(io.StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:

@@ -19,7 +19,7 @@ from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.graphs import Graph
-from facediff.pipelines.export_model import arrays_of, describe, export_model
+from facediff.pipelines.export_model import arrays_of, describe, export_model, record
 from facediff.runtime import RuntimeModel
 from facediff.speech.windows import LOW_LATENCY, WindowPlan
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
@@ -213,3 +213,17 @@ def test_low_latency_is_that_of_the_model(case: str, tiny_root: Path, monkeypatc
     runtime = in_eager(model)
     monkeypatch.setattr(f"{__name__}.PLAN", LOW_LATENCY)
     assert_alike(runtime, model, 2.513, "B", seed=1)
+
+
+class Branching(torch.nn.Module):
+    """Asks for a value, which a graph cannot know."""
+
+    def forward(self, motion: torch.Tensor) -> torch.Tensor:
+        return motion if motion.sum() > 0 else -motion
+
+
+def test_a_part_that_depends_on_values_is_refused_in_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(FaceDiffError, match=r"step: .*data-dependent") as caught:
+        record(Graph("step", Branching(), {"motion": torch.ones(1, 5)}, {"motion": {1: "frames"}}, ("clean",)))
+    assert "[96m" not in str(caught.value)
+    assert capfd.readouterr().err == ""
