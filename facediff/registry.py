@@ -113,6 +113,8 @@ class Kind:
                 f'{self.kind} name "{name}" cannot be registered: use a lower snake case identifier that is none '
                 f"of the registry's own words"
             )
+        if not isinstance(implementation, type):
+            raise RegistrationError(f'{self.kind} "{name}" is {implementation!r:.80}, which is no class')
         owner = f"{implementation.__module__}.{implementation.__qualname__}"
         taken = self._entries.get(name)
         if taken is not None and taken.owner != owner:

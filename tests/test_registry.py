@@ -126,7 +126,7 @@ def test_a_plug_in_is_found(shelf: Kind, install: Callable[..., None]) -> None:
         ("spinner", "import no_such_module_anywhere\n", "no_such_module_anywhere"),
         ("spinner", "raise SystemError('on fire')\n", "on fire"),
         ("spinner", "", "has no attribute 'Spinner'"),
-        ("spinner", "Spinner = 3\n", "Error"),
+        ("spinner", "Spinner = 3\n", "3, which is no class"),
         ("Spinner-3", "class Spinner: ...\n", "lower snake case"),
         ("taken", "class Spinner: ...\n", "facediff.models.decoders.GruDecoder"),
     ],

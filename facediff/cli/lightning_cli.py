@@ -233,6 +233,8 @@ def explain(message: str) -> str:
         lacking = ", ".join(sorted(getattr(getattr(sys.modules.get(module), name, None), "__abstractmethods__", ())))
         if lacking:
             return f"--{option} {match[1]}: the class lacks {lacking}; define what it lacks"
+        if extended := re.search(r"(?:to a subclass of |be a subclass of <class ')(\w+)", message):
+            return f"--{option} {match[1]}: no class that extends {extended[1]}, which it has to"
         return f"--{option} {match[1]}: no file, no name that `facediff components` lists, and no class of this kind"
     types = re.findall(r"Expected (?:a |an )?<class '([\w.]+)'>|Literal\[(.*?)\]", message)
     expected = [word for pair in dict.fromkeys(types) for word in pair if word not in ("", "NoneType")]

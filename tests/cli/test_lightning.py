@@ -255,6 +255,8 @@ def test_a_wrong_name_in_a_config_names_the_nearest(
         (["--trainer.max_epochs=a"], ["--trainer.max_epochs a", "int"]),
         (["--data=Biwi", "--data.batch_size=1"], ["--data.root"]),
         (["--model=nowhere.yaml"], ["--model nowhere.yaml"]),
+        (["--model.decoder=torch.nn.GRU"], ["--model.decoder torch.nn.GRU", "extends Decoder"]),
+        (["--data=torch.nn.GRU"], ["--data torch.nn.GRU", "extends SpeechMotionDataModule"]),
     ],
 )
 def test_a_wrong_option_is_one_sentence(words: list[str], named: list[str], capsys: pytest.CaptureFixture[str]) -> None:
