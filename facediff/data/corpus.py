@@ -357,7 +357,7 @@ class Corpus:
         return {name: torch.from_numpy(array) for name, array in arrays.items() if name in self.templates}
 
     def read_pairs(self, file: str) -> Tensor | None:
-        """Vertex pairs (P, 2) of a file below the folder, one ``upper, lower`` a line; None if it does not exist."""
+        """Vertex pairs (P, 2), one ``upper, lower`` or ``upper lower`` a line of a file; None if it does not exist."""
         path = self.root / file
         if not path.is_file():
             return None
@@ -365,7 +365,7 @@ class Corpus:
         rows: list[list[int]] = []
         for number, row in enumerate(read_table(path, remedy=remedy), 1):
             try:
-                upper, lower = map(int, row)
+                upper, lower = map(int, " ".join(row).split())
             except ValueError:
                 raise FaceDiffError(f"{path}: row {number} is {','.join(row)!r}; {remedy}") from None
             rows.append([upper, lower])

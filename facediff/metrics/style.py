@@ -308,7 +308,10 @@ class NearestSpeakerAccuracy(SequenceMetric):
             template: neutral vertices, when the prediction is absolute vertices. **None means that it is offsets from
                 the template already.**
         """
-        clips = self.align(prediction, prediction, **batch).attach_templates(template)
+        clips = self.align(prediction, prediction, **batch)
+        if clips.dims != 3:
+            raise ValueError(f"a point of the motion has {clips.dims} numbers; expected vertices, of 3")
+        clips = clips.attach_templates(template)
         numbers = torch.as_tensor(identities).reshape(-1)
         if numbers.shape != (len(clips.clips),) or numbers.is_floating_point() or numbers.dtype == torch.bool:
             raise ValueError(f"identities must be {len(clips.clips)} whole numbers, one per sequence")

@@ -140,3 +140,7 @@ def test_pairs_of_vertices_that_are_none_are_named_with_their_row(row: str, tmp_
     (tmp_path / "pairs.txt").write_text(f"0, 6\n{row}\n")
     with pytest.raises(FaceDiffError, match=rf"pairs\.txt: row 2 is '{row}'; expected .* such as 12, 34"):
         Corpus(tmp_path, n_vertices=9, frame_rate=25.0).read_pairs("pairs.txt")
+    (tmp_path / "pairs.txt").write_text("0, 6\n 1 7\n")
+    pairs = Corpus(tmp_path, n_vertices=9, frame_rate=25.0).read_pairs("pairs.txt")
+    assert pairs is not None
+    assert pairs.tolist() == [[0, 6], [1, 7]]

@@ -221,6 +221,8 @@ def test_a_speaker_without_recordings_is_left_out() -> None:
     assert metric.coverage().left_out == 1
     with pytest.raises(ValueError, match="vertices"):
         metric.update(torch.rand(1, 5, 4, 3), [0])
+    with pytest.raises(ValueError, match="1 numbers"):
+        metric.update(known.means[:1, None, :, :1], [0])
     with pytest.raises(ValueError, match="two speakers"):
         fm.SpeakerGallery(known.means[:2], (3, 3))
     with pytest.raises(ValueError, match="finite"):
