@@ -27,7 +27,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ThroughputMonitor
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.trainer.states import RunningStage
 
-from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, logger_versions, run_folder
+from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, job_text, logger_versions, run_folder
 from facediff.errors import FaceDiffError
 from facediff.models.checkpoint import read_checkpoint
 from facediff.registry import checks_arguments
@@ -374,10 +374,10 @@ class DeferredSignals:
 
 
 def note_job(run: Path) -> None:
-    """Note in a run's folder which job of SLURM trained it, which continues the run when SLURM starts it again."""
+    """Note in a run's folder which job of SLURM trained it, which continues it when SLURM starts the job again."""
     # Also after SIGTERM: SLURM itself puts a job that has to make room for another back into the queue.
     with atomic(run / JOB_FILE) as temporary:
-        temporary.write_text(os.environ.get("SLURM_JOB_ID", ""), encoding="utf-8")
+        temporary.write_text(job_text(), encoding="utf-8")
 
 
 def requeue() -> None:

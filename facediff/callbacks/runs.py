@@ -6,6 +6,7 @@ import csv
 import os
 import re
 import secrets
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -142,12 +143,16 @@ def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
         check_training_source(asked)
         return Path(asked)
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
-        job = os.environ.get("SLURM_JOB_ID", "")
-        folder = runs_folder(trainer)
+        job, folder = job_text(), runs_folder(trainer)
         for run in folder.glob("*") if trainer.logger else [folder]:
             if (run / JOB_FILE).is_file() and (run / JOB_FILE).read_text(encoding="utf-8") == job:
                 return run / LAST
     return None
+
+
+def job_text() -> str:
+    """The job of SLURM and the command: a job may train several runs of one name, and begins with the first again."""
+    return f"{os.environ.get('SLURM_JOB_ID', '')}\n{sys.argv[1:]!a}"
 
 
 def share_folder(loggers: Sequence[Logger]) -> None:

@@ -50,6 +50,8 @@ def test_a_job_of_slurm_that_was_stopped_continues_its_run(
     assert find_checkpoint(trainer, None) is None
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     assert find_checkpoint(trainer, None) == last.path(trainer)
+    monkeypatch.setattr("sys.argv", ["facediff", "fit", "--model=another"])  # which the same job ran before
+    assert find_checkpoint(trainer, None) is None
 
 
 @pytest.mark.parametrize(
