@@ -230,16 +230,16 @@ class PredictionWriter(BasePredictionWriter):
         batch_idx: int,
         dataloader_idx: int,
     ) -> None:
-        """Write a batch's clips, each file whole or not at all."""
+        """Write a batch's clips, each file whole or not at all; nothing of a trial with ``fast_dev_run``."""
         clips: list[Prediction] = prediction
-        for clip in clips:
+        for clip in [] if trainer.fast_dev_run else clips:  # type: ignore[attr-defined]
             path = self.folder / f"{clip.name}_condition_{clip.identity}.npy"
             with atomic(path) as temporary:
                 np.save(temporary, clip.vertices.flatten(1).numpy())
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say which training run the files are of, and print where they are."""
-        if trainer.is_global_zero:
+        if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             if isinstance(pl_module, AnimationModel):
                 provenance_of(trainer, pl_module, trainer.datamodule).write_next_to(self.folder)  # type: ignore[attr-defined]
             print(f"written: {self.folder}")

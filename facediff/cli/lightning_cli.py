@@ -26,7 +26,7 @@ import yaml
 from jsonargparse import set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.callbacks import LearningRateMonitor, WeightAveraging
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
@@ -367,6 +367,10 @@ class FaceDiffCLI(LightningCLI):
         bar_in_a_pipe = chosen.get("enable_progress_bar") is None and not on_terminal()
         if bar_in_a_pipe:
             kwargs["enable_progress_bar"] = False
+        part = {"fit": "train", "validate": "val"}.get(str(self.subcommand), self.subcommand)
+        if chosen.get(limit := f"limit_{part}_batches") == 0:
+            wanting = "leaves no batch; give 1 or more, or fast_dev_run for a trial"
+            raise ArgumentError({f"trainer.{limit}": 0}, wanting, located=True)
         with explained({**chosen, **kwargs}):
             trainer = super().instantiate_trainer(**kwargs)
         requeue_on_signal(trainer)
@@ -377,6 +381,8 @@ class FaceDiffCLI(LightningCLI):
             callbacks[:] = [callback for callback in callbacks if not isinstance(callback, WeightAveraging)]
         if self._get(self.config_init, "trainer").get("enable_checkpointing") is False:
             named.add(LastCheckpoint)
+        if not trainer.loggers:  # which bundled configs have it for; Lightning refuses it alone
+            callbacks[:] = [callback for callback in callbacks if not isinstance(callback, LearningRateMonitor)]
         callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # written whole, read by the one door
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()

@@ -31,6 +31,7 @@ QUICK = [
     (["--model.dim=33"], "--model.dim 33"),
     (["--trainer.precision=bf16-true"], "--trainer.precision bf16-true"),
     (["--trainer.enable_checkpointing=false"], "--trainer.enable_checkpointing false"),
+    (["--trainer.limit_train_batches=0"], "--trainer.limit_train_batches 0"),
     (["--trainer.logger.save_dir=/dev/null/x"], "/dev/null/x"),
     (
         ["--trainer.callbacks=facediff.callbacks.SamplingPreview", "--trainer.callbacks.clips=0"],

@@ -142,7 +142,10 @@ def test_test_scores_the_mean_face_of_the_training_clips(
 def test_predictions_are_written_as_the_field_names_them(
     trained: Path, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path
 ) -> None:
-    make_trainer(callbacks=[PredictionWriter(str(tmp_path / "out"))]).predict(load_model(trained), datamodule=tiny)
+    model, writer = load_model(trained), PredictionWriter(str(tmp_path / "out"))
+    make_trainer(callbacks=[writer], fast_dev_run=True).predict(model, datamodule=tiny)
+    assert not (tmp_path / "out").exists()
+    make_trainer(callbacks=[writer]).predict(model, datamodule=tiny)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == [f"{c.name}_condition_{c.identity}.npy" for c in tiny.clips("test_a")]
     clip = tiny.clips("test_a")[0]
