@@ -25,7 +25,7 @@ from facediff.data.batch import UNKNOWN_IDENTITY
 from facediff.data.conversations import channel_regions
 from facediff.data.dataset import MotionDataset
 from facediff.data.speakers import MeanFaces, speaker_gallery
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, counted
 from facediff.metrics import (
     BilabialClosureRate,
     BlinkRate,
@@ -594,7 +594,7 @@ def sampler_of(model: AnimationModel) -> str:
     sampler = getattr(model, "sampler", None)
     if sampler is None:
         return type(model).__name__
-    description = f"{type(sampler).__name__} with {sampler.steps} steps"
+    description = f"{type(sampler).__name__} with {counted(sampler.steps, 'step')}"
     own = model.expressivity
     if isinstance(own, Tensor):
         return f"{description}, expressivity by vertex"
