@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import collate
+from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.decoders import Decoder
 from facediff.models.dual_path.network import Conditions
@@ -129,3 +130,16 @@ def test_training_works_after_inference_mode(make_model: Make, tiny: Tiny) -> No
             parameter.add_(0.5)
     with torch.inference_mode():
         assert not torch.allclose(model.generate(batch), before)
+
+
+@pytest.mark.parametrize("part", ["audio_encoder", "style_encoder", "fusion", "decoder"])
+def test_a_component_that_gives_another_shape_is_named(part: str, make_model: Make, tiny: Tiny) -> None:
+    """In training and inference."""
+    model = make_model()
+    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    component = getattr(model.network, part)
+    component.register_forward_hook(lambda *values: values[-1][..., 1:])
+    batch = collate([tiny.dataset("val")[0]])
+    for use in (model.losses, model.generate):
+        with pytest.raises(FaceDiffError, match=rf"^{type(component).__name__}: .*shape .*{DIM}"):
+            use(batch)

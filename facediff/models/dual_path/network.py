@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
+from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.decoders import Decoder
 from facediff.models.folding import (
@@ -222,6 +223,7 @@ class DualPathNetwork(nn.Module):
         """
         cached = batch.cached_features or ()
         audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
+        check_shape(self.audio_encoder, audio, *batch.motion.shape[:2], *self.fused_norm.normalized_shape)
         mask = frame_mask(batch.frame_lengths, audio.shape[1])
         encoded = dynamic_style = self.heard_style(style, audio[:, animated], mask[:, animated])
         if self.training and self.speech_style is not None:
@@ -251,7 +253,9 @@ class DualPathNetwork(nn.Module):
         """F_dyn of scaled reference motion, or of its components (eq. 2 to 9); of width 0 without a dynamic style."""
         if self.mesh_encoder is None:
             return reference.new_zeros((len(reference), 0))
-        return self.style_encoder(self.mesh_encoder(reference), mask)
+        style = self.style_encoder(self.mesh_encoder(reference), mask)
+        check_shape(self.style_encoder, style, reference.shape[0], sum(self.style_encoder.token_dims))
+        return style
 
     def forward(
         self,
@@ -277,12 +281,15 @@ class DualPathNetwork(nn.Module):
             [] if prepared is None else [prepared] for prepared in (conditions.fusion, conditions.decoder)
         )
         fused = self.fusion(conditions.audio, motion, conditions.mask, *fusion)  # eq. 12
+        check_shape(self.fusion, fused, *motion.shape)
         table = conditions.step_table
         embedded = self.step_embedding(step) if table is None else table[step]
         fused = self.fused_norm(fused + embedded[:, None])  # eq. 13
         # The step enters next to the speech and the noisy motion and not through the style tokens: those stay constant
         # over the steps, so that their keys and values are computed once.
-        return self.decoder(fused, conditions.style, conditions.mask, *decoder)
+        decoded = self.decoder(fused, conditions.style, conditions.mask, *decoder)
+        check_shape(self.decoder, decoded, *motion.shape)
+        return decoded
 
     def clean_motion(self, features: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames coordinates"]:
         """The last map, from F_dec to clean scaled motion."""
@@ -334,6 +341,12 @@ class DualPathNetwork(nn.Module):
             own = mask if len(ready.shares) == 1 else mask.chunk(len(ready.shares))[0]  # guided views repeat the rows
             return PreconditionedDenoiser(self, ready, preconditioning, own, blend, ready.shares)
         return ConditionalDenoiser(self, ready, product, blend, ready.shares)
+
+
+def check_shape(part: nn.Module, result: Tensor, *expected: int) -> None:
+    """Name a component, perhaps of a user's own, whose result would end in an error elsewhere."""
+    if not exporting() and result.shape != expected:
+        raise FaceDiffError(f"{type(part).__name__}: gives the shape {tuple(result.shape)}; expected {expected}")
 
 
 class StyleTokens(nn.Module):
