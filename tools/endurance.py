@@ -173,6 +173,8 @@ def main() -> int:
     args = parser.parse_args()
     args.output = args.output.resolve()
     args.output.mkdir(parents=True, exist_ok=True)
+    # A shell that starts this in the background has it, and all that it starts, ignore Ctrl-C, by which they are ended.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     begun = time.time()
     rows: list[tuple[float, ...]] = []
     with KINDS[args.kind](args, begun + 3600 * args.hours) as (process, report):
@@ -182,14 +184,14 @@ def main() -> int:
             if process.poll() is None:
                 rows.append(((time.time() - begun) / 60, *measure(watched)))
         early = process.poll() is not None
+        with open(args.output / f"{args.kind}.csv", "w", newline="") as table:
+            csv.writer(table).writerows([COLUMNS, *([f"{value:.1f}" for value in row] for row in rows)])
         if not early:
             process.send_signal(signal.SIGINT)
         status = process.wait(timeout=600)
         lines = report()
     if not rows:
         sys.exit("\n".join([f"{args.kind}: ended with status {status} before the first figures", *lines]))
-    with open(args.output / f"{args.kind}.csv", "w", newline="") as table:
-        csv.writer(table).writerows([COLUMNS, *([f"{value:.1f}" for value in row] for row in rows)])
     tenth = max(1, len(rows) // 10)
     parts = {"second tenth": rows[tenth : 2 * tenth], "last tenth": rows[-tenth:]}
     medians = {name: [statistics.median(values) for values in zip(*part, strict=True)] for name, part in parts.items()}
