@@ -223,7 +223,7 @@ def test_the_command_serves_until_ctrl_c_and_continues(tmp_path: Path) -> None:
             process.send_signal(signal.SIGINT)
             out, err = process.communicate(timeout=60)
         assert (process.returncode, err) == (0, "")
-        assert f"{number + 1} raters" in out
+        assert f"study: {('1 rater', '2 raters')[number]}, " in out
 
 
 def environment() -> dict[str, str]:
