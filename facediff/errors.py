@@ -43,6 +43,18 @@ def choices(name: str, candidates: Iterable[str]) -> str:
     return f"{hint}known are {', '.join(names)}"
 
 
+def lacking(cls: object) -> str:
+    """What is wrong with a class that leaves abstract methods undefined; empty if it leaves none.
+
+    Example:
+        >>> from collections.abc import Sized
+        >>> lacking(Sized), lacking(list)
+        ('the class lacks __len__; define what it lacks', '')
+    """
+    names = sorted(getattr(cls, "__abstractmethods__", ()))
+    return f"the class lacks {', '.join(names)}; define what it lacks" if names else ""
+
+
 def printable(text: object) -> str:
     r"""Text for a terminal: names of files may hold anything, so that what does not print is escaped.
 

@@ -40,7 +40,7 @@ from facediff.callbacks.runs import continue_run, find_checkpoint, find_scored, 
 from facediff.cli.configs import PARTS, guard_configs
 from facediff.cli.trainer_options import IDLE_WARNINGS, explained, raised_in, sentence_of, without_warnings
 from facediff.data import SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
+from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices, lacking
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
 from facediff.spaces import Space
@@ -230,9 +230,8 @@ def explain(message: str) -> str:
         return f"{' and '.join(missing)} must be given, as an option or in a file with --config; {see}"
     if match := re.search(r"Expected a path but (\S+) either not accessible or invalid", message):
         module, _, name = match[1].rpartition(".")
-        lacking = ", ".join(sorted(getattr(getattr(sys.modules.get(module), name, None), "__abstractmethods__", ())))
-        if lacking:
-            return f"--{option} {match[1]}: the class lacks {lacking}; define what it lacks"
+        if fault := lacking(getattr(sys.modules.get(module), name, None)):
+            return f"--{option} {match[1]}: {fault}"
         if extended := re.search(r"(?:to a subclass of |be a subclass of <class ')(\w+)", message):
             return f"--{option} {match[1]}: no class that extends {extended[1]}, which it has to"
         return f"--{option} {match[1]}: no file, no name that `facediff components` lists, and no class of this kind"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin,
 from facediff.data.check.report import CheckReport, Findings, few
 from facediff.data.manifest import load_manifest
 from facediff.data.storage import WEIGHTS_FOLDER, rig_path
-from facediff.errors import FaceDiffError, choices, number
+from facediff.errors import FaceDiffError, choices, lacking, number
 from facediff.utils.arrays import open_array, vertices_of
 
 if TYPE_CHECKING:
@@ -300,9 +300,8 @@ def _import(path: str, option: str) -> Module:
         raise FaceDiffError(f"{option} {path}: cannot be imported ({error}); expected package.module.Class") from error
     if not (isinstance(module, type) and issubclass(module, SpeechMotionDataModule)):
         raise FaceDiffError(f"{option} {path}: is no data module; expected a subclass of SpeechMotionDataModule")
-    if inspect.isabstract(module):
-        lacking = ", ".join(sorted(module.__abstractmethods__))
-        raise FaceDiffError(f"{option} {path}: the class lacks {lacking}; define what it lacks")
+    if fault := lacking(module):
+        raise FaceDiffError(f"{option} {path}: {fault}")
     return module
 
 
