@@ -231,8 +231,10 @@ class PredictionWriter(BasePredictionWriter):
         dataloader_idx: int,
     ) -> None:
         """Write a batch's clips, each file whole or not at all; nothing of a trial with ``fast_dev_run``."""
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
         clips: list[Prediction] = prediction
-        for clip in [] if trainer.fast_dev_run else clips:  # type: ignore[attr-defined]
+        for clip in clips:
             path = self.folder / f"{clip.name}_condition_{clip.identity}.npy"
             with atomic(path) as temporary:
                 np.save(temporary, clip.vertices.flatten(1).numpy())

@@ -175,12 +175,12 @@ class Side {
     };
     const { positions } = this.face;
     for (let i = 0; i < positions.length; i += 3) turn(positions.subarray(i, i + 3));
-    const way = (v) => sub(turn(v.map((part, k) => part + centre[k])), centre);
+    const away = (v) => sub(turn(v.map((part, k) => part + centre[k])), centre);
     const [x, y, z, offset] = this.facts.plane;
-    const origin = turn([x * offset, y * offset, z * offset]), normal = way([x, y, z]);
+    const origin = turn([x * offset, y * offset, z * offset]), normal = away([x, y, z]);
     this.facts.plane = [...normal, dot(normal, origin)];
     this.facts.centre = turn([...this.facts.centre]);
-    this.halves = this.halves.map(way);
+    this.halves = this.halves.map(away);
     this.facts.extent = [0, 1, 2].map((k) => this.halves.reduce((sum, half) => sum + Math.abs(half[k]), 0));
     for (let k = 0; k < 3; k++) extent[k] = 0;
     for (let i = 0; i < positions.length; i++) extent[i % 3] = Math.max(extent[i % 3], Math.abs(positions[i] - centre[i % 3]));
