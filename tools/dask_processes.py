@@ -74,7 +74,7 @@ class DaskProcesses:
 
     def start_worker(self) -> subprocess.Popen[bytes]:
         """Start a worker, and wait until the scheduler has it."""
-        program = self.start("worker", self.address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+        program = self.start("worker", self.address, "--nthreads", "1", "--no-dashboard")
         log = self.folder / f"log{len(self.programs) - 1}.txt"
         end = time.monotonic() + SECONDS
         while b"Registered to" not in log.read_bytes():

@@ -33,10 +33,6 @@ def check_scheduler(scheduler: str | None) -> str:
     Args:
         scheduler: as ``--scheduler`` takes it; if None, what the environment variable :data:`ADDRESS` says.
 
-    Raises:
-        FaceDiffError: if it is none of these.
-        MissingExtraError: if it is a cluster and Dask is not installed.
-
     Example:
         >>> check_scheduler("threads")
         'threads'
@@ -64,11 +60,7 @@ def check_scheduler(scheduler: str | None) -> str:
 
 
 def is_cluster(scheduler: str | None) -> bool:
-    """Whether tasks run on a cluster rather than on this machine.
-
-    Raises:
-        FaceDiffError: as :func:`check_scheduler`.
-    """
+    """Whether tasks run on a cluster rather than on this machine."""
     return scheduler != "" and check_scheduler(scheduler) not in ("", *LOCAL)
 
 
@@ -95,11 +87,7 @@ class PerWorker(Generic[Task, Result]):
         return type(self), (self.setup,)
 
     def __call__(self, task: Task) -> Result:
-        """Do a task.
-
-        Raises:
-            SetupError: if the set-up failed in a way that the user can put right.
-        """
+        """Do a task."""
         work = getattr(self._here, "work", None)
         if work is None:
             try:
@@ -150,8 +138,8 @@ def run_tasks(
 
     No worker gets a task before it is free for it, and at most one result for each worker waits to be taken, so memory
     is bounded and a stop waits only for what is running. Wrap the generator in :func:`contextlib.closing`, so that it
-    stops with the loop that takes the results: what is running then has some seconds to come to its end before it is
-    stopped, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
+    stops with the loop that takes the results: what is running then has some seconds to come to its end before its
+    process is ended, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
 
     Args:
         work: does a task. For processes and clusters: a picklable function or object, which each worker gets once and
@@ -175,7 +163,6 @@ def run_tasks(
 
     Raises:
         Exception: the first one that ``work`` raises; tasks that have not been begun are dropped.
-        FaceDiffError: if the cluster cannot be used, or is lost.
 
     Example:
         >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
@@ -199,9 +186,6 @@ def in_order(
     results: Iterable[tuple[Task, Result | WorkerDied]], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result]]:
     """Results in the order of the tasks, for sums whose last digit depends on it; tasks are hashable and different.
-
-    Raises:
-        FaceDiffError: if a task killed its worker.
 
     Example:
         >>> list(in_order([("b", 2), ("a", 1)], ["a", "b"]))

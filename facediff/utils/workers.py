@@ -1,12 +1,10 @@
 """Worker processes and threads of this machine: how they start, do tasks one by one, and end.
 
-:func:`facediff.utils.jobs.run_tasks` is what the rest of the package calls; a worker of a cluster starts its process
-here too (:mod:`facediff.utils.cluster`).
+:func:`facediff.utils.jobs.run_tasks` is what the rest of the package calls.
 """
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -17,7 +15,6 @@ from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for_end
 from typing import Any, Literal, TypeVar
@@ -51,7 +48,7 @@ def run_locally(
     """Do tasks on this machine, for :func:`facediff.utils.jobs.run_tasks`."""
     if mode == "threads" and tasks:
         with one_thread_each():
-            yield from _together(ThreadPoolExecutor(workers), partial(_in_thread, work), deque(tasks), workers, deque())
+            yield from _together(ThreadPoolExecutor(workers), work, deque(tasks), workers, deque())
     elif mode == "serial" or workers <= 1 or not _can_start():
         for task in tasks:
             yield task, work(task)
@@ -105,35 +102,20 @@ def _raise_first_error(running: Collection[Future[Any]], done: Collection[Future
                     earlier.result()
 
 
-_busy: set[int] = set()  # threads that are doing a task
-
-
-def _in_thread(work: Callable[[Task], Result], task: Task) -> Result:
-    me = threading.get_ident()
-    _busy.add(me)
-    try:
-        return work(task)
-    finally:
-        _busy.discard(me)
-
-
-def end_soon(pool: Executor, running: Collection[Future[Any]], grace: float = GRACE) -> None:
-    """Let what is running come to its end for some seconds, then end the workers; Ctrl-C again ends them."""
-    workers = list((getattr(pool, "_processes", None) or {}).values())
-    threads = {thread.ident for thread in getattr(pool, "_threads", ())}
+def end_soon(pool: Executor, running: Collection[Future[Any]]) -> None:
+    """Let what is running come to its end for some seconds, then end the processes; Ctrl-C again ends them."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     try:
-        wait(running, grace)
+        wait(running, GRACE)
     finally:
         if any(not future.done() for future in running):
-            for worker in workers:
-                worker.terminate()  # what it has begun to write is removed
-            for thread in threads & _busy:  # nothing else ends a thread; it goes on until its next line of Python
-                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(SystemExit))
+            for process in processes:
+                process.terminate()  # what it has begun to write is removed
             wait(running, GRACE)
-        for worker in workers:
+        for process in processes:
             if any(not future.done() for future in running):
-                worker.kill()
+                process.kill()
 
 
 # Worker processes.
