@@ -71,7 +71,6 @@ IN_CONFIGS: dict[str, Any] = {
     f"{MODEL}.style_guidance": 1.0,
     f"{MODEL}.expressivity": 1.0,
     f"{MODEL}.style_identity_weight": 0.0,
-    f"{MODEL}.style_contrast_weight": 0.0,
     f"{MODEL}.fusion.init_args.rotary": False,
     f"{MODEL}.decoder.init_args.final_norm": False,
     # Where it is silent: as in the code that it builds on (FaceDiffuser), or whole clips.

@@ -95,6 +95,8 @@ def guard_configs(mode: str) -> None:
     from jsonargparse import set_loader
     from jsonargparse._optionals import get_omegaconf_loader
 
+    from facediff.models.earlier_versions import without_removed_options
+
     read = get_omegaconf_loader(mode)  # type: ignore[no-untyped-call]
 
     def load(text: str) -> Any:  # noqa: ANN401
@@ -105,6 +107,6 @@ def guard_configs(mode: str) -> None:
                 if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries what else it may be
                     raise error.__cause__ from error
                 raise
-        return with_bundled(read(text))
+        return without_removed_options(with_bundled(read(text)), "--config")
 
     set_loader(mode, load, exceptions=(yaml.YAMLError,))

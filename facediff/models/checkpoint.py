@@ -42,6 +42,7 @@ from facediff.data import SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
 from facediff.errors import FaceDiffError, choices
 from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
+from facediff.models.earlier_versions import without_removed_options
 from facediff.models.pretrained import read_model
 from facediff.registry import COMPONENTS, corpus, find_class, model
 from facediff.spaces import Space
@@ -201,19 +202,13 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
 
 @contextmanager
 def checked_file(path: str | os.PathLike[str] | IO[bytes]) -> Iterator[IO[bytes]]:
-    """An open checkpoint at its beginning, after all checks, for Lightning, which must read it itself."""
-    if isinstance(path, str | os.PathLike) and (split_face(path)[1] is not None or model_path(path).is_dir()):
-        content = read_checkpoint(path)
-        build_model(str(path), content)
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        buffer.seek(0)
-        yield buffer
-        return
-    with open_checkpoint(path) as (stream, name):
-        build_model(name, read_checkpoint(stream))
-        stream.seek(0)
-        yield stream
+    """A checkpoint after all checks, as a stream, for Lightning, which must read it itself."""
+    content = read_checkpoint(path)
+    build_model(str(path), content)
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    buffer.seek(0)
+    yield buffer
 
 
 @contextmanager
@@ -276,7 +271,7 @@ def read_file(stream: IO[bytes], path: Path | str) -> dict[str, Any]:
 
 
 def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
-    """Refuse a content that has not the outer form of a checkpoint of facediff's.
+    """Refuse a content that has not the outer form of a checkpoint of facediff's, and drop options of 1.x in place.
 
     Raises:
         FaceDiffError: naming the file and the part.
@@ -306,6 +301,7 @@ def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - what
     for name, value in checkpoint["state_dict"].items():
         if not isinstance(value, torch.Tensor):
             raise FaceDiffError(f"{path}: its weight {quoted(name)} is {quoted(value)}; expected a tensor")
+    checkpoint["hyper_parameters"] = without_removed_options(checkpoint["hyper_parameters"], path)
 
 
 def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:

@@ -32,7 +32,7 @@ class InventedSpeakers(nn.Module):
         deviation: standard deviation of the logarithm of the gain on all motion; the components' is half of it.
     """
 
-    def __init__(self, n_vertices: int, dims: int, share: float, deviation: float) -> None:
+    def __init__(self, n_vertices: int, dims: int, share: float, deviation: float = 0.1) -> None:
         super().__init__()
         self.share = share
         self.deviation = deviation

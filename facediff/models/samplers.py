@@ -118,8 +118,6 @@ class NoiseProcess:
         batch: int,
         device: torch.device,
         generator: torch.Generator | None = None,
-        *,
-        min_snr: float | None = None,
         weights: Float[Tensor, " steps"] | None = None,
     ) -> Int[Tensor, " batch"]:
         """Random step numbers (algorithm 1, line 3).
@@ -128,20 +126,11 @@ class NoiseProcess:
             batch: how many.
             device: where they are drawn.
             generator: random numbers.
-            min_snr: γ, with which steps are drawn in proportion to min(SNR, γ): in expectation, that weights their
-                losses as min-SNR-γ does for a network that predicts clean motion (Hang et al. 2023). None draws them
-                uniformly.
-            weights: probabilities of the steps, such as those of :meth:`even_in_log_snr`, instead.
+            weights: probabilities of the steps, such as those of :meth:`even_in_log_snr`; all alike if None.
         """
         if weights is not None:
             return torch.multinomial(weights.to(device), batch, replacement=True, generator=generator)
-        if min_snr is None:
-            return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
-        # Drawing in proportion to the weight replaces multiplying the loss by it: the expectation is the same, and no
-        # part of a batch is spent on steps that would hardly count.
-        signal = self.signal.to(device)
-        weights = (signal / (1 - signal)).clamp_max(min_snr)
-        return torch.multinomial(weights, batch, replacement=True, generator=generator)
+        return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
 
     def even_in_log_snr(self, hidden: Float[Tensor, " steps"]) -> Float[Tensor, " steps"]:
         """Probabilities of the steps that spread a training over the levels of noise at which motion is decided.

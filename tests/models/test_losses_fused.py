@@ -44,25 +44,6 @@ def test_losses_are_those_of_added_and_removed_noise(model: DualPathDiffusion, t
             torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
 
 
-def test_the_face_terms_share_does_not_depend_on_the_scale_if_its_weight_is_for_the_corpus(
-    make_model: Make, tiny: Tiny
-) -> None:
-    shares = []
-    for scale in (1.0, 7.0):
-        model = make_model(face_weight=0.3, face_weight_unit="corpus").eval()
-        model.adopt(tiny.assets().with_motion_scale(scale))
-        torch.nn.init.zeros_(model.network.unembed.weight)  # predicts no motion at all, whatever it sees
-        torch.nn.init.zeros_(model.network.unembed.bias)
-        batch = collate([tiny.dataset("train")[0]])
-        batch.motion.mul_(1e-3)  # where Huber's loss is quadratic
-        terms = model.losses_at(batch, torch.tensor([3]), torch.zeros(1, batch.motion.shape[1], 72))
-        velocity, acceleration = (0.003 * terms[name] for name in ("velocity", "acceleration"))
-        face = terms["loss"] - terms["reconstruction"] - velocity - acceleration
-        shares.append(float(face.detach() / terms["reconstruction"].detach()))
-        torch.testing.assert_close(face, 0.3 * scale * terms["face"], rtol=1e-4, atol=0)
-    assert shares[0] == pytest.approx(shares[1], rel=1e-3)
-
-
 @pytest.mark.parametrize("space", ["vertices", "components"])
 def test_losses_of_several_draws_are_the_mean_of_each(
     space: str, make_model: Make, make_trainer: Callable[..., pl.Trainer], tiny: Tiny
@@ -96,11 +77,6 @@ def test_a_training_step_noises_each_clip_as_often_as_asked(model: DualPathDiffu
     model.losses(collate([dataset[i] for i in range(6)]))
     assert len(seen) == 18
     assert len(set(seen)) > 6  # each draw has a step of its own
-    seen.clear()
-    model.min_snr = 1e-3  # so small that only the noisiest steps count less
-    model.process.signal[1:] = 0.0  # and of these, there is nothing to see
-    model.losses(collate([dataset[i] for i in range(6)]))
-    assert set(seen) == {0}
 
 
 def test_losses_of_a_batch_are_those_of_its_clips(model: DualPathDiffusion, tiny: Tiny) -> None:

@@ -91,15 +91,12 @@ def test_add_noise_takes_each_clips_own_step() -> None:
         torch.testing.assert_close(together[i], kept.sqrt() * clean[i] + (1 - kept).sqrt() * noise[i])
 
 
-def test_min_snr_draws_steps_in_proportion_to_their_weight() -> None:
+def test_steps_are_drawn_in_proportion_to_their_weights() -> None:
+    process, weights = NoiseProcess(10), torch.arange(1.0, 11.0)
     torch.manual_seed(0)
-    process = NoiseProcess(10)
-    snr = process.signal / (1 - process.signal)
-    assert snr[0] > 5 > snr[-1]
-    expected = torch.where(snr < 5, snr, torch.full_like(snr, 5.0))
-    counts = torch.bincount(process.draw_steps(40_000, torch.device("cpu"), min_snr=5.0), minlength=10)
-    torch.testing.assert_close(counts / 40_000, expected / expected.sum(), atol=0.01, rtol=0)
-    for how in ({"min_snr": 5.0}, {"weights": torch.arange(1.0, 11.0)}, {}):
+    counts = torch.bincount(process.draw_steps(40_000, torch.device("cpu"), weights=weights), minlength=10)
+    torch.testing.assert_close(counts / 40_000, weights / 55, atol=0.01, rtol=0)
+    for how in ({"weights": weights}, {}):
         drawn = [process.draw_steps(9, torch.device("cpu"), torch.Generator().manual_seed(3), **how) for _ in range(2)]
         assert torch.equal(*drawn), how
 

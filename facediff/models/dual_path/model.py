@@ -41,7 +41,7 @@ from facediff.models.graphs import Graphs
 from facediff.models.inference import ClipNoise, Expressivity, Progress, Style, WindowNoise, WindowOverlap
 from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.layers import Share, Weight, Width
-from facediff.models.losses import preconditioned_losses, style_contrast, style_identity_loss
+from facediff.models.losses import preconditioned_losses, style_identity_loss
 from facediff.models.losses_fused import fused_losses
 from facediff.models.mesh_encoders import ComponentMeshEncoder, LinearMeshEncoder, MeshEncoderFactory
 from facediff.models.motion_space import ComponentMotion, MotionSpaceFactory, Preconditioning, Projection, VertexMotion
@@ -105,8 +105,6 @@ class DualPathDiffusion(AnimationModel):
         noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
         noise_draws: how often a clip is noised in a training step, each time to another step with other noise; speech
             and style are encoded once for all of them.
-        min_snr: γ of min-SNR weighting: steps are drawn in proportion to min(SNR, γ), which leaves out the noisiest, in
-            which a sampler begins; uniformly if None.
         timestep_sampling: draw training steps ``uniform``, as in the paper, or by ``log_snr``: mostly evenly over the
             logarithm of the signal-to-noise ratio, where noise hides part of the motion. For a motion space with a
             preconditioned network.
@@ -118,7 +116,6 @@ class DualPathDiffusion(AnimationModel):
         identity_dropout: share of training clips whose identity is hidden, so that unseen speakers can be animated.
         invented_speakers: share of training clips whose motion and style reference are multiplied by the same random
             gains under a hidden identity, so that the style path learns more speakers than the corpus has.
-        invented_gain: standard deviation of the logarithm of these gains.
         style_dropout: share of training clips whose dynamic style is hidden, so that the style can guide, and is taken
             from the speech where none is given.
         style_from_speech: learn what speech says of the style, by a regression beside the training that changes
@@ -134,13 +131,8 @@ class DualPathDiffusion(AnimationModel):
         velocity_weight: λ_vel.
         acceleration_weight: λ_acc.
         face_weight: λ_face.
-        face_weight_unit: ``scaled`` takes it for the scaled motion that the network sees; ``corpus`` for motion in the
-            corpus's unit. L_face is linear in the motion and the other terms are quadratic, so that the scale divides
-            the share of L_face; ``corpus`` gives it back.
         style_identity_weight: of telling the training identity from the dynamic style, by a linear map that is used in
             training only; lets the style hold the person in addition to the mood.
-        style_contrast_weight: of pulling the dynamic styles of an identity's clips together, whatever their mood, and
-            those of different identities apart.
         options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
 
@@ -164,14 +156,12 @@ class DualPathDiffusion(AnimationModel):
         diffusion_steps: Annotated[int, Range(1, 100_000)] = 1000,
         noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2",
         noise_draws: Annotated[int, Range(1, 64)] = 1,
-        min_snr: Annotated[float, Range(1e-3, 1e6)] | None = None,
         timestep_sampling: TimestepSampling = "uniform",
         noise_scale: NoiseScale = 1.0,
         style_tokens: TokenForm = "levels",
         template_token: bool = False,
         identity_dropout: Share = 0.1,
         invented_speakers: Share = 0.0,
-        invented_gain: Annotated[float, Range(0, 1)] = 0.1,
         style_dropout: Share = 0.0,
         style_from_speech: bool = False,
         speech_dropout: Share = 0.0,
@@ -182,17 +172,13 @@ class DualPathDiffusion(AnimationModel):
         velocity_weight: Weight = 0.003,
         acceleration_weight: Weight = 0.003,
         face_weight: Weight = 0.0005,
-        face_weight_unit: Literal["scaled", "corpus"] = "scaled",
         style_identity_weight: Weight = 0.0,
-        style_contrast_weight: Weight = 0.0,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
         self.identity_dropout = identity_dropout
         self.invented_speakers = (
-            InventedSpeakers(self.n_vertices, self.dims, invented_speakers, invented_gain)
-            if invented_speakers
-            else None
+            InventedSpeakers(self.n_vertices, self.dims, invented_speakers) if invented_speakers else None
         )
         self.style_dropout = style_dropout
         self.speech_dropout = speech_dropout
@@ -203,12 +189,10 @@ class DualPathDiffusion(AnimationModel):
             "acceleration": acceleration_weight,
             "face": face_weight,
         }
-        self.face_weight_unit = face_weight_unit
         self.noise_draws = noise_draws
-        self.min_snr = min_snr
         self.timestep_sampling = timestep_sampling
         self._step_weights: Tensor | None = None  # follow from the motion space, known when training begins
-        self.style_weights = {"style_identity": style_identity_weight, "style_contrast": style_contrast_weight}
+        self.style_identity_weight = style_identity_weight
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
         # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
@@ -218,10 +202,9 @@ class DualPathDiffusion(AnimationModel):
         self._usual_steps = self.sampler.steps
         self.sampling_space: SamplingSpace = sampling_space
         self.motion_space = motion_space(n_vertices=self.n_vertices, dims=self.dims, steps=diffusion_steps)
-        if timestep_sampling == "log_snr" and (self.motion_space.preconditioning is None or min_snr is not None):
+        if timestep_sampling == "log_snr" and self.motion_space.preconditioning is None:
             raise ArgumentError(
-                {"timestep_sampling": timestep_sampling},
-                "needs motion_space=components, which knows what noise hides, and no min_snr",
+                {"timestep_sampling": timestep_sampling}, "needs motion_space=components, which knows what noise hides"
             )
         style = style_encoder(dim=dim)
         self.network = DualPathNetwork(
@@ -243,11 +226,10 @@ class DualPathDiffusion(AnimationModel):
             style_may_hide=style_dropout > 0,
             speech_style=SpeechStyle(dim, sum(style.token_dims), len(self.identities)) if style_from_speech else None,
         )
-        weights = {f"{name}_weight": weight for name, weight in self.style_weights.items()}
-        needing = {name: value for name, value in {"style_from_speech": style_from_speech, **weights}.items() if value}
-        if needing and not style.token_dims:
+        if (style_from_speech or style_identity_weight) and not style.token_dims:
             raise ArgumentError(
-                needing, "there is no dynamic style; choose a style_encoder, or leave out what needs one (false, 0)"
+                {"style_from_speech": style_from_speech, "style_identity_weight": style_identity_weight},
+                "there is no dynamic style; choose a style_encoder, or leave out what needs one (false, 0)",
             )
         self.style_identity = nn.Linear(sum(style.token_dims), len(self.identities)) if style_identity_weight else None
         self.guidance = dict.fromkeys(CONDITIONS, 1.0)
@@ -463,7 +445,7 @@ class DualPathDiffusion(AnimationModel):
             weights = self.process.even_in_log_snr(space.hidden().cpu()).to(device)
             # Not from validation: weight averages are swapped in there, whose tables may not be known yet.
             self._step_weights = weights if self.training else None
-        step = self.process.draw_steps(count, device, generator, min_snr=self.min_snr, weights=weights)
+        step = self.process.draw_steps(count, device, generator, weights=weights)
         shape = (count, batch.motion.shape[1], self.motion_space.coordinates)
         return self.losses_at(batch, step, unit_noise(shape, device, generator))
 
@@ -492,7 +474,11 @@ class DualPathDiffusion(AnimationModel):
             losses = self._preconditioned_losses(drawn, motion, mask, step, noise, space.preconditioning)
         else:
             losses = self._vertex_losses(drawn, motion, mask, step, noise)
-        return self._with_style_losses(losses, batch, conditions)
+        if self.style_identity is not None and conditions.dynamic is not None:
+            # It looks at F_dyn alone: no denoising step takes part, so it costs one pass of the style encoder.
+            term = style_identity_loss(self.style_identity(conditions.dynamic), batch.identity)
+            losses |= {"style_identity": term, "loss": losses["loss"] + self.style_identity_weight * term}
+        return losses
 
     def _vertex_losses(
         self,
@@ -504,9 +490,6 @@ class DualPathDiffusion(AnimationModel):
     ) -> dict[str, Tensor]:
         """The losses on the vertices."""
         network = self.network
-        # L_face is linear in the motion, the reconstruction quadratic while errors are below Huber's δ. Scaling motion
-        # by s divides the share of L_face by s, which is 100 to 200 on BIWI; ``corpus`` undoes that.
-        face = self.loss_weights["face"] * (self.scale if self.face_weight_unit == "corpus" else 1.0)
         # √ᾱ M⁰ + √(1 − ᾱ) ε, as NoiseProcess.add_noise, but in place: on a processor, allocating tensors of this size
         # takes longer than the arithmetic.
         signal = self.process.signal.to(noise.device)[step][:, None, None]
@@ -524,7 +507,7 @@ class DualPathDiffusion(AnimationModel):
             self.weighed(motion),
             mask,
             self.assets.regions["upper_face"],
-            {**self.loss_weights, "face": face},
+            self.loss_weights,
             scale=self.scale,
         )
 
@@ -544,24 +527,6 @@ class DualPathDiffusion(AnimationModel):
         features = self.network.clean_motion(self.network.core(embedded, step, conditions))
         predicted = scales.clean(mean, features, step, mask)
         return preconditioned_losses(predicted, clean, mask, scales.loss[step], self.loss_weights)
-
-    def _with_style_losses(self, losses: dict[str, Tensor], batch: Batch, conditions: Conditions) -> dict[str, Tensor]:
-        """The terms of the dynamic style, where they are asked for, and the sum with them."""
-        weights, style = self.style_weights, conditions.dynamic
-        assert style is not None  # noqa: S101 - for the type checker
-        # The terms look at F_dyn alone: no denoising step takes part, so they cost one pass of the style encoder.
-        terms: dict[str, Tensor] = {}
-        if self.style_identity is not None:
-            terms["style_identity"] = style_identity_loss(self.style_identity(style), batch.identity)
-        if weights["style_contrast"]:
-            # The reference and the target are clips of one speaker, which makes a positive pair of every clip, also
-            # in a batch of one speaker each.
-            own = self.network.dynamic_style(self._scaled(batch.motion), batch.mask)
-            terms["style_contrast"] = style_contrast(torch.cat([style, own]), batch.identity_names * 2)
-        loss = losses["loss"]
-        for name, term in terms.items():
-            loss = loss + weights[name] * term
-        return {**losses, **terms, "loss": loss}
 
     def conditions(self, batch: Batch, *, guided: bool = False, animated: slice = slice(None)) -> Conditions:
         """Everything that is computed once per clip; in training, conditions are hidden now and then.

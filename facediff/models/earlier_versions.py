@@ -1,0 +1,76 @@
+"""Options that models and components had in 1.x and have no more, for checkpoints and configs that still state them.
+
+An option that went had one value in practice. A file that states this value means what the present version does, and
+the option is dropped; another value asks for something that is gone, and is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from facediff.errors import FaceDiffError
+
+REMOVED: dict[str, dict[str, Any]] = {
+    "facediff.models.dual_path.model.DualPathDiffusion": {
+        "min_snr": None,
+        "invented_gain": 0.1,
+        "face_weight_unit": "scaled",
+        "style_contrast_weight": 0.0,
+    },
+}
+"""By class path, the removed options and the value that each has for good, as plain data of a checkpoint."""
+
+SHORT_NAMES: dict[str, str] = {}
+"""Registered names of components of :data:`REMOVED`, by which configs and checkpoints name them, and their classes."""
+
+
+def without_removed_options(content: Any, source: object) -> Any:  # noqa: ANN401 - a tree of plain data
+    """Hyperparameters, or a config, without removed options, in every model and component that is described in them.
+
+    Args:
+        content: plain data; classes stand in it as ``class_path`` with ``init_args``, that of a checkpoint's model as
+            ``_class_path`` next to its options.
+        source: the file, for messages.
+
+    Returns:
+        a copy, in which nothing else has changed.
+
+    Raises:
+        FaceDiffError: if an option has another value than the one that is left.
+    """
+    if isinstance(content, list):
+        return [without_removed_options(item, source) for item in content]
+    if not isinstance(content, dict):
+        return content
+    tree = {key: without_removed_options(value, source) for key, value in content.items()}
+    if "_class_path" in tree:
+        tree = _present(tree["_class_path"], tree, source)
+    if isinstance(tree.get("init_args"), dict):
+        tree["init_args"] = _present(tree.get("class_path"), tree["init_args"], source)
+    return tree
+
+
+def _present(class_path: object, options: Mapping[str, Any], source: object) -> dict[str, Any]:
+    """The options of a class that it still has."""
+    removed = _removed_of(class_path)
+    for name in removed.keys() & options.keys():
+        if _plain(options[name]) != removed[name]:
+            raise FaceDiffError(
+                f"{source}: {name}={options[name]} of {class_path} is an option of facediff 1.1 that is gone (it is "
+                f"{removed[name]} now); use facediff 1.1 for this file, or train the model again without the option"
+            )
+    return {name: value for name, value in options.items() if name not in removed}
+
+
+def _removed_of(class_path: object) -> dict[str, Any]:
+    """The removed options of a class, which may stand by its path, by a shorter path of facediff's, or by its name."""
+    module, _, name = str(class_path).rpartition(".")
+    if module and module.partition(".")[0] != "facediff":
+        return {}
+    name = SHORT_NAMES.get(name, name)
+    return next((options for path, options in REMOVED.items() if path.rpartition(".")[2] == name), {})
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
