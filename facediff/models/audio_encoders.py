@@ -210,14 +210,13 @@ def standardise(audio: Waves, lengths: Lengths, epsilon: float = 1e-7) -> Waves:
 
 @audio_encoder.register("mel")
 class MelEncoder(AudioEncoder):
-    """Log-mel spectrogram and residual dilated convolutions, trained from scratch.
+    """Log-mel spectrogram of 64 bands, 60 to 7 600 Hz, and residual dilated convolutions, trained from scratch.
 
     The default where no pretrained weights are at hand. 100 spectra a second are halved to 50 steps a second by a
     strided convolution and interpolated to the motion's frame rate at the end.
 
     Args:
         dim: channels of the result; given by the model.
-        n_mels: mel bands between 60 Hz and 7 600 Hz.
         hidden_dim: channels of the convolutions.
         num_layers: residual blocks, with dilations 1, 2, 4, 1, 2, 4 …
         dropout: dropout in each block.
@@ -225,6 +224,7 @@ class MelEncoder(AudioEncoder):
 
     filters: Tensor
     window: Tensor
+    n_mels = 64
     n_fft = 512
     hop = 160
 
@@ -232,17 +232,16 @@ class MelEncoder(AudioEncoder):
         self,
         *,
         dim: Width,
-        n_mels: Annotated[int, Range(1, 256)] = 64,
         hidden_dim: Width = 128,
         num_layers: Annotated[int, Range(0, 256)] = 4,
         dropout: Share = 0.1,
     ) -> None:
         super().__init__()
         self.register_buffer(
-            "filters", torch.from_numpy(mel_filters(n_mels, self.n_fft, 60.0, 7600.0)), persistent=False
+            "filters", torch.from_numpy(mel_filters(self.n_mels, self.n_fft, 60.0, 7600.0)), persistent=False
         )
         self.register_buffer("window", torch.hann_window(400), persistent=False)
-        self.stem = nn.Conv1d(n_mels, hidden_dim, kernel_size=4, stride=2, padding=1)
+        self.stem = nn.Conv1d(self.n_mels, hidden_dim, kernel_size=4, stride=2, padding=1)
         self.blocks = nn.ModuleList(ConvBlock(hidden_dim, 2 ** (i % 3), dropout) for i in range(num_layers))
         self.out = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, dim))
 

@@ -18,10 +18,14 @@ REMOVED: dict[str, dict[str, Any]] = {
         "face_weight_unit": "scaled",
         "style_contrast_weight": 0.0,
     },
+    "facediff.models.style_content.model.StyleContentDisentanglement": {"basis_start": "pca"},
+    "facediff.models.audio_encoders.MelEncoder": {"n_mels": 64},
+    "facediff.models.mesh_encoders.SpiralMeshEncoder": {"negative_slope": 0.2, "max_frames": None},
+    "facediff.models.speaker_encoders.HierarchicalIdentity": {"unseen": "mean"},
 }
 """By class path, the removed options and the value that each has for good, as plain data of a checkpoint."""
 
-SHORT_NAMES: dict[str, str] = {}
+SHORT_NAMES = {"mel": "MelEncoder", "spiral": "SpiralMeshEncoder", "hierarchical": "HierarchicalIdentity"}
 """Registered names of components of :data:`REMOVED`, by which configs and checkpoints name them, and their classes."""
 
 

@@ -10,16 +10,18 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from facediff.errors import FaceDiffError
-from facediff.models.layers import Frames, Share, Width, exporting
+from facediff.models.layers import Frames, Width
 from facediff.models.motion_space import PrincipalComponents
 from facediff.registry import mesh_encoder
 from facediff.utils.ranges import Dims, Range, Vertices
 
 Motion = Float[Tensor, "batch frames points dims"]
 """Offsets from the template."""
+
+SLOPE = 0.2
+"""Of the leaky ReLU after each spiral convolution (Chai et al., style-content disentanglement)."""
 
 
 class MeshEncoder(nn.Module, ABC):
@@ -188,9 +190,6 @@ class SpiralMeshEncoder(MeshEncoder):
         dilation: distance along the spiral between two of them.
         pooling: whether down-sampling takes one vertex of each group, which leaves a few vertices of the motion unseen,
             or the mean of the group, which sees all of them and takes five to ten times as long.
-        negative_slope: slope of the leaky ReLU below zero.
-        max_frames: frames to encode at a time in training; activations are computed again for the gradient, so that
-            memory grows with this number only. None for all in one pass, which is faster.
     """
 
     steps: Sequence[SpiralDown]
@@ -207,8 +206,6 @@ class SpiralMeshEncoder(MeshEncoder):
         spiral_length: Annotated[int, Range(1, 1000)] = 12,
         dilation: Annotated[int, Range(1, 1000)] = 1,
         pooling: Literal["select", "mean"] = "select",
-        negative_slope: Share = 0.2,
-        max_frames: Annotated[int, Range(1, 10**9)] | None = None,
     ) -> None:
         super().__init__()
         if dims != 3:
@@ -221,8 +218,6 @@ class SpiralMeshEncoder(MeshEncoder):
         self.spiral_length = spiral_length
         self.dilation = dilation
         self.pooling = pooling
-        self.negative_slope = negative_slope
-        self.max_frames = max_frames
         self._attached = False
         steps = []
         width, vertices = 3, n_vertices
@@ -294,22 +289,7 @@ class SpiralMeshEncoder(MeshEncoder):
         check_points(motion, self.n_vertices, 3)
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
-        frames = motion.flatten(0, 1)
-        # Frames are independent of one another, so that splitting them changes nothing but memory: activations are
-        # those of ``max_frames`` frames, at the cost of a second forward pass (Chen et al. 2016, sublinear memory).
-        if self.max_frames is None or exporting() or len(frames) <= self.max_frames:
-            return self.encode(frames).view(*motion.shape[:2], -1)
-        parts = [self._part(part) for part in torch.split(frames, self.max_frames)]
-        return torch.cat(parts).view(*motion.shape[:2], -1)
-
-    def encode(self, x: Float[Tensor, "frames points dims"]) -> Float[Tensor, "frames dim"]:
-        """The feature of each frame of one sequence."""
-        x = x.permute(1, 2, 0).contiguous()
+        x = motion.flatten(0, 1).permute(1, 2, 0).contiguous()
         for step in self.steps:
-            x = F.leaky_relu(step(x), self.negative_slope)
-        return self.map(x.flatten(0, 1).T)
-
-    def _part(self, x: Tensor) -> Tensor:
-        # Nothing here is random, so the state of the random generator need not be kept.
-        part: Tensor = checkpoint(self.encode, x, use_reentrant=False, preserve_rng_state=False)
-        return part
+            x = F.leaky_relu(step(x), SLOPE)
+        return self.map(x.flatten(0, 1).T).view(*motion.shape[:2], -1)

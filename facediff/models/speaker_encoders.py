@@ -76,18 +76,9 @@ class HierarchicalIdentity(IdentityEncoder):
         dim: the model's channels; given by the model.
         n_identities: number of training identities; given by the model.
         level_dim: channels of each level; ``dim`` if None.
-        unseen: what an unseen speaker gets, and a training clip whose identity is hidden: the ``mean`` over all
-            identities' features, or a feature of its own that is ``learnt`` from hidden identities.
     """
 
-    def __init__(
-        self,
-        *,
-        dim: Width,
-        n_identities: Count,
-        level_dim: Width | None = None,
-        unseen: Literal["mean", "learnt"] = "mean",
-    ) -> None:
+    def __init__(self, *, dim: Width, n_identities: Count, level_dim: Width | None = None) -> None:
         super().__init__()
         width = dim if level_dim is None else level_dim
         self.coarse = nn.Embedding(n_identities, width)
@@ -95,9 +86,6 @@ class HierarchicalIdentity(IdentityEncoder):
         self.fine = nn.Embedding(n_identities, width)
         self.attention = nn.Linear(3 * width, 3)
         self.norm = nn.LayerNorm(3 * width)
-        # Normalised as the identities' features are. The mean over them is smaller than any of them and moves whenever
-        # one of them does; nothing is learnt of it but through them.
-        self.unseen = nn.Parameter(torch.randn(3 * width)) if unseen == "learnt" else None
         self.token_dims = (width, width, width)
 
     def level_weights(self) -> Float[Tensor, "identities 3"]:
@@ -105,13 +93,11 @@ class HierarchicalIdentity(IdentityEncoder):
         return self.attention(torch.cat(self._tables(), dim=-1)).softmax(-1)
 
     def forward(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identity_dim"]:
-        """F_id of each clip; an unseen speaker gets the mean over all identities, or what was learnt for that."""
-        # Of every identity, not of the batch's alone: an unseen speaker may get the mean over all of them.
+        """F_id of each clip; an unseen speaker, or a hidden identity, gets the mean over all identities."""
         weights = self.level_weights().unbind(-1)
         weighted = [weight[:, None] * table for weight, table in zip(weights, self._tables(), strict=True)]
         features = self.norm(torch.cat(weighted, dim=-1))  # eq. 11
-        unseen = features.mean(0) if self.unseen is None else self.norm(self.unseen)
-        return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], unseen[None])
+        return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], features.mean(0)[None])
 
     def _tables(self) -> list[Tensor]:
         return [self.coarse.weight, self.mid.weight, self.fine.weight]

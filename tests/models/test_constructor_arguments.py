@@ -141,7 +141,7 @@ def draw(
 
 TINY: dict[str, Any] = {
     "dim": 8,
-    "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=8, num_layers=1, n_mels=8),
+    "audio_encoder": partial(registry.audio_encoder.mel, hidden_dim=8, num_layers=1),
 }
 MODELS: dict[str, dict[str, Any]] = {
     "DualPathDiffusion": {
@@ -158,7 +158,6 @@ MODELS: dict[str, dict[str, Any]] = {
         "decoder_kernels": (3,),
         "decoder_hidden": (8,),
         "basis_size": 4,
-        "basis_start": "random",
     },
 }
 

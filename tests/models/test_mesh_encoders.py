@@ -183,28 +183,6 @@ def test_spiral_widths_are_the_published_ones() -> None:
     }
 
 
-@pytest.mark.parametrize("frames", [1, 2, 6, 100])
-def test_max_frames_changes_nothing(frames: int, make: Callable[..., MeshEncoder]) -> None:
-    results = []
-    for options in ({}, {"max_frames": frames}):
-        encoder, inputs = make("spiral", **options), motion().requires_grad_()
-        out = encoder(inputs)
-        out.square().sum().backward()
-        results.append([out.detach(), inputs.grad, *(p.grad for p in encoder.parameters())])
-    for one, other in zip(*results, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
-
-
-def test_max_frames_trains_on_motion_that_needs_no_gradient(make: Callable[..., MeshEncoder]) -> None:
-    """Recorded motion has none; the weights learn from it all the same."""
-    found = []
-    for frames in (None, 2):
-        encoder = make("spiral", max_frames=frames)
-        encoder(motion()).square().sum().backward()
-        found.append([p.grad for p in encoder.parameters()])
-    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.parametrize("pooling", ["select", "mean"])
 def test_spiral_without_a_mesh_is_an_error(hierarchy: Hierarchy, pooling: Literal["select", "mean"]) -> None:
     encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, dims=3, pooling=pooling)
@@ -239,9 +217,3 @@ def test_attach_refuses_another_mesh_and_changes_nothing(
     with pytest.raises(FaceDiffError, match=message):
         encoder.attach(hierarchy(**{**encoder.mesh_options, **options}))
     assert not encoder.attached
-
-
-@pytest.mark.parametrize("option", ["factor", "spiral_length", "dilation", "max_frames"])
-def test_impossible_options_are_refused(option: str) -> None:
-    with pytest.raises(ValueError, match=rf"model\.mesh_encoder\.{option} 0"):
-        SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, dims=3, **{option: 0})

@@ -7,19 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import yaml
 
 from facediff.cli.app import main
-from facediff.data import Vocaset
-from facediff.models import StyleContentDisentanglement
-from facediff.models.mesh_encoders import SpiralMeshEncoder
-from facediff.models.speaker_encoders import LstmStyle
-from facediff.models.style_content.network import SLOPE, StyleContentDecoder, WindowedTransformer
-from facediff.registry import defaults
 
 MODEL, DATA = "model.init_args", "data.init_args"
 CONFIG: dict[str, Any] = {
@@ -47,7 +40,6 @@ CONFIG: dict[str, Any] = {
     f"{MODEL}.mesh_encoder.init_args.factor": 4,
     f"{MODEL}.mesh_encoder.init_args.spiral_length": 12,
     f"{MODEL}.mesh_encoder.init_args.dilation": 1,
-    f"{MODEL}.mesh_encoder.init_args.negative_slope": 0.2,
     f"{MODEL}.content_dim": 64,
     f"{MODEL}.content_scale": "free",
     f"{MODEL}.style_encoder.class_path": "facediff.registry.style_encoder.lstm",
@@ -60,7 +52,6 @@ CONFIG: dict[str, Any] = {
     f"{MODEL}.decoder_kernels": [5, 3, 3],
     f"{MODEL}.decoder_hidden": [256, 256, 128],
     f"{MODEL}.basis_size": 50,
-    f"{MODEL}.basis_start": "pca",
     # Objective.
     f"{MODEL}.reconstruction_weight": 1.0,
     f"{MODEL}.swap_weight": 3.0,
@@ -109,52 +100,3 @@ def test_the_published_config_has_every_number() -> None:
     callbacks = [callback["class_path"].rpartition(".")[2] for callback in composed["trainer"]["callbacks"]]
     assert "SpeechFeatureCache" in callbacks
     assert not [name for name in callbacks if "Averaging" in name or "Ema" in name]
-
-
-STYLE_CONTENT: dict[str, Any] = {
-    "dim": 64,
-    "content_dim": 64,
-    "window_seconds": 0.64,
-    "speech_layers": 3,
-    "speech_heads": 4,
-    "decoder_channels": (64, 128, 256),
-    "decoder_kernels": (5, 3, 3),
-    "decoder_hidden": (256, 256, 128),
-    "basis_size": 50,
-    "basis_start": "pca",
-    "swap_region": "lower_face",
-    "reconstruction_weight": 1.0,
-    "swap_weight": 3.0,
-    "cycle_weight": 1.0,
-    "speech_weight": 2.0,
-    "recording_content_weight": 5.0,
-    "speech_content_weight": 5.0,
-    "position_weight": 1.0,
-    "velocity_weight": 5.0,
-    "lip_gap_weight": 1.0,
-    "learning_rate": 1e-4,
-    "weight_decay": 0.0,
-    "lr_decay": 0.9,
-    "lr_decay_epoch": 30,
-}
-DEFAULTS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
-    (StyleContentDisentanglement, STYLE_CONTENT),
-    (
-        SpiralMeshEncoder,
-        {"channels": (16, 32, 32), "factor": 4, "spiral_length": 12, "dilation": 1, "negative_slope": 0.2},
-    ),
-    (LstmStyle, {"style_dim": 32, "num_layers": 1, "pooling": "last"}),
-    (WindowedTransformer, {"dim": 64, "num_heads": 4, "num_layers": 3}),
-    (
-        StyleContentDecoder,
-        {"channels": (64, 128, 256), "kernels": (5, 3, 3), "hidden": (256, 256, 128), "basis_size": 50},
-    ),
-]
-
-
-@pytest.mark.parametrize(("owner", "published"), DEFAULTS, ids=lambda each: getattr(each, "__name__", ""))
-def test_defaults_are_the_published_numbers(owner: Callable[..., Any], published: dict[str, Any]) -> None:
-    found = defaults(owner)  # type: ignore[arg-type]
-    assert {name: found[name] for name in published} == published
-    assert SLOPE == 0.2
-    assert (Vocaset.frame_rate, Vocaset.n_vertices, Vocaset.unit) == (30.0, 5023, "m")

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from facediff import registry
 from facediff.data import Batch, collate
@@ -16,7 +15,6 @@ from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.adaptation import with_extra_identities
 from facediff.models.losses import style_identity_loss
-from facediff.models.speaker_encoders import HierarchicalIdentity
 from tests.fakes.tiny import SEEN, Tiny
 
 Ready = Callable[..., DualPathDiffusion]
@@ -87,20 +85,3 @@ def test_the_classifier_is_personal_and_grows_with_a_new_speaker(ready: Ready) -
 def test_style_terms_need_a_style(make_model: Callable[..., DualPathDiffusion]) -> None:
     with pytest.raises(FaceDiffError, match="style_identity_weight"):
         make_model(style_encoder=registry.style_encoder.none, style_identity_weight=1.0)
-
-
-def test_an_unseen_speaker_may_get_a_learnt_feature() -> None:
-    torch.manual_seed(0)
-    encoder = HierarchicalIdentity(dim=8, n_identities=4, level_dim=3, unseen="learnt")
-    nn.init.normal_(encoder.norm.weight)
-    nn.init.normal_(encoder.norm.bias)
-    found = encoder(torch.tensor([-1, 1]))
-    given = encoder.unseen.detach().numpy().astype(np.float64)
-    normed = (given - given.mean()) / np.sqrt(given.var() + 1e-5)
-    expected = normed * encoder.norm.weight.detach().numpy() + encoder.norm.bias.detach().numpy()
-    np.testing.assert_allclose(found[0].detach().numpy(), expected, atol=1e-5)
-    plain = HierarchicalIdentity(dim=8, n_identities=4, level_dim=3)
-    assert plain.load_state_dict(encoder.state_dict(), strict=False).unexpected_keys == ["unseen"]
-    torch.testing.assert_close(plain(torch.tensor([1]))[0], found[1])
-    found[0].sum().backward()
-    assert not encoder.coarse.weight.grad.any(), "hidden clips teach no identity's own feature"

@@ -67,8 +67,7 @@ class StyleContentDisentanglement(AnimationModel):
         decoder_channels: channels of the decoder's three convolutions.
         decoder_kernels: their taps.
         decoder_hidden: channels of its fully connected layers before the coefficients.
-        basis_size: coefficients of its linear basis.
-        basis_start: the basis starts from the principal components of the training motion, or at random.
+        basis_size: coefficients of its linear basis, which starts from the principal components of the training motion.
         content_scale: ``clip`` removes mean and spread over a clip from the content of motion, by which a speaker
             would be recognised; ``free`` leaves it as it is.
         vertices: what the encoders see and the losses compare: all vertices, or the corpus's region ``face``
@@ -118,7 +117,6 @@ class StyleContentDisentanglement(AnimationModel):
         decoder_kernels: Annotated[Sequence[int], Range(1, 1000, items=(0, 32))] = (5, 3, 3),
         decoder_hidden: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (256, 256, 128),
         basis_size: Width = 50,
-        basis_start: Literal["pca", "random"] = "pca",
         content_scale: Literal["clip", "free"] = "clip",
         vertices: Literal["all", "face"] = "all",
         aligned_pairs: bool = True,
@@ -151,7 +149,6 @@ class StyleContentDisentanglement(AnimationModel):
                 {"decoder_channels": list(decoder_channels), "decoder_kernels": list(decoder_kernels)},
                 "expected one number of channels and one of taps for each convolution",
             )
-        self.basis_start = basis_start
         self.vertices = vertices
         self.aligned_pairs = aligned_pairs
         self.aligned_windows = aligned_windows
@@ -217,7 +214,7 @@ class StyleContentDisentanglement(AnimationModel):
             data.pair_sentences = True
             data.aligner = self.alignments if self.aligned_pairs and self.aligned_windows else None
             data.window_context = self.context_frames() if self.window_context else (0, 0)
-            if new and self.basis_start == "pca":
+            if new:
                 mean, shapes = data.principal_motion(self.network.decoder.basis.in_features)
                 self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
             if self.distance.lip_gap and self.assets.inner_lip_pairs is None:
