@@ -24,7 +24,7 @@ from facediff.data.manifest import LONGEST
 from facediff.data.manifest import read_manifest as read_manifest
 from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
-from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, Stretch, WeightFile
+from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, WeightFile
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
@@ -307,18 +307,6 @@ class Corpus:
         first = samples_for(start, self.frame_rate)
         length = samples_for(stop - start, self.frame_rate)
         return torch.from_numpy(self._storages[clip.root].speech(clip.name, first, length, self.store))
-
-    def expect(self, stretches: Sequence[tuple[Clip, int, int, bool]]) -> None:
-        """Announce what will be read, in that order: clip, first frame, the one after the last, whether with speech."""
-        by_root: dict[Path, list[Stretch]] = {}
-        for clip, start, stop, speaks in stretches:
-            stride = self._strides[clip.root]
-            first = samples_for(start, self.frame_rate)
-            length = samples_for(stop - start, self.frame_rate) if speaks else 0
-            picks = range(start * stride, stop * stride, stride)
-            by_root.setdefault(clip.root, []).append(Stretch(clip.name, picks, first, first + length))
-        for root, entries in by_root.items():
-            self._storages[root].expect(entries)
 
     def fingerprint(self, clips: Sequence[Clip]) -> str:
         """A hash that changes when the motion of these clips, or a template, changes; only small files are opened.

@@ -683,13 +683,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             groups=[self.words_of(clip) for clip in samples.clips] if self.pair_sentences else None,
             copies=self._copies(samples) if training else None,
         )
-        # From an address, chunks are fetched before their batch is due: by this process, which knows the order, or by
-        # the loader process that gets the batch.
-        far = self.packed is not None and self.packed.is_remote
-        batches.announce = samples.expect if far and not self.num_workers else None
         # The sampler yields whole batches, so the loader must not batch again.
         loader = ResumableLoader(
-            BatchDataset(samples, announces=far and self.num_workers > 0),
+            BatchDataset(samples),
             sampler=batches,
             batch_size=None,
             collate_fn=collate,

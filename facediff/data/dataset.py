@@ -152,9 +152,6 @@ class ClipBatches(ResumableBatches[list[Pick]]):
         world_size: number of processes.
         groups: for each clip what pairs have in common; None for no pairs.
         copies: how often an epoch of training takes each clip; once if None.
-
-    Attributes:
-        announce: is told the clips of a batch and of the next one before the batch is read.
     """
 
     def __init__(
@@ -178,7 +175,6 @@ class ClipBatches(ResumableBatches[list[Pick]]):
         self.training = training
         self.groups = list(groups) if groups is not None and training else None
         self.copies = list(copies) if copies is not None and training else [1] * len(lengths)
-        self.announce: Callable[[list[Pick]], None] | None = None
 
     def __len__(self) -> int:
         """Number of batches of this process; the same in every epoch."""
@@ -189,15 +185,10 @@ class ClipBatches(ResumableBatches[list[Pick]]):
         # Every process computes the batches of all and takes its share: the seed alone keeps them in agreement.
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
         places = range(self.rank + self.done * self.num_replicas, len(batches), self.num_replicas)
-        for number, place in enumerate(places):
-            if self.announce is not None:
-                self.announce([pick for near in places[number : number + 2] for pick in self._picks(batches, near)])
-            yield self._picks(batches, place)
-
-    def _picks(self, batches: list[list[int]], place: int) -> list[Pick]:
-        # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
-        repeated = not self.training and place >= len(self.lengths)
-        return [Pick(*self._pick(unit), repeated) for unit in batches[place]]
+        for place in places:
+            # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
+            repeated = not self.training and place >= len(self.lengths)
+            yield [Pick(*self._pick(unit), repeated) for unit in batches[place]]
 
     def _hash(self, what: object) -> int:
         return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
@@ -430,9 +421,14 @@ class MotionDataset(Dataset[Sample]):
             begin: where the window begins, if that is known already.
         """
         index, clip = pick.index, self.clips[pick.index]
-        frames = self.corpus.frames(clip)
-        start, stop, source, earliest, latest = self._draw(pick, begin)
-        first, last = self._with_context(clip, start, stop)
+        frames, random = self.corpus.frames(clip), torch.Generator().manual_seed(pick.seed)
+        start, stop = self._window(frames, self.window, random)
+        if begin is not None:
+            start, stop = begin, begin + stop - start
+        source = self._reference(clip, random)
+        earliest, latest = self._window(self.corpus.frames(source), self.policy.max_frames, random)
+        # A training window comes with the frames around it, as far as the clip has them.
+        first, last = max(0, start - self.context[0]), min(frames, stop + self.context[1])
         audio = self.corpus.read_audio(clip, first, last)
         motion = self.projection.read(self.corpus, clip, first, last)
         if self.augmenter is not None and clip.fits(self.augmented_clips):
@@ -452,30 +448,6 @@ class MotionDataset(Dataset[Sample]):
             repeated=pick.repeated,
             window=(start - first, stop - first) if any(self.context) else None,
         )
-
-    def _draw(self, pick: Pick, begin: int | None = None) -> tuple[int, int, Clip, int, int]:
-        """Begin and end of the window, the style reference, and begin and end of its window."""
-        random, clip = torch.Generator().manual_seed(pick.seed), self.clips[pick.index]
-        start, stop = self._window(self.corpus.frames(clip), self.window, random)
-        if begin is not None:
-            start, stop = begin, begin + stop - start
-        source = self._reference(clip, random)
-        return start, stop, source, *self._window(self.corpus.frames(source), self.policy.max_frames, random)
-
-    def _with_context(self, clip: Clip, start: int, stop: int) -> tuple[int, int]:
-        """A training window comes with the frames around it, as far as the clip has them."""
-        return max(0, start - self.context[0]), min(self.corpus.frames(clip), stop + self.context[1])
-
-    def expect(self, picks: Sequence[Pick]) -> None:
-        """Announce to the corpus what the samples of these picks will read, in order."""
-        if self.aligner is not None or self.projection.project is not None:
-            return  # windows that depend on alignments; whole clips, which are kept
-        stretches: list[tuple[Clip, int, int, bool]] = []
-        for pick in picks:
-            start, stop, source, earliest, latest = self._draw(pick)
-            clip = self.clips[pick.index]
-            stretches += [(clip, *self._with_context(clip, start, stop), True), (source, earliest, latest, False)]
-        self.corpus.expect(stretches)
 
     def _augmented(
         self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int
@@ -578,12 +550,10 @@ class BatchDataset(Dataset[list[Sample]]):
 
     Args:
         samples: the data set.
-        announces: whether a loader process announces a batch before it reads it.
     """
 
-    def __init__(self, samples: MotionDataset, *, announces: bool = False) -> None:
+    def __init__(self, samples: MotionDataset) -> None:
         self.samples = samples
-        self.announces = announces
 
     def __len__(self) -> int:
         """Number of clips."""
@@ -593,8 +563,6 @@ class BatchDataset(Dataset[list[Sample]]):
         """The picked clips; a bare number, which Lightning asks for when it overfits on a few batches, is one clip."""
         if isinstance(picks, int):
             return [self.samples[picks]]
-        if self.announces:
-            self.samples.expect(picks)
         if self.samples.aligner is None:
             return [self.samples.sample(pick) for pick in picks]
         pairs = [self.samples.pair(*picks[i : i + 2]) for i in range(0, len(picks) - 1, 2)]

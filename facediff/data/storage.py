@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,23 +26,6 @@ VALUES_FOLDER = "values_npy"
 
 CHUNK = 8
 """Frames that are converted at a time: few enough to stay in a processor's cache, many enough to cost no overhead."""
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """A part of a clip that will be read soon.
-
-    Attributes:
-        name: of the clip.
-        picks: stored frames.
-        first_sample: of its speech at 16 kHz.
-        stop_sample: the sample after the last one.
-    """
-
-    name: str
-    picks: Sequence[int]
-    first_sample: int
-    stop_sample: int
 
 
 class ClipMotion(Protocol):
@@ -71,9 +53,6 @@ class ClipStorage(Protocol):
 
     def version(self, name: str) -> object:
         """A value that changes when the clip's motion changes."""
-
-    def expect(self, stretches: Sequence[Stretch]) -> None:
-        """Prepare for reading these stretches next, if that saves time."""
 
 
 class ClipFolder:
@@ -115,9 +94,6 @@ class ClipFolder:
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
         return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store, self._whole)
-
-    def expect(self, stretches: Sequence[Stretch]) -> None:
-        """Nothing: the operating system reads files ahead."""
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""

@@ -123,7 +123,7 @@ Window = tuple[int, int]
 Reader = Callable[[list[Window]], object]
 
 
-def reader(root: str, *, memory: float, announces: bool = True) -> Reader:
+def reader(root: str, *, memory: float) -> Reader:
     """Reads a batch of windows, clip and first frame, of a corpus whose cache of chunks has so many gigabytes."""
     from facediff.data import Biwi
     from facediff.data.packed.decoded import VARIABLE
@@ -134,8 +134,6 @@ def reader(root: str, *, memory: float, announces: bool = True) -> Reader:
 
     def read(windows: list[Window]) -> None:
         stretches = [(clips[clip % len(clips)], start, start + WINDOW) for clip, start in windows]
-        if announces:
-            corpus.expect([(*stretch, True) for stretch in stretches])
         for clip, start, stop in stretches:
             corpus.read_audio(clip, start, stop)
             corpus.read_motion(clip, start, stop)
@@ -222,7 +220,6 @@ def main() -> int:
         for codec in CODECS:
             far = f"{address}/{codec}.zarr"
             first[f"{codec}, HTTP"] = reader(far, memory=0)
-            first[f"{codec}, HTTP, without read-ahead"] = reader(far, memory=0, announces=False)
         compare("first", first, asked.batches)
         again = {codec: reader(near[codec], memory=0.5) for codec in CODECS}
         compare("again", {"plain files": plain, **again}, asked.batches)

@@ -18,17 +18,17 @@ CRC-32C: ordinary codecs of Zarr, so that any of its implementations reads them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_origin, get_type_hints
 
 import numpy as np
 
 from facediff.data.manifest import LONGEST
 from facediff.errors import FaceDiffError
 from facediff.spaces.space import metres_per_unit
-from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_array, check_format, check_nesting, check_number, quoted
+from facediff.utils.limits import LIMITS, SAMPLE_RATES, check_array, check_format, check_nesting, quoted
 from facediff.utils.plain_files import parse_json
 
 FORMAT = "facediff packed corpus 1"
@@ -206,211 +206,142 @@ def is_plain_name(name: str) -> bool:
 
 
 def read_record(text: bytes, source: str) -> Record:
-    """The record in a group's ``zarr.json``; every field is checked, since the file may be hostile.
-
-    Raises:
-        FaceDiffError: if it is no packed corpus, of a later format, or declares what cannot be.
-    """
+    """The record in a group's ``zarr.json``; every field is checked, since the file may be hostile."""
     name = f"{source}/{METADATA}"
     LIMITS.check("bytes", len(text), name)
     content = parse_json(text, name, remedy=REMEDY)
     check_nesting(content, name)
     attributes = content.get("attributes") if isinstance(content, dict) else None
     plain = attributes.get(RECORD) if isinstance(attributes, dict) else None
-    if not isinstance(plain, dict) or content.get("node_type") != "group":
-        raise FaceDiffError(f"{name}: is no packed corpus; expected what `facediff data pack` writes")
-    check_format(name, plain.get("format"), FORMAT)
+    _require(isinstance(plain, dict), name, "is no packed corpus; expected what `facediff data pack` writes")
+    check_format(name, cast(dict[str, Any], plain).get("format"), FORMAT)
     try:
-        return _record(plain, _Checks(name))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        return _record(cast(dict[str, Any], plain), name)
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise FaceDiffError(f"{name}: its record is damaged ({quoted(error)}); {REMEDY}") from error
 
 
-class _Checks:
-    """Reads fields of a record, and names the one that is wrong."""
-
-    def __init__(self, source: str) -> None:
-        self.source = source
-
-    def whole(self, plain: Mapping[str, Any], name: str, low: int = 0, high: float = 2**53) -> int:
-        """A whole number in a range."""
-        return int(check_number(self.source, name, plain[name], low, high, whole=True, remedy=REMEDY))
-
-    def number(self, plain: Mapping[str, Any], name: str, low: float, high: float) -> float:
-        """A number in a range."""
-        return check_number(self.source, name, plain[name], low, high, remedy=REMEDY)
-
-    def text(self, plain: Mapping[str, Any], name: str, allowed: Sequence[str] = ()) -> str:
-        """A short text that can be printed, one of the known ones if there are any."""
-        text = plain[name]
-        fits = isinstance(text, str) and text.isprintable() and len(text) <= LONGEST
-        if not fits or (allowed and text not in allowed):
-            expected = f"one of {', '.join(allowed)}" if allowed else "a short text"
-            raise FaceDiffError(f"{self.source}: {name} is {quoted(text)}; expected {expected}; {REMEDY}")
-        return str(text)
-
-    def name(self, plain: Mapping[str, Any], name: str) -> str:
-        """A text that can be the name of a file."""
-        text = self.text(plain, name)
-        if not is_plain_name(text):
-            raise self.refuse(f"{name} is {quoted(text)}; expected a plain name, without / \\ : and no leading dot")
-        return text
-
-    def items(self, plain: Mapping[str, Any], name: str) -> list[Any]:
-        """A list."""
-        entries = plain[name]
-        if not isinstance(entries, list):
-            raise FaceDiffError(f"{self.source}: {name} is {quoted(entries)}; expected a list; {REMEDY}")
-        return entries
-
-    def refuse(self, what: str) -> FaceDiffError:
-        """The error of a record that contradicts itself."""
-        return FaceDiffError(f"{self.source}: {what}; {REMEDY}")
+def _require(condition: object, source: str, fault: str) -> None:
+    if not condition:
+        raise FaceDiffError(f"{source}: {fault}; {REMEDY}")
 
 
-def _record(plain: dict[str, Any], checks: _Checks) -> Record:
-    n_vertices = checks.whole(plain, "n_vertices", 1, LIMITS.vertices)
-    arrays = {}
-    if not isinstance(plain["arrays"], dict):
-        raise checks.refuse("arrays is no object")
-    for name, facts in plain["arrays"].items():
-        arrays[name] = _array(name, facts, checks, 3 * n_vertices)
-    clips = {}
-    for entry in checks.items(plain, "clips"):
-        clip = _clip(entry, checks, arrays)
-        if clip.name in clips:
-            raise checks.refuse(f"has two clips {quoted(clip.name)}")
+def _fields(kind: type[Any], plain: Mapping[str, Any], source: str, **known: Any) -> Any:  # noqa: ANN401
+    """An object with every field of the type that its dataclass declares: texts, numbers from 0, lists of them."""
+    values = dict(known)
+    for name, hint in get_type_hints(kind).items():
+        value = plain[name] if name not in known else None
+        if name not in known and hint is str:
+            _require(isinstance(value, str) and value.isprintable() and len(value) <= LONGEST, source, f"odd {name}")
+        elif name not in known:
+            # Whole numbers up to 2^53; what they mean is compared with the rest of the record below.
+            numbers = list(value) if get_origin(hint) is tuple else [value]
+            kinds = (int, float) if hint is float else int
+            fit = all(isinstance(n, kinds) and not isinstance(n, bool) and 0 <= n <= 2**53 for n in numbers)
+            _require(fit, source, f"{name} is {quoted(value)}; expected numbers from 0 on")
+            value = tuple(numbers) if get_origin(hint) is tuple else value
+        values.setdefault(name, value)
+    return kind(**values)
+
+
+def _record(plain: Mapping[str, Any], source: str) -> Record:
+    lists = all(isinstance(plain[name], list) for name in ("clips", "files", "identities"))
+    _require(lists, source, "clips, files and identities are lists")
+    arrays: dict[str, ArrayFacts] = {}
+    for name, entry in plain["arrays"].items():
+        arrays[name] = _fields(ArrayFacts, entry, f"{source}: {quoted(name)}")
+    clips: dict[str, PackedClip] = {}
+    for entry in plain["clips"]:
+        sound = _fields(PackedSound, entry["sound"], f"{source}: clip {quoted(entry['name'])}")
+        clip: PackedClip = _fields(PackedClip, entry, source, sound=sound)
+        _require(clip.name not in clips, source, f"has two clips {quoted(clip.name)}")
         clips[clip.name] = clip
-    files = {}
-    for entry in checks.items(plain, "files"):
-        file = PackedFile(
-            _relative(checks.text(entry, "path"), checks),
-            checks.whole(entry, "first"),
-            checks.whole(entry, "bytes"),
-            checks.text(entry, "sha256"),
-        )
-        if file.path in files or file.first + file.bytes > _rows(arrays, "files"):
-            raise checks.refuse(f"its file {quoted(file.path)} lies beyond the array, or is there twice")
+    files: dict[str, PackedFile] = {}
+    for entry in plain["files"]:
+        file: PackedFile = _fields(PackedFile, entry, source)
+        _require(file.path not in files, source, f"has two files {quoted(file.path)}")
         files[file.path] = file
-    LIMITS.check("bytes", sum(file.bytes for file in files.values()), checks.source)
-    identities = checks.items(plain, "identities")
-    LIMITS.check("identities", len(identities), checks.source)
-    record = Record(
-        made_by=checks.text(plain, "made_by"),
-        corpus=checks.text(plain, "corpus"),
-        n_vertices=n_vertices,
-        frame_rate=checks.number(plain, "frame_rate", 0.1, 1000.0),
-        tolerance=checks.number(plain, "tolerance", 0, 1e6),
-        step=checks.number(plain, "step", 0, 1e6),
-        unit=checks.text(plain, "unit"),
-        chunk_seconds=checks.number(plain, "chunk_seconds", 0, 1e6),
-        identities=tuple(checks.name({"identity": name}, "identity") for name in identities),
-        clips=dict(sorted(clips.items())),
-        files=files,
-        arrays=arrays,
-        codec=checks.text({"codec": "zstd", **plain}, "codec", list(CODECS)),
-    )
-    _check_agreement(record, checks)
+    identities = tuple(str(name) for name in plain["identities"])
+    parts = {"clips": dict(sorted(clips.items())), "files": files, "arrays": arrays, "identities": identities}
+    record: Record = _fields(Record, {"codec": "zstd", **plain}, source, **parts)
+    _require(1 <= record.n_vertices <= LIMITS.vertices, source, f"n_vertices is {record.n_vertices}")
+    _require(0.1 <= record.frame_rate <= 1000, source, f"frame_rate is {record.frame_rate}")
+    _require(record.codec in CODECS, source, f"codec is {quoted(record.codec)}; expected one of {', '.join(CODECS)}")
+    for name, facts in arrays.items():
+        _check_array(name, facts, 3 * record.n_vertices, source)
+    for clip in clips.values():
+        _check_clip(clip, record, source)
+    for file in files.values():
+        where = f"{source}: its file {quoted(file.path)}"
+        _require(_is_relative(file.path), where, "is no plain path below the folder")
+        _require(file.first + file.bytes <= _rows(arrays, "files"), where, "lies beyond the array")
+    LIMITS.check("bytes", sum(file.bytes for file in files.values()), source)
+    LIMITS.check("identities", len(identities), source)
+    _check_meaning(record, source)
     return record
 
 
-def _check_agreement(record: Record, checks: _Checks) -> None:
+def _check_meaning(record: Record, source: str) -> None:
     """Refuse a record whose declarations contradict each other: they determine what the stored numbers mean."""
     codings = {clip.coding for clip in record.clips.values()}
-    if record.tolerance:
-        try:
-            step = step_of(record.tolerance, record.unit)
-        except FaceDiffError as error:
-            raise checks.refuse(str(error)) from error
-    else:
-        step = 0.0
-    if not math.isclose(record.step, step, rel_tol=1e-6) or (not step and codings & set(QUANTISED)):
-        expected = f"{step:.6g}" if step else "a tolerance above 0, since motion is quantised"
-        what = f"step is {record.step:.6g} at a tolerance of {record.tolerance:g} mm; expected {expected}"
-        raise checks.refuse(what)
+    try:
+        step = step_of(record.tolerance, record.unit)
+    except FaceDiffError as error:
+        raise FaceDiffError(f"{source}: {error}; {REMEDY}") from error
+    expected = f"{step:.6g}" if step else "a tolerance above 0, since motion is quantised"
+    fault = f"step is {record.step:.6g} at a tolerance of {record.tolerance:g} mm; expected {expected}"
+    fits = math.isclose(record.step, step, rel_tol=1e-6) and (step or not codings & set(QUANTISED))
+    _require(fits, source, fault)
     frames = chunk_frames(record.frame_rate, record.chunk_seconds)
     for name in sorted({f"motion_{coding}" for coding in codings}):
-        if record.arrays[name].chunk != frames:
-            raise checks.refuse(f"{name} has chunks of {record.arrays[name].chunk} frames; expected {frames}")
-    rows = _rows(record.arrays, "templates")
-    if rows != len(record.identities) or len(set(record.identities)) != rows:
-        raise checks.refuse(f"identities has {len(record.identities)} names; expected {rows} different ones")
-    for clip in record.clips.values():
-        if clip.identity not in record.identities:
-            raise checks.refuse(f"clip {clip.name} is of {clip.identity}, who is none of identities")
+        chunk = record.arrays[name].chunk
+        _require(chunk == frames, source, f"{name} has chunks of {chunk} frames; expected {frames}")
+    rows, names = _rows(record.arrays, "templates"), record.identities
+    fault = f"identities has {len(names)} names; expected {rows} different ones"
+    _require(rows == len(names) == len(set(names)) and all(map(is_plain_name, names)), source, fault)
 
 
 def _rows(arrays: Mapping[str, ArrayFacts], name: str) -> int:
     return arrays[name].rows if name in arrays else 0
 
 
-def _array(name: str, plain: Mapping[str, Any], checks: _Checks, coordinates: int) -> ArrayFacts:
-    coding = name.removeprefix("motion_")
+def _check_array(name: str, facts: ArrayFacts, coordinates: int, source: str) -> None:
     dtypes = {"templates": "float32", "speech": "uint8", "files": "uint8"}
-    dtype = CODINGS[coding].name if name != coding and coding in CODINGS else dtypes.get(name)
-    if dtype is None:
-        raise checks.refuse(f"has an array {quoted(name)}, which is none of a packed corpus")
-    width = 0 if dtype == "uint8" else coordinates
-    facts = ArrayFacts(
-        dtype=checks.text(plain, "dtype", [dtype]),
-        rows=checks.whole(plain, "rows"),
-        width=checks.whole(plain, "width", width, width),
-        chunk=checks.whole(plain, "chunk", 1, 2**31),
-        chunks=checks.whole(plain, "chunks", 1, 2**20),
-        shards=tuple(
-            checks.whole({"bytes of a shard": size}, "bytes of a shard", 4) for size in checks.items(plain, "shards")
-        ),
-    )
+    dtypes |= {f"motion_{coding}": dtype.name for coding, dtype in CODINGS.items()}
+    _require(name in dtypes, source, f"has an array {quoted(name)}, which is none of a packed corpus")
+    where, width = f"{source}: {name}", 0 if dtypes[name] == "uint8" else coordinates
+    fits = (facts.dtype, facts.width) == (dtypes[name], width) and 1 <= facts.chunk <= 2**31
+    _require(fits and 1 <= facts.chunks <= 2**20, where, f"is {facts.dtype} of width {facts.width}")
     # This bounds the memory that a hostile record can demand: decoding refuses a chunk of any other size.
-    check_array(f"{checks.source}: {name}", (facts.chunk, max(1, width)), np.dtype(dtype).itemsize)
-    if len(facts.shards) != math.ceil(facts.rows / (facts.chunk * facts.chunks)):
-        raise checks.refuse(f"{name} has {len(facts.shards)} shards, which do not hold {facts.rows} rows")
-    return facts
+    check_array(where, (facts.chunk, max(1, width)), np.dtype(facts.dtype).itemsize)
+    count = math.ceil(facts.rows / (facts.chunk * facts.chunks))
+    _require(len(facts.shards) == count, where, f"has {len(facts.shards)} shards, which do not hold {facts.rows} rows")
 
 
-def _clip(plain: Mapping[str, Any], checks: _Checks, arrays: Mapping[str, ArrayFacts]) -> PackedClip:
-    sound = plain["sound"]
-    pieces = checks.items(sound, "pieces")
-    samples = checks.whole(sound, "samples", 1)
-    packed_sound = PackedSound(
-        first=checks.whole(sound, "first"),
-        pieces=tuple(checks.whole({"piece": size}, "piece", 1) for size in pieces),
-        form=checks.text(sound, "form", ["flac", "wav"]),
-        rate=checks.whole(sound, "rate", *SAMPLE_RATES),
-        channels=checks.whole(sound, "channels", 1, 64),
-        samples=samples,
-        bits=checks.whole(sound, "bits", 0, 24),
-    )
-    clip = PackedClip(
-        name=checks.name(plain, "name"),
-        identity=checks.name(plain, "identity"),
-        coding=checks.text(plain, "coding", list(CODINGS)),
-        dtype=checks.text(plain, "dtype", list(EXACT)),
-        first=checks.whole(plain, "first"),
-        frames=checks.whole(plain, "frames", 1, LIMITS.frames),
-        sound=packed_sound,
-    )
-    if clip.coding in EXACT and clip.dtype != clip.coding:
-        raise checks.refuse(f"clip {clip.name} was {clip.dtype}, but is coded as {clip.coding}")
-    facts = arrays.get(f"motion_{clip.coding}")
-    if facts is None or clip.first % facts.chunk or clip.first + clip.frames > facts.rows:
-        raise checks.refuse(f"clip {clip.name} lies beyond its array")
-    LIMITS.check("seconds", samples / packed_sound.rate, f"{checks.source}: clip {clip.name}")
-    if packed_sound.bits not in ((16, 24) if packed_sound.form == "flac" else (0,)):
-        raise checks.refuse(f"the speech of clip {clip.name} has {packed_sound.bits} bits")
-    count = math.ceil(samples / (PIECE_SECONDS * packed_sound.rate)) if packed_sound.form == "flac" else 1
-    if len(packed_sound.pieces) != count or packed_sound.first + sum(packed_sound.pieces) > _rows(arrays, "speech"):
-        raise checks.refuse(f"the speech of clip {clip.name} lies beyond its array")
-    return clip
+def _check_clip(clip: PackedClip, record: Record, source: str) -> None:
+    where, sound = f"{source}: clip {quoted(clip.name)}", clip.sound
+    _require(is_plain_name(clip.name), where, "has a name that is not plain")
+    _require(clip.identity in record.identities, where, f"is of {quoted(clip.identity)}, who is none of identities")
+    fits = clip.coding in CODINGS and clip.dtype in EXACT and (clip.coding not in EXACT or clip.dtype == clip.coding)
+    _require(fits, where, f"was {quoted(clip.dtype)}, but is coded as {quoted(clip.coding)}")
+    facts = record.arrays.get(f"motion_{clip.coding}")
+    fits = facts is not None and not clip.first % facts.chunk and clip.first + clip.frames <= facts.rows
+    _require(fits and 1 <= clip.frames <= LIMITS.frames, where, "lies beyond its array")
+    low, high = SAMPLE_RATES
+    bits = {"flac": (16, 24), "wav": (0,)}.get(sound.form, ())
+    fits = low <= sound.rate <= high and 1 <= sound.channels <= 64 and sound.samples >= 1 and sound.bits in bits
+    _require(fits, where, f"has speech of form {quoted(sound.form)} with {sound.bits} bits at {sound.rate} Hz")
+    LIMITS.check("seconds", sound.samples / sound.rate, where)
+    count = math.ceil(sound.samples / (PIECE_SECONDS * sound.rate)) if sound.form == "flac" else 1
+    fits = len(sound.pieces) == count and sound.first + sum(sound.pieces) <= _rows(record.arrays, "speech")
+    _require(fits and all(sound.pieces), where, "has speech that lies beyond its array")
 
 
-def _relative(path: str, checks: _Checks) -> str:
-    """A path that stays below the folder that it is unpacked into."""
+def _is_relative(path: str) -> bool:
+    """Whether a path stays below the folder that it is unpacked into."""
     parts = PurePosixPath(path).parts
     odd = "\\" in path or ":" in path or not parts or path != "/".join(parts)
-    if odd or PurePosixPath(path).is_absolute() or any(part.startswith(".") for part in parts):
-        raise checks.refuse(f"has a file {quoted(path)}; expected a plain path below the folder")
-    return path
+    return not odd and not PurePosixPath(path).is_absolute() and not any(part.startswith(".") for part in parts)
 
 
 def check_array_metadata(text: bytes, name: str, facts: ArrayFacts) -> None:
@@ -420,7 +351,6 @@ def check_array_metadata(text: bytes, name: str, facts: ArrayFacts) -> None:
     """
     content = parse_json(text, name, remedy=REMEDY)
     width = (facts.width,) if facts.width else ()
-    grid, shape = [facts.chunk * facts.chunks, *width], [facts.rows, *width]
     try:
         (codec,) = content["codecs"]
         inner = codec["configuration"]
@@ -436,16 +366,13 @@ def check_array_metadata(text: bytes, name: str, facts: ArrayFacts) -> None:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FaceDiffError(f"{name}: describes no sharded array; {REMEDY}") from error
     expected = {
-        "shape": shape,
+        "shape": [facts.rows, *width],
         "data_type": facts.dtype,
-        "chunk_grid": grid,
+        "chunk_grid": [facts.chunk * facts.chunks, *width],
         "chunk_shape": [facts.chunk, *width],
         "index_location": "end",
         "codecs": ["sharding_indexed", "bytes", "blosc", "crc32c"],
         "index_codecs": ["bytes", "crc32c"],
     }
-    for field_name, value in expected.items():
-        if declared[field_name] != value:
-            raise FaceDiffError(
-                f"{name}: {field_name} is {quoted(declared[field_name])}; expected {quoted(value)}; {REMEDY}"
-            )
+    for part, value in expected.items():
+        _require(declared[part] == value, name, f"{part} is {quoted(declared[part])}; expected {quoted(value)}")

@@ -6,7 +6,7 @@ import hashlib
 import io
 import os
 import tempfile
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,10 +29,9 @@ from facediff.data.packed.layout import (
     Record,
     read_record,
 )
-from facediff.data.packed.read_ahead import Answer, ReadAhead
 from facediff.data.packed.shards import ShardedArray, chunks_of
-from facediff.data.packed.stores import ByteStore, LocalStore, address_of, limit_bytes, open_store
-from facediff.data.storage import Stretch, refuse_out_of_range, within
+from facediff.data.packed.stores import ByteStore, LocalStore, RemoteStore, cache_folder, limit_bytes, open_store
+from facediff.data.storage import refuse_out_of_range, within
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
 from facediff.utils import SAMPLE_RATE
@@ -68,21 +67,17 @@ class PackedCorpus:
         self.record: Record = read_record(text, self.source)
         # The record holds the size and place of everything, so its hash identifies the content for caches.
         self.identity = hashlib.sha256(text).hexdigest()[:40]
-        self.store: ByteStore = open_store(source, self.identity)
-        self._ahead, self._decoded_chunks = ReadAhead(), DecodedChunks(limit_bytes(VARIABLE, USUAL_GB))
-        self._arrays = {
-            name: ShardedArray(self.store, name, facts, self._ahead) for name, facts in self.record.arrays.items()
-        }
+        if isinstance(store, RemoteStore):
+            size = sum(sum(facts.shards) for facts in self.record.arrays.values())
+            store.cache = cache_folder(self.identity, size)
+        self.store: ByteStore = store
+        self._decoded_chunks = DecodedChunks(limit_bytes(VARIABLE, USUAL_GB))
+        self._arrays = {name: ShardedArray(store, name, facts) for name, facts in self.record.arrays.items()}
 
     @property
     def places(self) -> list[Path]:
         """Folders that workers on other machines must see: its own, or none for an address."""
-        return [] if self.is_remote else [Path(self.source)]
-
-    @property
-    def is_remote(self) -> bool:
-        """Whether it lies at an address."""
-        return address_of(self.source) is not None
+        return [Path(self.source)] if isinstance(self.store, LocalStore) else []
 
     # Its small files.
 
@@ -126,24 +121,6 @@ class PackedCorpus:
         """The motion of a clip; nothing is read yet."""
         clip = self.record.clips[name]
         return PackedMotion(self.source, self.record, clip, self._arrays[f"motion_{clip.coding}"], self._decoded_chunks)
-
-    def expect(self, stretches: Sequence[Stretch]) -> None:
-        """Ask an address for the chunks of these stretches now, in their order; a disk is as quick when they are read.
-
-        Args:
-            stretches: what will be read next.
-        """
-        if not self.is_remote:
-            return
-        requests: dict[Hashable, Callable[[], Answer]] = {}
-        for stretch in stretches:
-            sound = self.record.clips[stretch.name].sound
-            if _is_read_in_parts(sound):
-                for _, first, stop in _pieces(sound, stretch.first_sample, min(stretch.stop_sample, sound.samples)):
-                    chunks = self._arrays["speech"].chunks_of_rows(first, stop)
-                    requests |= self._arrays["speech"].later(chunks.start, chunks.stop)
-            requests |= self.open(stretch.name).later(stretch.picks)
-        self._ahead.expect(requests)
 
     def version(self, name: str) -> object:
         """The hash of the whole record, which holds the size of every shard: the same for all clips."""
@@ -278,15 +255,6 @@ class PackedMotion:
             refuse_out_of_range(offsets, picks, f"{self.source}: clip {self.clip.name}")
             offsets -= template
         return offsets
-
-    def later(self, picks: Sequence[int]) -> dict[Hashable, Callable[[], Answer]]:
-        """Requests for the chunks that hold some frames, as :meth:`offsets` makes them."""
-        numbers = sorted(chunks_of(within(picks, self.frames), self.array.facts.chunk))
-        missing = [n for n in numbers if self.decoded.get((self.array.name, self._begin + n)) is None]
-        requests: dict[Hashable, Callable[[], Answer]] = {}
-        for run in _consecutive(missing):
-            requests |= self.array.later(self._begin + run[0], self._begin + run[-1] + 1)
-        return requests
 
     @property
     def _begin(self) -> int:

@@ -8,7 +8,7 @@ data loader.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from threading import local
 from typing import Any
@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.packed.layout import DAMAGED, METADATA, ArrayFacts, check_array_metadata
-from facediff.data.packed.read_ahead import Answer, ReadAhead
 from facediff.data.packed.stores import ByteStore, Range
 from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.limits import LIMITS, brief
@@ -36,12 +35,10 @@ class ShardedArray:
         store: where it lies.
         name: the array's name.
         facts: its entry in the record.
-        ahead: holds chunks that were asked for early.
     """
 
-    def __init__(self, store: ByteStore, name: str, facts: ArrayFacts, ahead: ReadAhead) -> None:
+    def __init__(self, store: ByteStore, name: str, facts: ArrayFacts) -> None:
         self.store = store
-        self.ahead = ahead
         self.name = name
         self.facts = facts
         self._indices: dict[int, npt.NDArray[np.uint64]] = {}
@@ -70,26 +67,18 @@ class ShardedArray:
         blosc.use_threads = False
         return blosc, google_crc32c
 
-    def fetch(self, first: int, stop: int) -> Answer:
-        """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array."""
-        answer = self.ahead.take((self.name, first, stop))
-        return self._request(first, stop) if answer is None else answer
-
-    def later(self, first: int, stop: int) -> dict[Hashable, Callable[[], Answer]]:
-        """The same as a request for :class:`~facediff.data.packed.read_ahead.ReadAhead`."""
-        return {(self.name, first, stop): lambda: self._request(first, stop)}
-
     def chunks_of_rows(self, first: int, stop: int) -> range:
         """The chunks that hold rows ``first`` to ``stop``."""
         return range(first // self.facts.chunk, -(-stop // self.facts.chunk)) if stop > first else range(0)
 
-    def _request(self, first: int, stop: int) -> Answer:
+    def fetch(self, first: int, stop: int) -> list[memoryview]:
+        """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array."""
         if not self._checked:
             check_array_metadata(
                 self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.facts
             )
             self._checked = True
-        encoded: Answer = []
+        encoded: list[memoryview] = []
         per_shard = self.facts.chunks
         for shard in range(first // per_shard, -(-stop // per_shard)):
             low, high = max(first - shard * per_shard, 0), min(stop - shard * per_shard, per_shard)

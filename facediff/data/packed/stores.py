@@ -1,16 +1,19 @@
-"""Byte access to a packed corpus in a folder or at any address that fsspec knows, with a cache on disk."""
+"""Byte access to a packed corpus in a folder or at any address that fsspec knows, with a cache on disk.
+
+fsspec's own block cache has no limit, and asks a server for the size of every object before it reads.
+"""
 
 from __future__ import annotations
 
 import os
 import re
-import time
+import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from facediff.data.packed.layout import DAMAGED, METADATA, STATE
-from facediff.data.packed.web import WebServer
 from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.files import atomic, cache_dir
 from facediff.utils.limits import brief
@@ -18,8 +21,6 @@ from facediff.utils.limits import brief
 VARIABLE = "FACEDIFF_PACKED_CACHE_GB"
 USUAL_GB = 50.0
 """Default size of the cache in gigabytes."""
-TOUCHED = 3600.0
-"""Seconds after which reading a kept chunk marks it as used; marking it each time would cost a write each time."""
 ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
 
 Range = tuple[int, int]
@@ -61,17 +62,10 @@ class ByteStore(Protocol):
         """Some ranges of an object."""
 
 
-def open_store(source: str | Path, identity: str = "") -> ByteStore:
-    """The store of a packed corpus.
-
-    Args:
-        source: folder or address.
-        identity: key of the cache for an address; nothing is cached if empty.
-    """
+def open_store(source: str | Path) -> LocalStore | RemoteStore:
+    """The store of a packed corpus: a folder, or an address, of which nothing is cached yet."""
     address = address_of(source)
-    if address is not None:
-        return RemoteStore(address, None if not identity else ChunkCache(cache_dir() / "packed", identity))
-    return LocalStore(Path(source).expanduser())
+    return LocalStore(Path(source).expanduser()) if address is None else RemoteStore(address, None)
 
 
 class LocalStore:
@@ -112,13 +106,12 @@ class RemoteStore:
 
     Args:
         address: of the group, as fsspec has it.
-        cache: of the ranges; None for no cache.
+        cache: folder for the ranges, one file each; None for no cache.
     """
 
-    def __init__(self, address: str, cache: ChunkCache | None) -> None:
+    def __init__(self, address: str, cache: Path | None) -> None:
         self.source = address.rstrip("/")
         self.cache = cache
-        self._web = WebServer(self.source) if WebServer.serves(self.source) else None
         self._system: Any = None
         self._process = 0
         self._base = ""
@@ -129,41 +122,46 @@ class RemoteStore:
 
     def whole(self, key: str) -> bytes:
         """All bytes of an object."""
-        return bytes(self._fetch(key, None, None))
+        return self._fetch(key, None, None)
 
     def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
         """Ranges of an object: from the cache, or fetched, with neighbours in one request."""
-        parts: dict[Range, memoryview] = {}
-        for byte_range in dict.fromkeys(byte_ranges):
-            cached = None if self.cache is None else self.cache.get(key, byte_range)
-            if cached is not None:
-                parts[byte_range] = cached
+        parts = {byte_range: part for byte_range in byte_ranges if (part := self._cached(key, byte_range)) is not None}
         for run in runs([byte_range for byte_range in dict.fromkeys(byte_ranges) if byte_range not in parts]):
-            start, end = run[0][0], run[-1][0] + run[-1][1]
-            for byte_range, part in zip(
-                run, split(self._fetch(key, start, end), run, f"{self.source}/{key}"), strict=True
-            ):
+            content = self._fetch(key, run[0][0], sum(run[-1]))
+            for byte_range, part in zip(run, split(content, run, f"{self.source}/{key}"), strict=True):
                 parts[byte_range] = part
-                if self.cache is not None:
-                    self.cache.put(key, byte_range, part)
+                self._keep(key, byte_range, part)
         return [parts[byte_range] for byte_range in byte_ranges]
 
-    def _fetch(self, key: str, start: int | None, end: int | None) -> bytes | bytearray:
-        where = f"{self.source}/{key}"
+    def _file(self, folder: Path, key: str, byte_range: Range) -> Path:
+        return folder / key.replace("/", ".") / f"{byte_range[0]}-{byte_range[1]}"
+
+    def _cached(self, key: str, byte_range: Range) -> memoryview | None:
+        if self.cache is None:
+            return None
         try:
-            answer = None if self._web is None else self._web.get(key, start, end)
-        except FileNotFoundError as error:
-            raise FaceDiffError(f"{where}: there is no such object; check the address") from error
-        if answer is not None:
-            return answer
-        system = self._connected()
+            content = self._file(self.cache, key, byte_range).read_bytes()
+        except OSError:
+            return None
+        return memoryview(content) if len(content) == byte_range[1] else None
+
+    def _keep(self, key: str, byte_range: Range, content: memoryview) -> None:
+        if self.cache is not None:
+            try:
+                with atomic(self._file(self.cache, key, byte_range)) as temporary:
+                    temporary.write_bytes(content)
+            except FaceDiffError:  # a full or protected disk: reading goes on without
+                self.cache = None
+
+    def _fetch(self, key: str, start: int | None, end: int | None) -> bytes:
         try:
+            system = self._connected()
             content: bytes = system.cat_file(f"{self._base}/{key}", start=start, end=end)
-        except FileNotFoundError as error:
-            raise FaceDiffError(f"{where}: there is no such object; check the address") from error
         except Exception as error:  # every file system has its own exceptions
             raise FaceDiffError(
-                f"{where}: cannot be read ({brief(error)}); check the address, the connection and your access to it"
+                f"{self.source}/{key}: cannot be read ({brief(error)}); check the address, the connection and your "
+                f"access to it, and install what fsspec names"
             ) from error
         return content
 
@@ -172,13 +170,7 @@ class RemoteStore:
         if self._system is None or self._process != os.getpid():
             with needs_extra("fsspec", "packed", "reading a corpus from an address"):
                 import fsspec
-            try:
-                self._system, self._base = fsspec.core.url_to_fs(self.source, skip_instance_cache=True)
-            except Exception as error:  # every file system asks for options of its own
-                raise FaceDiffError(
-                    f"{self.source}: cannot be opened ({brief(error)}); install what fsspec names, or correct the "
-                    f"address"
-                ) from error
+            self._system, self._base = fsspec.core.url_to_fs(self.source, skip_instance_cache=True)
             self._process = os.getpid()
         return self._system
 
@@ -199,7 +191,7 @@ def runs(byte_ranges: Sequence[Range]) -> list[list[Range]]:
     return groups
 
 
-def split(content: bytes | bytearray, run: Sequence[Range], source: object) -> list[memoryview]:
+def split(content: bytes, run: Sequence[Range], source: object) -> list[memoryview]:
     """The bytes of a run of ranges, one view for each."""
     if len(content) != sum(size for _, size in run):
         raise FaceDiffError(
@@ -210,73 +202,29 @@ def split(content: bytes | bytearray, run: Sequence[Range], source: object) -> l
     return [view[start - run[0][0] : start - run[0][0] + size] for start, size in run]
 
 
-class ChunkCache:
-    """A cache on disk for ranges read from addresses, one file each; the least recently used are removed.
+def cache_folder(identity: str, size: int) -> Path | None:
+    """The folder for the ranges of a packed corpus at an address; None for one that is larger than the limit.
 
-    Several processes may use it at the same time; anything in it may be removed at any time.
+    The corpora that were not opened for the longest time are removed until this one fits.
 
     Args:
-        folder: of all packed corpora.
-        identity: of this one.
+        identity: of the corpus.
+        size: of all its shards in bytes.
     """
-
-    def __init__(self, folder: Path, identity: str) -> None:
-        self.folder = folder
-        self.identity = identity
-        self.limit = limit_bytes(VARIABLE, USUAL_GB)
-        # Scanning the folder is slow: it is done at first, and whenever a tenth of the limit was added.
-        self._unseen = self.limit
-
-    def _path(self, key: str, byte_range: Range) -> Path:
-        return self.folder / self.identity / "chunks" / key.replace("/", ".") / f"{byte_range[0]}-{byte_range[1]}"
-
-    def get(self, key: str, byte_range: Range) -> memoryview | None:
-        """The bytes of a range; None if they are not in the cache."""
-        if not self.limit:
-            return None
-        path = self._path(key, byte_range)
-        try:
-            content = path.read_bytes()
-            if time.time() - path.stat().st_mtime > TOUCHED:
-                os.utime(path)
-        except OSError:
-            return None
-        return memoryview(content) if len(content) == byte_range[1] else None
-
-    def put(self, key: str, byte_range: Range, content: memoryview) -> None:
-        """Store the bytes of a range, if the disk has room."""
-        if not self.limit:
-            return
-        try:
-            with atomic(self._path(key, byte_range)) as temporary:
-                temporary.write_bytes(content)
-        except FaceDiffError:  # a full or protected disk: reading goes on without
-            self.limit = 0.0
-            return
-        self._unseen += len(content)
-        if self._unseen > self.limit / 10:
-            self._unseen = 0.0
-            self.trim()
-
-    def trim(self) -> None:
-        """Remove the files that were not used for the longest time, until nine tenths of the limit are left."""
-        kept: list[tuple[float, int, str]] = []
-        for folder, _, names in os.walk(self.folder):
-            if Path(folder).parent.name == "chunks":
-                for name in names:
-                    try:
-                        facts = os.stat(os.path.join(folder, name))
-                    except OSError:  # another process has removed it
-                        continue
-                    kept.append((facts.st_mtime, facts.st_size, os.path.join(folder, name)))
-        total = sum(size for _, size, _ in kept)
-        if total <= self.limit:
-            return
-        for _, size, path in sorted(kept):
-            if total <= 0.9 * self.limit:
-                break
-            Path(path).unlink(missing_ok=True)
-            total -= size
+    limit, folder = limit_bytes(VARIABLE, USUAL_GB), cache_dir() / "packed" / identity / "chunks"
+    if size > limit:
+        return None
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        others = sorted(folder.parents[1].glob("*/chunks"), key=lambda other: other.stat().st_mtime)
+        sizes = {other: sum(file.stat().st_size for file in other.rglob("*") if file.is_file()) for other in others}
+        used = sum(kept for other, kept in sizes.items() if other != folder) + size
+        for other in others:
+            if used > limit and other != folder:
+                shutil.rmtree(other, ignore_errors=True)
+                used -= sizes[other]
+    return folder
 
 
 def limit_bytes(variable: str, usual: float) -> float:

@@ -16,9 +16,8 @@ import torch
 
 from facediff.data.check import check
 from facediff.data.packed.packing import pack
-from facediff.data.packed.stores import ChunkCache
+from facediff.data.packed.stores import cache_folder
 from facediff.data.packed.unpacking import unpack
-from facediff.data.packed.web import WebServer
 from facediff.errors import FaceDiffError
 from facediff.utils.checksums import describe_files
 from tests.fakes.tiny import Tiny, write_tiny
@@ -31,10 +30,8 @@ class Ranges(http.server.SimpleHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     sent: list[tuple[str, int]] = []  # noqa: RUF012
-    clients: set[object] = set()  # noqa: RUF012
 
     def do_GET(self) -> None:  # noqa: N802
-        self.clients.add(self.client_address)
         if self.path.startswith("/moved/"):
             self.send_response(302)
             self.send_header("Location", self.path.removeprefix("/moved"))
@@ -103,20 +100,6 @@ def test_a_window_costs_its_chunks_only(served: tuple[Path, str]) -> None:
     assert size < shard / 5
 
 
-def test_windows_share_a_connection(served: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "0")
-    monkeypatch.setenv("FACEDIFF_PACKED_MEMORY_GB", "0")
-    corpus = Tiny(root=served[1]).corpus
-    clip = corpus.clips["B_e04"]
-    corpus.read_motion(clip, 0, 1)
-    Ranges.sent.clear()
-    Ranges.clients.clear()
-    for start in range(10):
-        corpus.read_motion(clip, start, start + 5)
-    assert len(Ranges.sent) == 10
-    assert len(Ranges.clients) == 1
-
-
 @pytest.mark.parametrize("place", ["moved/corpus.zarr", "hasty.zarr", "corpus.zarr/"])
 def test_servers_that_answer_otherwise(served: tuple[Path, str], place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "0")
@@ -126,22 +109,6 @@ def test_servers_that_answer_otherwise(served: tuple[Path, str], place: str, mon
     near, far = Tiny(root=str(root / "corpus.zarr")), Tiny(root=f"{address.rpartition('/')[0]}/{place}")
     for one, other in zip(near.dataset("train"), far.dataset("train"), strict=True):
         assert torch.equal(one.motion, other.motion)
-
-
-def test_which_addresses_are_read_without_fsspec(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
-        monkeypatch.delenv(name, raising=False)
-        monkeypatch.delenv(name.upper(), raising=False)
-    assert WebServer.serves("https://lab.example/biwi.zarr")
-    for other in (
-        "s3://b/c.zarr",
-        "http://me:word@lab.example/c.zarr",
-        "http://lab.example/c.zarr?key=3",
-        "http://[x/c",
-    ):
-        assert not WebServer.serves(other)
-    monkeypatch.setenv("https_proxy", "http://proxy.example:8080")
-    assert not WebServer.serves("https://lab.example/biwi.zarr")
 
 
 def test_loader_processes_connect_for_themselves(served: tuple[Path, str]) -> None:
@@ -182,33 +149,26 @@ def test_an_object_that_is_cut_short_is_named(served: tuple[Path, str]) -> None:
         corpus.read_motion(corpus.clips["A_e01"])
 
 
-def test_the_cache_keeps_to_its_limit_and_drops_what_was_used_longest_ago(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_cache_keeps_to_its_limit_and_drops_the_corpus_that_was_opened_longest_ago(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "1e-5")  # ten kilobytes
-    cache = ChunkCache(tmp_path / "packed", "one")
-    block = memoryview(bytes(1000))
-    for number in range(9):
-        cache.put("motion/c/0/0", (number * 1000, 1000), block)
-        os.utime(cache._path("motion/c/0/0", (number * 1000, 1000)), (number, number))
-    assert cache.get("motion/c/0/0", (0, 1000)) == block  # and is marked as used now
-    for number in range(9, 14):
-        cache.put("motion/c/0/0", (number * 1000, 1000), block)
-    kept = list((tmp_path / "packed").rglob("*-1000"))
-    assert len(kept) <= 10
-    assert cache.get("motion/c/0/0", (0, 1000)) is not None
-    assert cache.get("motion/c/0/0", (1000, 1000)) is None
-    other = ChunkCache(tmp_path / "packed", "two")  # all corpora share the limit
-    for number in range(20):
-        other.put("motion/c/0/0", (number * 1000, 1000), block)
-    assert len(list((tmp_path / "packed").rglob("*-1000"))) <= 10
+    for age, identity in enumerate(("new", "old", "oldest")):
+        folder = cache_folder(identity, 3000)
+        assert folder is not None
+        (folder / "c.0").mkdir()
+        (folder / "c.0" / "0-3000").write_bytes(bytes(3000))
+        os.utime(folder, (1000 - age, 1000 - age))
+    assert cache_folder("next", 4000) is not None
+    assert {path.parent.name for path in own_cache.rglob("chunks")} == {"new", "old", "next"}
+    assert cache_folder("huge", 20_000) is None
 
 
 @pytest.mark.parametrize("text", ["-1", "much", "nan", "inf"])
-def test_a_limit_that_is_none_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+def test_a_limit_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", text)
     with pytest.raises(FaceDiffError, match="FACEDIFF_PACKED_CACHE_GB"):
-        ChunkCache(tmp_path, "one")
+        cache_folder("one", 1)
 
 
 def test_nothing_is_kept_without_a_limit(
