@@ -1,9 +1,8 @@
 """Everything that can be chosen by name: components, models, corpora, metrics and export formats.
 
 Each *kind* (``decoder``, ``model``, ``metric`` …) is an object of this module. A component is registered under a lower
-snake case name and becomes an importable class below its kind: ``facediff.registry.decoder.gru`` is a path that configs
-and checkpoints can store and that survives moving files, and ``--model.decoder=gru`` works on the command line because
-the path ends in the name. Models and corpora are registered under their class names.
+snake case name and is an attribute of its kind: ``facediff.registry.decoder.gru`` is a path that configs and
+checkpoints can store and that survives moving files. Models and corpora are registered under their class names.
 
 Third parties add an entry of any kind by installing a package with an entry point in the group ``facediff.<kind>``::
 
@@ -52,13 +51,11 @@ class Entry:
 
     Attributes:
         name: what chooses it.
-        implementation: the class as written by its author.
-        alias: the empty subclass importable as ``facediff.registry.<kind>.<name>``.
+        implementation: the class.
     """
 
     name: str
     implementation: type
-    alias: type
 
     @property
     def owner(self) -> str:
@@ -79,13 +76,13 @@ class Kind:
         name: what the kind is called.
         modules: import paths of the modules that register the built-in ones, separated by spaces.
         title: what an entry of this kind does, in a few words.
-        aliases: whether each entry is also an importable class below the kind, as components are.
+        component: whether models are made of it; its options are then checked as those of the model.
     """
 
-    def __init__(self, name: str, modules: str, title: str, *, aliases: bool = True) -> None:
+    def __init__(self, name: str, modules: str, title: str, *, component: bool = False) -> None:
         self.kind = name
         self.title = title
-        self._aliases = aliases
+        self._component = component
         self._modules = modules.split()
         self._entries: dict[str, Entry] = {}
         self._loaded = False
@@ -107,7 +104,7 @@ class Kind:
     def _add(self, name: str, implementation: type) -> None:
         """Register ``implementation`` under ``name``; see :meth:`register`."""
         malformed = not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_")
-        malformed = malformed or (self._aliases and name != name.lower())
+        malformed = malformed or (self._component and name != name.lower())
         if malformed or name in dir(self):
             raise RegistrationError(
                 f'{self.kind} name "{name}" cannot be registered: use a lower snake case identifier that is none '
@@ -121,19 +118,10 @@ class Kind:
             raise RegistrationError(
                 f'{self.kind} name "{name}" is wanted by {owner} but belongs to {taken.owner}: rename one of them'
             )
-        if self._aliases and "__init__" in vars(implementation) and taken is None:
+        if self._component and "__init__" in vars(implementation) and taken is None:
             own: Any = implementation
             own.__init__ = checks_arguments(own.__init__, f"model.{self.kind}", sizes="model")
-        alias = self._make_alias(name, implementation) if self._aliases else implementation
-        self._entries[name] = Entry(name, implementation, alias)
-
-    def _make_alias(self, name: str, implementation: type) -> type:
-        """Make the empty subclass whose import path ends in the registered name."""
-
-        def body(namespace: dict[str, Any]) -> None:
-            namespace.update(__module__=__name__, __qualname__=f"{self.kind}.{name}", __doc__=implementation.__doc__)
-
-        return types.new_class(name, (implementation,), exec_body=body)
+        self._entries[name] = Entry(name, implementation)
 
     def load(self) -> None:
         """Import the built-in components and the installed plug-ins, once; another thread waits for them."""
@@ -164,15 +152,16 @@ class Kind:
         return [self._entries[name] for name in self.names()]
 
     def get(self, name: str) -> Any:  # noqa: ANN401 - the kinds' base classes are not known here
-        """The class registered under ``name``.
+        """The class registered under ``name``, which may be the registered path.
 
         Raises:
             UnknownComponentError: naming the nearest and all known names.
         """
         self.load()
+        name = name.removeprefix(f"{__name__}.{self.kind}.")
         if name not in self._entries:
             raise UnknownComponentError(self.unknown(name))
-        return self._entries[name].alias
+        return self._entries[name].implementation
 
     def read(self, text: str, hidden: Set[str] = frozenset()) -> tuple[str, dict[str, Any]]:
         """The name and the options of ``NAME:option=value,option=value``; a value is of the kind of its default.
@@ -229,7 +218,7 @@ class Kind:
         return f'there is no {self.kind} "{name}": {choices(name, self.names())}'
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401
-        """Make ``facediff.registry.<kind>.<name>`` importable and picklable."""
+        """Make ``facediff.registry.<kind>.<name>`` importable."""
         if name.startswith("_"):
             raise AttributeError(name)
         return self.get(name)
@@ -288,42 +277,36 @@ model = Kind(
     "facediff.models.published.unitalker facediff.models.published.unitalker_checkpoints "
     "facediff.models.published.voca",
     "a method, as a LightningModule",
-    aliases=False,  # Lightning refuses to reload a module that is named by a nested alias
 )
 corpus = Kind(
     "corpus",
     "facediff.data.puppet facediff.data.biwi facediff.data.vocaset facediff.data.mead3d facediff.data.parametric",
     "a data set, as a LightningDataModule",
-    aliases=False,
 )
-metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class", aliases=False)
+metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class")
 render_metric = Kind(
     "render_metric",
     "facediff.evaluation.renders",
     "a score of rendered frames and speech by networks of one's own",
-    aliases=False,
 )
-augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech", aliases=False)
-voice_gate = Kind("voice_gate", "facediff.speech.voice_activity", "finds the pauses of speech", aliases=False)
-acting = Kind("acting", "facediff.editing.acting", "moves brows, head and lids with the speech", aliases=False)
+augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech")
+voice_gate = Kind("voice_gate", "facediff.speech.voice_activity", "finds the pauses of speech")
+acting = Kind("acting", "facediff.editing.acting", "moves brows, head and lids with the speech")
 export_format = Kind(
     "export_format",
     "facediff.export.arrays facediff.export.glb facediff.export.sequences facediff.export.usd facediff.export.video "
     "facediff.export.viewer.page",
     "a file format that animations are written in",
-    aliases=False,
 )
 puppet_voice = Kind(
     "puppet_voice",
     "facediff.synthetic.recordings facediff.synthetic.voices",
     "speaks the sentences of the built-in corpus",
-    aliases=False,
 )
 receiver = Kind(
     "receiver",
     "facediff.live.receivers",
     "where frames of a live performance go, by the scheme of an address",
-    aliases=False,
 )
 
 COMPONENTS: dict[str, Kind] = {
@@ -366,13 +349,51 @@ def alias_path(component: type) -> str:
     """Import path to store for a component class: its registered path if it has one, else its own.
 
     Args:
-        component: a registered alias, an implementation that is registered, or any other class.
+        component: a class.
     """
     for kind in COMPONENTS.values():
         for entry in kind._entries.values():  # noqa: SLF001 - same module; loading everything is not wanted here
-            if component in (entry.implementation, entry.alias):
+            if component is entry.implementation:
                 return f"{__name__}.{kind.kind}.{entry.name}"
     return f"{component.__module__}.{component.__qualname__}"
+
+
+def name_of(component: type) -> str:
+    """The registered name of a component class, such as ``ddim``; of any other class its own name."""
+    return alias_path(component).rpartition(".")[2]
+
+
+def with_paths(content: Any) -> Any:  # noqa: ANN401
+    """A config's content with the registered paths in place of the names of components.
+
+    Args:
+        content: of a config, or of a file of one component alone; a name that stands for components of two kinds is
+            replaced only where the key says which.
+
+    Example:
+        >>> with_paths({"class_path": "gru", "init_args": {"num_layers": 1}})
+        {'class_path': 'facediff.registry.decoder.gru', 'init_args': {'num_layers': 1}}
+    """
+
+    def path(name: object, *kinds: Kind) -> object:
+        paths = [f"{__name__}.{kind.kind}.{name}" for kind in kinds if isinstance(name, str) and name in kind.names()]
+        return paths[0] if len(paths) == 1 else name
+
+    if isinstance(content, list):
+        return [with_paths(item) for item in content]
+    if not isinstance(content, dict):
+        return content
+    changed = {}
+    for key, value in content.items():
+        if key == "trainer":  # callbacks take names
+            changed[key] = value
+        elif key == "class_path":
+            changed[key] = path(value, *COMPONENTS.values())
+        elif key in COMPONENTS and isinstance(value, dict) and "class_path" in value:
+            changed[key] = with_paths({**value, "class_path": path(value["class_path"], COMPONENTS[key])})
+        else:
+            changed[key] = path(value, COMPONENTS[key]) if key in COMPONENTS else with_paths(value)
+    return changed
 
 
 def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``

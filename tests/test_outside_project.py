@@ -151,7 +151,7 @@ def test_components_lists_the_extensions_of_an_installed_package(printed: dict[s
 
 
 def test_an_installed_decoder_is_chosen_by_name(printed: dict[str, str]) -> None:
-    assert "class_path: facediff.registry.decoder.moving_average" in printed["decoder"]
+    assert "class_path: facediff_example.decoder.MovingAverageDecoder" in printed["decoder"]
     assert "reach: 2" in printed["decoder"]
 
 

@@ -1,8 +1,7 @@
-"""Names become importable classes; wrong names, clashes and broken plug-ins are told plainly."""
+"""Names are paths of classes; wrong names, clashes and broken plug-ins are told plainly."""
 
 from __future__ import annotations
 
-import pickle
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,7 @@ def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kind:
     (tmp_path / "empty_shelf").mkdir()
     (tmp_path / "empty_shelf" / "__init__.py").touch()
     monkeypatch.syspath_prepend(tmp_path)
-    return Kind("gadget", "empty_shelf", "things for tests")
+    return Kind("gadget", "empty_shelf", "things for tests", component=True)
 
 
 @pytest.fixture
@@ -43,25 +42,15 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., No
 
 
 @pytest.mark.parametrize("kind", registry.COMPONENTS)
-def test_every_name_is_an_importable_picklable_class(kind: str) -> None:
+def test_every_name_is_the_path_of_its_class(kind: str) -> None:
     assert registry.COMPONENTS[kind].names()
     for entry in registry.COMPONENTS[kind]:
-        alias = getattr(getattr(registry, kind), entry.name)
-        assert f"{alias.__module__}.{alias.__qualname__}" == f"facediff.registry.{kind}.{entry.name}"
-        assert issubclass(alias, entry.implementation)
-        assert pickle.loads(pickle.dumps(alias)) is alias  # noqa: S301
-        assert alias_path(alias) == alias_path(entry.implementation) == f"facediff.registry.{kind}.{entry.name}"
+        assert getattr(getattr(registry, kind), entry.name) is entry.implementation
+        assert alias_path(entry.implementation) == f"facediff.registry.{kind}.{entry.name}"
         assert entry.summary, f"{entry.owner} has no docstring"
 
 
-def test_an_instance_survives_pickling() -> None:
-    made = registry.decoder.gru(dim=4, style_dim=4, num_layers=1)
-    again = pickle.loads(pickle.dumps(made))  # noqa: S301
-    assert type(again) is registry.decoder.gru
-    assert all(torch.equal(a, b) for a, b in zip(made.parameters(), again.parameters(), strict=True))
-
-
-@pytest.mark.parametrize("word", ["gru", "facediff.registry.decoder.gru"])
+@pytest.mark.parametrize("word", ["GruDecoder", "facediff.registry.decoder.gru"])
 def test_jsonargparse_resolves_the_word(word: str) -> None:
     registry.decoder.load()
     parser = ArgumentParser(exit_on_error=False)
@@ -69,8 +58,27 @@ def test_jsonargparse_resolves_the_word(word: str) -> None:
     parsed = parser.parse_args(
         [f"--decoder={word}", "--decoder.dim=4", "--decoder.style_dim=4", "--decoder.num_layers=1"]
     )
-    assert parsed.decoder.class_path == "facediff.registry.decoder.gru"
-    assert parsed.decoder.init_args.num_layers == 1
+    decoder = parser.instantiate_classes(parsed).decoder
+    assert isinstance(decoder, GruDecoder)
+    assert decoder.gru.num_layers == 1
+
+
+def test_names_in_a_config_become_paths() -> None:
+    path = "facediff.registry"
+    written = {
+        "model": {"init_args": {"decoder": {"class_path": "gru", "init_args": {"dropout": 0.0}}, "fusion": "add"}},
+        "other": [{"class_path": "components"}, {"decoder": "my.Decoder", "sampler": None}],
+    }
+    assert registry.with_paths(written) == {
+        "model": {
+            "init_args": {
+                "decoder": {"class_path": f"{path}.decoder.gru", "init_args": {"dropout": 0.0}},
+                "fusion": f"{path}.fusion.add",
+            }
+        },
+        "other": [{"class_path": "components"}, {"decoder": "my.Decoder", "sampler": None}],  # of two kinds
+    }
+    assert registry.with_paths({"class_path": "gru"}) == {"class_path": f"{path}.decoder.gru"}
 
 
 def test_other_classes_keep_their_own_path() -> None:
@@ -140,4 +148,4 @@ def test_a_broken_plug_in_is_a_warning_that_names_it(
     with pytest.warns(UserWarning, match=rf'"{name}" of the installed package "broken-gadgets"') as caught:
         assert shelf.names() == ["taken"]
     assert reason in str(caught[0].message)
-    assert shelf.get("taken").__bases__ == (GruDecoder,)
+    assert shelf.get("taken") is GruDecoder

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from facediff.errors import FaceDiffError
+from facediff.registry import with_paths
 from facediff.utils.files import config_dir
 from facediff.utils.yaml_files import check_yaml, yaml_text
 
@@ -107,6 +108,6 @@ def guard_configs(mode: str) -> None:
                 if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries what else it may be
                     raise error.__cause__ from error
                 raise
-        return without_removed_options(with_bundled(read(text)), "--config")
+        return with_paths(without_removed_options(with_bundled(read(text)), "--config"))
 
     set_loader(mode, load, exceptions=(yaml.YAMLError,))

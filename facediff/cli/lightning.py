@@ -358,12 +358,17 @@ def fresh_component(flag: str, value: str) -> str:
     jsonargparse hands options of the same name on from the component that stood there before, even where those were
     mere defaults: ``--model.sampler=ddpm`` would silently keep the 25 steps of ``ddim``.
     """
-    kind = registry.COMPONENTS.get(flag.rpartition(".")[2]) if flag.startswith("--model.") else None
+    words = flag.removesuffix(".help").split(".") if flag.startswith("--model.") else [""]
+    kind = registry.COMPONENTS.get(words[-1])
+    if kind is not None and flag.endswith(".help") and value in kind.names():
+        return f"facediff.registry.{kind.kind}.{value}"
     if kind is None or not re.fullmatch(r"[a-z]\w*", value) or Path(value).is_file() or value == "null":
         return value
     if value not in kind.names():
         raise FaceDiffError(kind.unknown(value))
-    return json.dumps({"class_path": value, "init_args": plain(defaults(kind.get(value)))})
+    return json.dumps(
+        {"class_path": f"facediff.registry.{kind.kind}.{value}", "init_args": plain(defaults(kind.get(value)))}
+    )
 
 
 def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list[str]:

@@ -52,6 +52,7 @@ from facediff.metrics.eyes import LidMetric
 from facediff.models.base import AnimationModel
 from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of, with_identity
 from facediff.models.inference import named
+from facediff.registry import name_of
 from facediff.utils import ranges
 
 REFERENCES = {
@@ -594,7 +595,7 @@ def sampler_of(model: AnimationModel) -> str:
     sampler = getattr(model, "sampler", None)
     if sampler is None:
         return type(model).__name__
-    description = f"{type(sampler).__name__} with {counted(sampler.steps, 'step')}"
+    description = f"{name_of(type(sampler))} with {counted(sampler.steps, 'step')}"
     own = model.expressivity
     if isinstance(own, Tensor):
         return f"{description}, expressivity by vertex"

@@ -25,6 +25,7 @@ from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder, Lengths, Waves
 from facediff.models.layers import of_frames
 from facediff.models.samplers import Sampler
+from facediff.registry import name_of
 from facediff.speech.windows import FrameClock
 
 Axes = dict[int, str]
@@ -140,7 +141,7 @@ def update_table(sampler: Sampler) -> list[list[float]]:
         >>> update_table(DdimSampler(process=NoiseProcess(), steps=4))[-1]
         [0.0, 1.0, 0.0, 0.0, 0.0]
     """
-    name = type(sampler).__name__
+    name = name_of(type(sampler))
     if not sampler.linear:
         raise FaceDiffError(
             f"sampler: {name} is no fixed linear combination; choose ddim, ddpm or dpm_solver, or set linear = True "

@@ -18,6 +18,7 @@ from facediff.animation.animation import WITHOUT_FACE
 from facediff.animation.options import AnimationOptions
 from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
+from facediff.registry import name_of
 from facediff.spaces.rigs import LinearRig
 from facediff.utils.files import valid_text
 from facediff.utils.hub import is_audio2face, is_exported, model_name
@@ -192,7 +193,7 @@ class TrainedPipeline(AnimationPipeline):
         if self.options.condition is not None:
             metadata["condition"] = self.options.condition
         if sampler is not None:
-            metadata["sampler"] = f"{type(sampler).__name__}, {sampler.steps} steps"
+            metadata["sampler"] = f"{name_of(type(sampler))}, {sampler.steps} steps"
         return metadata
 
     def precision(self) -> AbstractContextManager[object]:

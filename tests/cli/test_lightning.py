@@ -36,9 +36,9 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 def test_a_decoder_is_swapped_by_name(fitted: Path, checkpoint: Path) -> None:
     config = yaml.safe_load((fitted / "config.yaml").read_text())
     decoder = config["model"]["init_args"]["decoder"]
-    assert decoder["class_path"] == "facediff.registry.decoder.gru"
+    assert decoder["class_path"] == "facediff.models.decoders.GruDecoder"
     assert decoder["init_args"]["num_layers"] == 1
-    assert type(load_model(checkpoint).network.decoder).__name__ == "gru"
+    assert type(load_model(checkpoint).network.decoder).__name__ == "GruDecoder"
     assert (fitted / "metrics.csv").is_file()
 
 

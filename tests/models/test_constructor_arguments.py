@@ -27,6 +27,7 @@ from facediff.data.parametric import FlameClips
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.samplers import NoiseProcess
+from facediff.registry import alias_path
 from facediff.utils.ranges import Range, mismatch
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
@@ -194,7 +195,7 @@ def test_wild_arguments_of_a_model(
 
 
 @WILD
-@pytest.mark.parametrize("entry", COMPONENTS, ids=lambda entry: f"{entry.alias.__qualname__}")
+@pytest.mark.parametrize("entry", COMPONENTS, ids=lambda entry: entry.implementation.__name__)
 def test_wild_arguments_of_a_component(
     entry: registry.Entry,
     values: Iterable[object],
@@ -202,7 +203,7 @@ def test_wild_arguments_of_a_component(
     hubert_source: object,
     deepspeech_source: object,
 ) -> None:
-    kind = entry.alias.__qualname__.partition(".")[0]
+    kind = alias_path(entry.implementation).split(".")[2]
     sources = {"hubert": hubert_source, "wav2vec2": hubert_source, "deepspeech": deepspeech_source}
     base: dict[str, Any] = {"source": str(sources[entry.name])} if entry.name in sources else {}
     if entry.name == "spiral":
@@ -212,7 +213,7 @@ def test_wild_arguments_of_a_component(
     name = "StyleContentDisentanglement" if kind == "mesh_encoder" else "DualPathDiffusion"
 
     def build(**options: object) -> AnimationModel:
-        chosen = {kind: partial(entry.alias, **{**base, **options})}
+        chosen = {kind: partial(entry.implementation, **{**base, **options})}
         model: AnimationModel = registry.model.get(name)(**{**SIZES, **TINY, **MODELS[name], **chosen})
         return model
 

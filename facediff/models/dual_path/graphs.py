@@ -27,6 +27,7 @@ from facediff.models.graphs import (
 )
 from facediff.models.motion_space import MotionSpace
 from facediff.models.samplers import NoiseProcess, Sampler
+from facediff.registry import name_of
 
 
 class DualPathModel(GraphedModel, Protocol):
@@ -179,7 +180,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
             state=state,
             drawn=state,
             kept=kept,
-            sampler=type(sampler).__name__,
+            sampler=name_of(type(sampler)),
             steps=list(sampler.timesteps),
             table=update_table(sampler),
             last_step=model.process.steps - 1,
