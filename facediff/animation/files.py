@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
-from facediff.utils.limits import FRAME_RATES, LIMITS, SAMPLE_RATES, check_format, check_number, in_range, quoted
+from facediff.utils.limits import FRAME_RATES, SAMPLE_RATES, check_format, check_number, in_range, quoted
 from facediff.utils.plain_files import json_text, parse_json
 
 T = TypeVar("T")
@@ -160,9 +160,6 @@ def read_archive(path: Path) -> Animation:
     facts = _about(arrays.pop("about"), f"{path}: its entry about")
     count = len(np.atleast_1d(arrays["template"]))
     checked = {name: _checked(path, name, array, count) for name, array in arrays.items()}
-    LIMITS.check("frames", len(checked["vertices"]), path)
-    LIMITS.check("vertices", count, path)
-    LIMITS.check("seconds", len(checked["vertices"]) / facts["frame_rate"], path)
     regions = {name.removeprefix("region_"): array for name, array in checked.items() if name.startswith("region_")}
     parts: dict[str, Any] = {name: checked[name] for name in ARRAYS if name in checked and checked[name].size}
     values, deltas, space = parts.pop("values", None), parts.pop("deltas", None), facts.pop("space")

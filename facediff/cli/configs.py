@@ -1,4 +1,4 @@
-"""YAML configs before jsonargparse reads them: UTF-8, a mapping, each key once, and no more than the budget.
+"""YAML configs before jsonargparse reads them: UTF-8, a mapping, and each key once.
 
 A config is the user's own and may name classes and environment variables; it may still be damaged, or be another file.
 """
@@ -17,13 +17,13 @@ from facediff.registry import with_paths
 from facediff.utils.files import config_dir
 from facediff.utils.yaml_files import check_yaml, yaml_text
 
-SHORT = 32  # characters of a value that can neither expand nor recurse
-
 
 def check_config(path: Path | str) -> None:
     """Refuse a file that is no config."""
     expected = "expected a YAML file such as configs/experiment/puppet.yaml"
-    if check_yaml(yaml_text(path, expected), path) is not dict:
+    text = yaml_text(path, expected)
+    check_yaml(text, path)
+    if not isinstance(yaml.compose(text, yaml.SafeLoader), yaml.MappingNode):
         raise FaceDiffError(f"{path}: holds no options (key: value); {expected}")
 
 
@@ -101,13 +101,8 @@ def guard_configs(mode: str) -> None:
     read = get_omegaconf_loader(mode)  # type: ignore[no-untyped-call]
 
     def load(text: str) -> Any:  # noqa: ANN401
-        if len(text) > SHORT:
-            try:
-                check_yaml(text, "--config")
-            except FaceDiffError as error:
-                if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries what else it may be
-                    raise error.__cause__ from error
-                raise
+        if "\n" in text:  # a file, and not a value
+            check_yaml(text, "--config")
         return with_paths(without_removed_options(with_bundled(read(text)), "--config"))
 
     set_loader(mode, load, exceptions=(yaml.YAMLError,))

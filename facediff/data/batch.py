@@ -22,7 +22,7 @@ from torch.nn.utils.rnn import pad_sequence
 from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.rigs import LinearRig
-from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
+from facediff.utils.limits import FRAME_RATES, check_number, quoted
 from facediff.utils.plain_options import is_name
 
 UNKNOWN_IDENTITY = -1
@@ -456,11 +456,9 @@ class Assets:
         names = state["identities"]
         if not isinstance(names, list) or not names or not all(map(is_name, names)) or len(set(names)) < len(names):
             raise _bad("identities", names, "a list of different names without path separators")
-        LIMITS.check("identities", len(names), "assets")
         for key in ("templates", "regions", "references", "identity_colours"):
             if not isinstance(state[key], dict) or not all(map(is_name, state[key])):
                 raise _bad(key, state[key], "a dict by name")
-            LIMITS.check("identities", len(state[key]), f"assets {key}")
         for key in ("corpus", "unit"):
             if not is_name(state[key]):
                 raise _bad(key, state[key], "a short text")
@@ -497,7 +495,6 @@ class Assets:
         if len(sizes) != 1 or not min(sizes):
             raise _bad("templates", state["templates"], "a neutral face of equally many vertices for every speaker")
         (count,) = sizes
-        LIMITS.check("vertices", count, "assets templates")
         dims = space.dims
         if not space.is_vertices and (count != len(space.channels) or state["faces"] is not None):
             raise _bad("templates", count, f"{len(space.channels)} channels, as the space has, and no triangles")

@@ -35,7 +35,7 @@ from facediff.speech.audio import samples_for
 from facediff.utils.arrays import ArrayStore, read_arrays
 from facediff.utils.checksums import sha256
 from facediff.utils.files import cache_dir
-from facediff.utils.limits import COORDINATE, LIMITS, quoted
+from facediff.utils.limits import COORDINATE, quoted
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_table
 
@@ -382,7 +382,6 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
         if not size or size % 3:
             raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, as every corpus has it")
         n_vertices = size // 3
-    LIMITS.check("identities", len(loaded), path)
     templates = {}
     for name, value in loaded.items():
         if not (isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import FRAME_RATES, LIMITS, check_format, check_number, quoted
+from facediff.utils.limits import FRAME_RATES, check_format, check_number, quoted
 from facediff.utils.plain_files import load_json
 
 FORMAT = 1
@@ -42,7 +42,7 @@ def read_manifest(root: Path) -> dict[str, Any]:
     if manifest.get("frame_rate") is not None:
         check_number(path, "frame_rate", manifest["frame_rate"], *FRAME_RATES, remedy=REMEDY)
     if manifest.get("n_vertices") is not None:
-        check_number(path, "n_vertices", manifest["n_vertices"], 1, LIMITS.vertices, whole=True, remedy=REMEDY)
+        check_number(path, "n_vertices", manifest["n_vertices"], 1, whole=True, remedy=REMEDY)
     for field in TEXTS:
         text = manifest.get(field, "")
         if text is not None and not (isinstance(text, str) and text.isprintable() and len(text) <= LONGEST):

@@ -16,7 +16,7 @@ from facediff.spaces.operations import at_times, permuted
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
-from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.limits import quoted
 
 USUAL_SUFFIXES = (".csv", ".json")
 
@@ -53,8 +53,7 @@ class RecordingFolder(ChannelFolder):
         """The files with values and speech of each recording, by name, sorted."""
         sounds = {path.stem: path for path in (self.root / "wav").glob("*") if path.suffix.lower() == ".wav"}
         files: dict[str, tuple[Path, Path]] = {}
-        for number, path in enumerate(sorted(self.root.rglob("*"))):
-            LIMITS.check("entries", number, self.root)
+        for path in sorted(self.root.rglob("*")):
             if path.suffix.lower() not in self.suffixes or path.name.startswith(".") or not path.is_file():
                 continue
             beside = (path.with_suffix(suffix) for suffix in (".wav", ".WAV"))

@@ -13,7 +13,7 @@ from facediff.errors import FaceDiffError
 from facediff.spaces import Space
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore, open_array, open_vertices
-from facediff.utils.limits import COORDINATE, LIMITS, in_range, quoted
+from facediff.utils.limits import COORDINATE, in_range, quoted
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Folders with absolute vertices, in order of preference; the second is ProbTalk3D's."""
@@ -144,7 +144,6 @@ class ChannelMotion:
                 f"{path}: has shape {values.shape}; expected (frames, {len(space.channels)}), the channels of the "
                 f"corpus's space ({space.kind})"
             )
-        LIMITS.check("frames", len(values), path)
 
     @property
     def frames(self) -> int:
@@ -218,7 +217,6 @@ class WeightFile:
                 f"{path}: has shape {self.weights.shape}; expected (frames, {len(rig) - 1}), the weights of the "
                 f"speaker's shapes in {RIGS_FOLDER}"
             )
-        LIMITS.check("frames", len(self.weights), path)
 
     @property
     def frames(self) -> int:

@@ -29,7 +29,6 @@ from facediff.spaces.arkit import ARKIT, arkit_name, plain
 from facediff.spaces.files.tables import gaze
 from facediff.spaces.rotations import convert, matrices
 from facediff.spaces.visemes import OCULUS, VRM
-from facediff.utils.limits import check_array
 
 Array = npt.NDArray[np.float64]
 Kind = Literal["ARKit", "Oculus", "VRM"]
@@ -257,7 +256,6 @@ def _solved(glb: Glb, own: OwnShapes, animation: Animation) -> Weights:
     """Weights of the avatar's own shapes that come nearest to an animation of its mesh."""
     parts, animation = parts_of(glb, animation)
     total = len(animation.template)
-    check_array(glb.source, (2, len(own.binds), total, 3), 8)
     deltas, first = np.zeros((len(own.binds), total, 3)), 0
     for part in parts:
         targets = glb.entries("targets", part.primitive)

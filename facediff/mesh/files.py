@@ -2,8 +2,7 @@
 
 Every format is read by a parser of our own. Libraries for meshes drop vertices, or put zeros in their place, in files
 that are cut short, mix polygons, or hold textures or sparse data, and several open other files that a file names. Here
-a file is read exactly or refused: what it declares is compared with what it holds and with the budget
-(:data:`facediff.utils.limits.LIMITS`) before memory is allocated, and no other file is opened.
+a file is read exactly or refused: what it declares is compared with what it holds, and no other file is opened.
 """
 
 from __future__ import annotations
@@ -23,9 +22,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.mesh.glb_scene import read_glb
 from facediff.mesh.mesh import Array, Mesh, check_coordinates
-from facediff.utils.limits import LIMITS
 
-BYTES_OF_A_CHARACTER = 16  # memory that a character of a text format can take while its words are numbers in the making
 HEADER = 1 << 16  # bytes within which a PLY header must end
 
 Triangles = npt.NDArray[np.int32]
@@ -39,7 +36,7 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         points_allowed: whether a file without faces is accepted; its mesh has faces of shape (0, 3).
 
     Raises:
-        FaceDiffError: if the file is missing, damaged or larger than the budget, holds no vertices or no triangles, or
+        FaceDiffError: if the file is missing or damaged, holds no vertices or no triangles, or
             coordinates that are not finite.
 
     Example:
@@ -62,8 +59,6 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
     try:
         if not path.is_file():
             raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
-        size = path.stat().st_size
-        LIMITS.check("bytes", size, path)
         data = path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
@@ -83,8 +78,6 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
 
 
 def _read_obj(data: bytes, path: Path) -> Mesh:
-    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
-    LIMITS.check("vertices", data.count(b"\nv ") + data.count(b"\nv\t"), path)
     lines = data.splitlines()
     rows = [line[2:].split() for line in lines if line[:2] in (b"v ", b"v\t")]
     if not rows:
@@ -96,7 +89,6 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
     if width < 3:
         raise ValueError("a line `v` has fewer than three coordinates")
     listed = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
-    LIMITS.check("vertices", (listed.count(b" ") + listed.count(b"\t")) // 4, path)
     # Negative numbers count back from the face's own line; with vertices after it they would name others here, where
     # all vertices are read first.
     if b" -" in listed or b"\t-" in listed:
@@ -137,7 +129,7 @@ def _checked(faces: npt.NDArray[np.int64], n_vertices: int) -> Triangles:
     return faces.reshape(-1, 3).astype(np.int32)
 
 
-def _cut(polygons: npt.NDArray[Any] | Sequence[Sequence[int]], n_vertices: int, source: object) -> Triangles:
+def _cut(polygons: npt.NDArray[Any] | Sequence[Sequence[int]], n_vertices: int) -> Triangles:
     """Triangles of polygons: those of triangles first, then both halves of quadrangles, then fans of larger ones."""
     if isinstance(polygons, np.ndarray):  # all of one length
         lengths = np.full(len(polygons), polygons.shape[1], np.int64)
@@ -145,7 +137,6 @@ def _cut(polygons: npt.NDArray[Any] | Sequence[Sequence[int]], n_vertices: int, 
         lengths = np.array([len(polygon) for polygon in polygons], np.int64)
     if lengths.size and lengths.min() < 3:
         raise ValueError("a face has fewer than three corners")
-    LIMITS.check("vertices", int((lengths - 2).sum()), source)
     parts = [np.zeros((0, 3), np.int64)]
     for length in (3, 4):
         places = np.flatnonzero(lengths == length)
@@ -189,11 +180,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
         raise ValueError("its header is not that of a PLY file, or does not end")
     elements, form = _ply_header(data[: end.start()].decode("utf-8").splitlines(), path)
     body = memoryview(data)[end.end() :]
-    if form == "ascii":
-        LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(body), path)
-        columns = _ply_text(elements, bytes(body).split())
-    else:
-        columns = _ply_binary(elements, body)
+    columns = _ply_text(elements, bytes(body).split()) if form == "ascii" else _ply_binary(elements, body)
     vertex = columns.get("vertex", {})
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("its vertices have no x, y and z")
@@ -212,7 +199,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
         if table.size and not (table.min() >= 0 and table.max() <= 255):
             raise ValueError("its colours are out of range")
         colours = np.rint(table).astype(np.uint8)
-    return Mesh(points, _cut(faces[names[0]] if names else [], len(points), path), colours)
+    return Mesh(points, _cut(faces[names[0]] if names else [], len(points)), colours)
 
 
 def _ply_header(lines: list[str], path: Path) -> tuple[list[_Element], str]:
@@ -225,7 +212,6 @@ def _ply_header(lines: list[str], path: Path) -> tuple[list[_Element], str]:
             case ["element", name, count]:
                 if not count.isdecimal():
                     raise ValueError(f"its element {name} has no valid number of rows")
-                LIMITS.check("vertices", int(count), path)
                 if any(element.name == name for element in elements):
                     raise ValueError(f"its element {name} occurs twice")
                 elements.append(_Element(name, int(count)))
@@ -359,7 +345,6 @@ _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribu
 def _read_stl(data: bytes, path: Path) -> Mesh:
     stated = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else -1
     if len(data) == 84 + stated * _STL_ROW.itemsize:
-        LIMITS.check("vertices", 3 * stated, path)
         points = np.frombuffer(data, _STL_ROW, stated, 84)["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid":
         points = _stl_text(data, path)
@@ -369,8 +354,6 @@ def _read_stl(data: bytes, path: Path) -> Mesh:
 
 
 def _stl_text(data: bytes, path: Path) -> Array:
-    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
-    LIMITS.check("vertices", data.lower().count(b"vertex"), path)
     numbers: list[float] = []
     facet, solid = 0, False
     for line in data.lower().splitlines():
@@ -397,7 +380,6 @@ def _stl_text(data: bytes, path: Path) -> Array:
 
 
 def _read_off(data: bytes, path: Path) -> Mesh:
-    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(data), path)
     head = re.match(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?(C?)(N?)OFF\b", data)
     if head is None:
         raise ValueError("it does not begin with OFF")
@@ -405,8 +387,6 @@ def _read_off(data: bytes, path: Path) -> Mesh:
     if not lines or len(lines[0]) < 2:
         raise ValueError("it does not say how many vertices and faces it has")
     n_vertices, n_faces = int(lines[0][0]), int(lines[0][1])
-    LIMITS.check("vertices", n_vertices, path)
-    LIMITS.check("vertices", n_faces, path)
     if len(lines) < 1 + n_vertices + n_faces:
         raise ValueError(f"it is cut short: its {n_vertices} vertices and {n_faces} faces are not all there")
     rows = lines[1 : 1 + n_vertices]
@@ -421,7 +401,7 @@ def _read_off(data: bytes, path: Path) -> Mesh:
         if len(corners) != int(line[0]):
             raise ValueError("a face has fewer corners than it declares")
         polygons.append(corners)
-    return Mesh(points, _cut(polygons, n_vertices, path), colours)
+    return Mesh(points, _cut(polygons, n_vertices), colours)
 
 
 READERS: dict[str, Callable[[bytes, Path], Mesh]] = {

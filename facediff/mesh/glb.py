@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import Array
-from facediff.utils.limits import LIMITS
 from facediff.utils.plain_files import parse_json
 
 TYPES: dict[int, np.dtype[Any]] = {
@@ -42,7 +41,6 @@ class Glb:
 
     Raises:
         ValueError: if it is no such file, or damaged; so do all methods.
-        FaceDiffError: if it is larger than the budget.
     """
 
     def __init__(self, data: bytes, source: object) -> None:
@@ -70,7 +68,6 @@ class Glb:
                 f"is compressed ({', '.join(packed)}): write it with {remedy}, or import it into Blender and export it "
                 f"without compression"
             )
-        self._expanded = 0  # bytes of all accessors that were read: many may share the same data
 
     def entries(self, kind: str, holder: dict[str, Any] | None = None) -> list[dict[str, Any]]:
         """A list of objects, such as ``nodes``, of the file or of one of its objects; empty if there is none."""
@@ -111,11 +108,6 @@ class Glb:
             raise ValueError("holds positions or indices of an unknown type: export it without compression")
         if count is not None and stated != count:
             raise ValueError(f"has a target of {stated} vertices where the mesh has {count}")
-        LIMITS.check("vertices", stated if width > 1 else stated // 3, self.source)
-        # Thousands of accessors may name the same bytes: what they expand to counts, as float64, not what the file
-        # holds.
-        self._expanded += stated * width * 8
-        LIMITS.check("bytes", self._expanded, self.source)
         if "bufferView" in accessor:
             values = self._slab(accessor, kind, stated, width)
         elif count is not None:
@@ -211,14 +203,12 @@ def whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
 
 
 def open_glb(path: Path) -> Glb:
-    """A file from elsewhere, within the budget.
+    """A file from elsewhere.
 
     Raises:
-        FaceDiffError: if it cannot be read, or needs more than the budget.
         ValueError: saying what is wrong with its content.
     """
     try:
-        LIMITS.check("bytes", path.stat().st_size, path)
         data = path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error

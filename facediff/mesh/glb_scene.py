@@ -16,7 +16,6 @@ import numpy.typing as npt
 from facediff.mesh.glb import Glb, attributes, whole
 from facediff.mesh.mesh import Array, Mesh
 from facediff.utils.colours import to_srgb
-from facediff.utils.limits import LIMITS
 
 ALIKE = 1e-5
 """Matrices of a skin that differ by less than this share are one: it is in the pose that it was bound in."""
@@ -76,12 +75,10 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
 
     Raises:
         ValueError: if the file is damaged.
-        FaceDiffError: if it is larger than the budget.
     """
     materials, nodes = glb.entries("materials"), placed_nodes(glb)
     read: dict[int, list[tuple[dict[str, Any], Array, npt.NDArray[np.int64]]]] = {}  # several nodes may show a mesh
     skins: dict[int, Array] = {}
-    before, triangles = 0, 0
     for mesh, node in _shown(glb, nodes):
         entry = {} if node < 0 else glb.entry("nodes", node)
         if mesh not in read:
@@ -92,9 +89,6 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
         for primitive, local, faces in read[mesh]:
             if not len(faces):
                 continue  # points and lines
-            before, triangles = before + len(local), triangles + len(faces)
-            LIMITS.check("vertices", before, glb.source)
-            LIMITS.check("vertices", triangles, glb.source)
             matrix = nodes.get(node)
             if "skin" in entry and "JOINTS_0" in attributes(primitive):
                 number = whole(entry, "skin")
@@ -117,7 +111,6 @@ def read_glb(data: bytes, source: object) -> Mesh:
 
     Raises:
         ValueError: if the file is damaged.
-        FaceDiffError: if it is larger than the budget.
     """
     glb = Glb(data, source)
     points, faces, colours, before = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [], 0

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb
 from facediff.mesh.glb_scene import Placed, placed_parts
 from facediff.mesh.mesh import check_coordinates
-from facediff.utils.limits import LIMITS, check_array
 
 Array = npt.NDArray[np.float64]
 
@@ -40,7 +39,6 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
 
     Raises:
         ValueError: saying what is wrong with the file.
-        FaceDiffError: if it is larger than the budget.
     """
     counts = [
         max((len(glb.entries("targets", primitive)) for primitive in glb.primitives(index)), default=0)
@@ -88,9 +86,6 @@ def _joined(glb: Glb, parts: list[Placed]) -> Targets:
         for name in names:
             columns.setdefault(name, len(columns))
     total = sum(len(part.local) for part in parts)
-    LIMITS.check("vertices", total, glb.source)
-    # Targets without data of their own cost a file nothing, however many they are.
-    check_array(glb.source, (2, len(columns), total, 3), 8)
     neutral, deltas, faces, before = np.zeros((total, 3)), np.zeros((len(columns), total, 3)), [], 0
     for part, names in zip(parts, named, strict=True):
         rows = slice(before, before + len(part.local))

@@ -20,7 +20,6 @@ from facediff.mesh.glb import Glb, attributes, open_glb, whole
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
 from facediff.utils.files import holds_glb
-from facediff.utils.limits import LIMITS
 
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
 """How pictures begin that programs for glTF and USD read, their type and suffix."""
@@ -114,7 +113,6 @@ def read_textures(path: Path, n_triangles: int) -> Textures:
 
 
 def _read_obj(path: Path) -> Textures | None:
-    LIMITS.check("bytes", path.stat().st_size, path)
     uvs: list[tuple[float, float]] = []
     corners: list[tuple[int, int, int]] = []
     libraries: list[str] = []
@@ -160,7 +158,6 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
         if file is None:
             lost.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
             continue
-        LIMITS.check("bytes", file.stat().st_size, file)
         name, left_out = "", set()
         for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
             word, _, rest = line.strip().replace("\t", " ").partition(" ")
@@ -209,7 +206,6 @@ def _beside(path: Path, name: str) -> Path | None:
 
 
 def _is_picture(path: Path) -> bool:
-    LIMITS.check("bytes", path.stat().st_size, path)
     with path.open("rb") as stream:
         start = stream.read(8)
     return any(start.startswith(magic) for magic in PICTURES)

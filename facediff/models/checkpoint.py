@@ -48,7 +48,7 @@ from facediff.registry import COMPONENTS, corpus, find_class, model
 from facediff.spaces import Space
 from facediff.utils.hub import model_path, split_face
 from facediff.utils.licences import require_cleared
-from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.limits import quoted
 from facediff.utils.plain_options import Components, is_name, is_plain_text, read_options, unknown_class
 from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
 
@@ -334,7 +334,6 @@ def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[Animati
     identities = hparams.get("identities")
     if not isinstance(identities, list) or not all(map(is_name, identities)):
         raise FaceDiffError(f"{path}: its identities are {quoted(identities)}; expected names without path separators")
-    LIMITS.check("identities", len(identities), path)
     space = hparams.get("space")
     if space is not None:
         try:
@@ -351,7 +350,6 @@ def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[Animati
     for name in ("n_vertices", "frame_rate"):
         if not arguments.get(name, 0) > 0:
             raise FaceDiffError(f"{path}: its {name} is {quoted(hparams.get(name))}; expected a number above zero")
-    LIMITS.check("vertices", arguments["n_vertices"], path)
     sizes = {} if "faces" not in hparams else {"faces": sizes_of_faces(path, hparams["faces"])}
     return implementation, {**arguments, "identities": list(identities), "space": space, **sizes}
 
@@ -371,10 +369,8 @@ def sizes_of_faces(path: Path | str, faces: object) -> dict[str, dict[str, Any]]
         names = sizes["identities"]
         if not isinstance(names, list) or not all(map(is_name, names)):
             raise error
-        LIMITS.check("identities", len(names), path)
         if not isinstance(sizes["n_vertices"], int) or not isinstance(sizes["frame_rate"], int | float):
             raise error
-        LIMITS.check("vertices", sizes["n_vertices"], path)
         if sizes["space"] is not None:
             Space.from_state(sizes["space"])
     return faces

@@ -27,7 +27,7 @@ from facediff.registry import COMPONENTS, component_class, corpus, defaults, des
 from facediff.spaces import Space
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
-from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.limits import quoted
 from facediff.utils.plain_options import is_name, is_plain_text
 
 PROVENANCE_KEY = "facediff_provenance"
@@ -243,7 +243,6 @@ def read_person_styles(state: object) -> dict[str, Style]:
                 f"damaged"
             )
         styles[name] = Style(value[0], vector.float())
-    LIMITS.check("identities", len(styles), STYLES_KEY)
     if len({len(style.vector) for style in styles.values()}) > 1:
         raise FaceDiffError("its styles of speakers differ in length; expected one length. The file is damaged")
     return styles

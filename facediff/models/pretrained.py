@@ -33,7 +33,7 @@ from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
 from facediff.utils.hub import ASSETS, CARD, CONFIG, WEIGHTS
 from facediff.utils.licences import Licence, commercial_use, known_licence, merged
-from facediff.utils.limits import LIMITS, check_format, quoted
+from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import json_text, load_json
 from facediff.utils.plain_options import is_plain_text
 from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
@@ -240,7 +240,6 @@ def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
             if name in tensors or not isinstance(twin, str) or twin not in tensors:
                 raise FaceDiffError(f"{path}: the weights {quoted(name)} are said to equal {quoted(twin)}; {REMEDY}")
         tensors.update({name: tensors[twin] for name, twin in config["shared"].items()})
-        LIMITS.check("bytes", sum(value.numel() * value.element_size() for value in tensors.values()), folder)
         content["state_dict"] = tensors
     return content
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import read_arrays
-from facediff.utils.limits import LIMITS, check_number, in_range, quoted
+from facediff.utils.limits import check_number, in_range, quoted
 from facediff.utils.plain_files import load_json
 
 Array = npt.NDArray[np.float32]
@@ -269,8 +269,8 @@ def read_facts(path: Path) -> NetworkFacts:
         tongue=count("num_shapes_tongue", 1, MOST),
         jaw=count("result_jaw_size", 9, MOST),
         eyes=count("result_eyes_size", 4, 4),
-        skin_vertices=count("num_verts_skin", 1, LIMITS.vertices),
-        tongue_vertices=count("num_verts_tongue", 1, LIMITS.vertices),
+        skin_vertices=count("num_verts_skin", 1, 2**31),
+        tongue_vertices=count("num_verts_tongue", 1, 2**31),
         buffer=buffer,
         before=count("buffer_ofs", 0, buffer, audio),
     )

@@ -13,7 +13,6 @@ from facediff.errors import OptionError
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.noise import NumpyClipNoise, NumpyWindowNoise, SeedNoise
 from facediff.speech.windows import MotionWindow
-from facediff.utils.limits import LIMITS
 
 Array = npt.NDArray[np.float32]
 
@@ -200,7 +199,6 @@ class SamplerRun:
         """Offsets from the template (1, frames, points, dims), but for those frames that are given out already."""
         about, share = self.model.description, self.conditions.choices.expressivity
         frames, width = features.shape[1], about.drawn or about.state
-        LIMITS.check("bytes", 4 * frames * max(width, about.state, about.kept), f"{about.model}: {frames} frames")
         mean = None
         if share != 1:
             # As the model's own mean: the prediction at the last step, averaged over a noise and its negative.

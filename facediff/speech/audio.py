@@ -26,7 +26,7 @@ from facediff.errors import FaceDiffError, OptionError, needs_extra
 from facediff.speech.pcm import samples_of
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
-from facediff.utils.limits import LIMITS, SAMPLE_RATES, brief, check_number
+from facediff.utils.limits import SAMPLE_RATES, brief, check_number
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -73,7 +73,7 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
 
     Args:
         path: the file.
-        max_seconds: longest speech allowed; the budget's :attr:`~facediff.utils.limits.Limits.seconds` if that is less.
+        max_seconds: longest speech allowed; None for any.
 
     Raises:
         FaceDiffError: if the file is missing, empty, cut short, no sound file, too long, or holds values that are not
@@ -167,7 +167,7 @@ class _Length:
 
     Args:
         path: the file.
-        most: longest speech allowed in seconds, of an option; None for the budget's alone.
+        most: longest speech allowed in seconds, of an option; None for any.
     """
 
     def __init__(self, path: Path, most: float | None) -> None:
@@ -180,7 +180,6 @@ class _Length:
             raise OptionError(
                 "max_seconds", f"{self.path} lasts {seconds:.0f} s; cut it or raise the limit", f"{self.most:g}"
             )
-        LIMITS.check("seconds", seconds, self.path)
 
 
 def _check_rate(path: Path, rate: object, channels: object) -> None:
@@ -393,7 +392,6 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
     seconds = len(waveform) / rate
     if max_seconds is not None and seconds > max_seconds:
         raise OptionError("max_seconds", f"speech lasts {seconds:.0f} s; cut it or raise the limit", f"{max_seconds:g}")
-    LIMITS.check("seconds", seconds, "speech")
     return SpeechRecording.of(waveform, rate, "speech", "speech")
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import LIMITS
 
 PHONES = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment")
 WORDS = ("words", "word", "ort", "ort-mau")
@@ -48,7 +47,6 @@ def read_text_grid(path: Path) -> dict[str, list[Interval]]:
     Tiers of points are left out. The format is that of Praat's manual, "TextGrid file formats".
     """
     try:
-        LIMITS.check("bytes", path.stat().st_size, path)
         content = path.read_bytes()
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except OSError as error:

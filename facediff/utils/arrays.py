@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import math
-import os
 import warnings
-import zipfile
 from collections.abc import Container
 from pathlib import Path
 from threading import Lock
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic
-from facediff.utils.limits import LIMITS, brief, check_array, quoted
+from facediff.utils.limits import brief
 
 # NumPy parses a file's header with Python's own parser, which two threads that read at the same time can break in
 # Python 3.11 (SystemError, "AST constructor recursion depth mismatch").
 _PARSING = Lock()
-
-HEADER_BYTES = 10_000
-"""Longest header of an array; NumPy itself evaluates no longer one, but would first read gigabytes of it."""
-
-PLAIN_KINDS = "biufcSU"
-"""NumPy's letters for what arrays may hold: truth values, whole, floating and complex numbers, and text."""
 
 
 def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", name: str = "") -> npt.NDArray[Any]:
@@ -42,36 +32,22 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
         name: what messages call the file, e.g. the option that names it; its path if empty.
     """
     name = name or str(path)
-    if not path.is_file():
-        raise FaceDiffError(f"{name}: no such file, or no regular file; expected a NumPy array (.npy)")
     try:
-        with path.open("rb") as stream:  # once: on network storage, opening a file takes milliseconds
-            size = os.fstat(stream.fileno()).st_size
-            if stream.read(4) == b"PK\x03\x04":
-                raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
-            stream.seek(0)
-            shape, fortran, dtype = read_header(stream)
-            offset = stream.tell()
-            # What is mapped takes no memory, so only the file's own size bounds it; empty axes must not be endless.
-            check_array(name, shape, 0)
-            needed = offset + math.prod(shape) * dtype.itemsize
-            if size < needed:
-                raise FaceDiffError(
-                    f"{name}: is cut short: its {size} bytes are fewer than its header says; copy it again"
-                )
-            if size > needed:
-                raise FaceDiffError(f"{name}: holds {size - needed} bytes more than its header says; write it again")
-            order: Literal["F", "C"] = "F" if fortran else "C"
-            array: npt.NDArray[Any] = np.memmap(stream, dtype, mode, offset, shape, order)
+        if not path.is_file():  # a pipe would never end
+            raise FaceDiffError(f"{name}: no such file, or no regular file; expected a NumPy array (.npy)")
+        with _PARSING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
+            array = np.load(path, mmap_mode=mode, allow_pickle=False)
     except FaceDiffError:
         raise
     except Exception as error:  # a damaged header makes NumPy raise anything
         raise FaceDiffError(
             f"{name}: not a readable NumPy array ({brief(error)}); expected a .npy file of numbers"
         ) from error
-    if kinds and not array.size:
-        raise FaceDiffError(f"{name}: holds no numbers, its shape is {array.shape}; write it again")
-    if kinds and array.dtype.kind not in kinds:
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
+    if kinds and (not array.size or array.dtype.kind not in kinds):
         expected = "floating-point numbers" if kinds == "f" else "numbers"
         raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {expected}")
     return array
@@ -89,10 +65,6 @@ def open_vertices(
     if count is None or n_vertices not in (None, count):
         expected = "(frames, 3 * vertices)" if n_vertices is None else f"(frames, {3 * n_vertices})"
         raise FaceDiffError(f"{path}: has shape {array.shape}, expected {expected} or (frames, vertices, 3)")
-    LIMITS.check("frames", len(array), path)
-    LIMITS.check("vertices", count, path)
-    if not array.flags.c_contiguous:
-        LIMITS.check("bytes", array.nbytes, path)  # columns first: taken apart, the array is copied into memory
     return array.reshape(len(array), count, 3)
 
 
@@ -116,69 +88,13 @@ def read_arrays(
     """
     name = name or str(path)
     try:
-        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-            return _checked_members(archive, keys, name)
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{error}; {remedy}") from error
+        with _PARSING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
+            # Opened here, since NumPy leaves a damaged archive open.
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+                return {entry: archive[entry] for entry in archive.files if keys is None or entry in keys}
     except Exception as error:  # zipfile, zlib and NumPy each have several exceptions for damaged files
         raise FaceDiffError(f"{name}: not a readable .npz file ({brief(error)}); {remedy}") from error
-
-
-def _checked_members(archive: zipfile.ZipFile, keys: Container[str] | None, name: str) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of an open archive; all headers are checked before the first array is read."""
-    members: dict[str, zipfile.ZipInfo] = {}
-    LIMITS.check("entries", len(archive.infolist()), name)
-    for member in archive.infolist():
-        entry = member.filename.removesuffix(".npy")
-        if keys is not None and entry not in keys:
-            continue
-        if entry in members:
-            raise FaceDiffError(f"{name}: holds two entries {quoted(entry)}")
-        if not entry.isprintable() or "/" in entry or "\\" in entry or not member.filename.endswith(".npy"):
-            raise FaceDiffError(f"{name}: holds an entry {quoted(member.filename)}; expected arrays only")
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise FaceDiffError(f"{name}: its entry {quoted(entry)} is not compressed as NumPy compresses")
-        members[entry] = member
-    LIMITS.check("bytes", sum(member.file_size for member in members.values()), name)
-    for entry, member in members.items():
-        with archive.open(member) as opened:
-            shape, _, dtype = read_header(opened)
-            check_array(f"{name}: {entry}", shape, dtype.itemsize)
-            if opened.tell() + math.prod(shape) * dtype.itemsize != member.file_size:
-                raise FaceDiffError(f"{name}: its entry {entry} is shorter or longer than its header says")
-    held = {}
-    for entry, member in members.items():
-        with archive.open(member) as opened, _PARSING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            held[entry] = np.lib.format.read_array(opened, allow_pickle=False)
-            opened.read(1)  # at its end the archive compares the checksum
-    return held
-
-
-def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, Fortran order and type that an ``.npy`` stream declares; the stream stands at the numbers then.
-
-    Raises:
-        ValueError: if there is no valid header of an array of plain values.
-    """
-    version = np.lib.format.read_magic(stream)
-    width = {(1, 0): 2, (2, 0): 4}.get(version)
-    if width is None:
-        raise ValueError(f"format version {version} is only for structured types")
-    prefix = stream.read(width)
-    length = int.from_bytes(prefix, "little")
-    if length > HEADER_BYTES:
-        raise ValueError(f"a header of {length} bytes; expected at most {HEADER_BYTES}")
-    text = io.BytesIO(prefix + stream.read(length))
-    read = np.lib.format.read_array_header_1_0 if width == 2 else np.lib.format.read_array_header_2_0
-    with _PARSING, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
-        shape, fortran, dtype = read(text)
-    if dtype.kind not in PLAIN_KINDS:
-        raise ValueError(f"it holds {quoted(dtype)}; expected plain numbers or text")
-    if any(size < 0 for size in shape):
-        raise ValueError(f"its shape is {quoted(shape)}")
-    return shape, fortran, dtype
 
 
 class ArrayStore:

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, needs_extra
-from facediff.utils.limits import check_array
 
 if TYPE_CHECKING:
     import h5py
@@ -71,7 +70,6 @@ def _dataset(holder: h5py.Group, name: str, most: int, path: Path) -> Array:
         raise FaceDiffError(f"{where} lies in another file; expected a file that holds its own data")
     if max(dataset.shape, default=0) > MOST_FRAMES:
         raise FaceDiffError(f"{where} has shape {dataset.shape}; expected at most {MOST_FRAMES} frames")
-    check_array(where, dataset.shape, max(8, dataset.dtype.itemsize))
     return as_frames(dataset[()], most, where, exact=most == ROTATION)
 
 

@@ -8,11 +8,9 @@ mean to ``huggingface_hub``, through which everything goes.
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import re
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +18,6 @@ from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.checksums import sha256
-from facediff.utils.limits import LIMITS, brief
 
 CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"
 BUNDLED = Path(__file__).parents[1] / "bundled" / "puppet"
@@ -39,11 +36,6 @@ EXPECTED_TO_ANIMATE = (
 )
 
 Source = TypeVar("Source", bound="str | os.PathLike[str]")
-
-PATIENCE = 30.0
-"""Seconds that the hub has for what it tells about a model; it is asked twice, since the cache may know more."""
-MOST_TOLD = 16 << 20
-"""Bytes of that; a model's own files are not meant, whose sizes are compared with the budget."""
 
 _ID = re.compile(r"(?P<name>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:@(?P<revision>[\w.-][\w./-]{0,199}))?")
 
@@ -230,20 +222,14 @@ def fetch(name: str, revision: str | None = None) -> Path:
     """The folder of a model of the hub, in the hub's cache on this machine.
 
     Raises:
-        FaceDiffError: if there is no such model, no network, or it is larger than the budget.
+        FaceDiffError: if there is no such model or no network.
         MissingExtraError: if huggingface_hub is not installed.
     """
     with needs_extra("huggingface_hub", "hub", f"fetching the model {name}"):
         from huggingface_hub import snapshot_download
-        from huggingface_hub.errors import DryRunError
     shown = name if revision is None else f"{name}@{revision}"
-    with _hub_errors(shown, "fetched"), _bounded_answers(), _progress():
+    with _hub_errors(shown, "fetched"), _progress():
         options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
-        try:
-            planned = snapshot_download(name, dry_run=True, **options)
-        except DryRunError:
-            planned = []  # the hub does not answer, or refuses: the cache may have it, or the reason follows
-        LIMITS.check("bytes", sum(file.file_size or 0 for file in planned), shown)
         folder = Path(snapshot_download(name, **options))
     for part in (CONFIG, WEIGHTS, ASSETS):
         if not (folder / part).is_file():
@@ -263,68 +249,13 @@ def push(folder: Path, name: str, *, private: bool = False) -> str:
     """
     with needs_extra("huggingface_hub", "hub", "sending a model to the hub"):
         from huggingface_hub import HfApi
-    with _hub_errors(name, "sent"), _bounded_answers(), _progress():
+    with _hub_errors(name, "sent"), _progress():
         api = HfApi(library_name="facediff")
         address = api.create_repo(name, private=private, exist_ok=True)
         api.upload_folder(
             repo_id=name, folder_path=folder, commit_message="Publish with facediff", allow_patterns=list(FILES)
         )
     return str(address)
-
-
-@contextmanager
-def _bounded_answers() -> Iterator[None]:
-    """Let the hub's library wait for no answer for ever, and read no more than :data:`MOST_TOLD` of one into memory."""
-    from huggingface_hub import set_client_factory
-    from huggingface_hub.utils import _http
-
-    def client() -> Any:  # noqa: ANN401 - of the HTTP library that the hub's library has chosen
-        session = _http.default_client_factory()
-        library = importlib.import_module(type(session).__module__.partition(".")[0])
-
-        class Bounded(library.SyncByteStream):  # type: ignore[misc, name-defined]
-            def __init__(self, stream: Any, ends: float) -> None:  # noqa: ANN401
-                self.stream, self.ends = stream, ends
-
-            def __iter__(self) -> Iterator[bytes]:
-                size = 0
-                for part in self.stream:
-                    size += len(part)
-                    if size > MOST_TOLD or time.monotonic() > self.ends:
-                        raise FaceDiffError(
-                            f"the hub's answer is longer than {MOST_TOLD >> 20} MiB or takes longer than {PATIENCE:g} "
-                            f"s; check HF_ENDPOINT, or give a folder in its place"
-                        )
-                    yield part
-
-            def close(self) -> None:
-                self.stream.close()
-
-        def ask(request: Any) -> None:  # noqa: ANN401
-            timeouts = request.extensions.get("timeout") or dict.fromkeys(("connect", "read", "write", "pool"))
-            request.extensions["timeout"] = {kind: seconds or PATIENCE for kind, seconds in timeouts.items()}
-            # What a redirect leads to has the same extensions; only files of a model are read piece by piece.
-            if not request.extensions.setdefault("facediff_file", "/resolve/" in request.url.path):
-                request.headers["Accept-Encoding"] = "identity"  # what expands is bounded as well
-
-        def answer(response: Any) -> None:  # noqa: ANN401
-            if not response.request.extensions["facediff_file"]:
-                if response.headers.get("Content-Encoding", "identity") != "identity":
-                    raise FaceDiffError("the hub's answer is compressed though none was asked for; check HF_ENDPOINT")
-                response.stream = Bounded(response.stream, time.monotonic() + PATIENCE)
-
-        hooks = session.event_hooks
-        session.event_hooks = {
-            "request": [*hooks["request"], ask],
-            "response": [*hooks["response"], answer],
-        }
-        return session
-
-    set_client_factory(client)
-    try:
-        yield
-    finally:
-        set_client_factory(_http.default_client_factory)
 
 
 @contextmanager
@@ -345,62 +276,14 @@ def _progress() -> Iterator[None]:
 
 @contextmanager
 def _hub_errors(name: str, done: str) -> Iterator[None]:
-    """Whatever the hub's library raises, as one sentence."""
-    from huggingface_hub import errors
-
+    """What the hub's library raises, with the model's name."""
     try:
         yield
     except FaceDiffError:
         raise
-    except errors.GatedRepoError as error:
+    except Exception as error:  # errors of the network are of the class of whichever library the hub's one uses
+        reason = " ".join(str(error).split())[:300]
         raise FaceDiffError(
-            f"{name}: its owner gives access on request only; accept the terms on its page, then log in with `hf auth "
-            f"login`"
+            f"{name}: neither a file or folder here, nor can it be {done} ({reason}); check the name, go online, log "
+            f"in with `hf auth login` if it is private, or give a folder in its place"
         ) from error
-    except errors.RevisionNotFoundError as error:
-        raise FaceDiffError(f"{name}: the model has no such revision; expected a branch, a tag or a commit") from error
-    except errors.RepositoryNotFoundError as error:
-        raise FaceDiffError(_unknown(name)) from error
-    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
-        status = _status(error.__cause__)
-        raise FaceDiffError(_unknown(name) if status == 404 else _unreachable(name, done, status)) from error
-    except errors.HFValidationError as error:
-        raise FaceDiffError(f"{name}: is no name of a model on the hub ({brief(error)}); expected user/name") from error
-    except Exception as error:  # errors of the network are of whatever class its library has
-        status = _status(error)
-        if status in (401, 403):
-            raise FaceDiffError(
-                f"{name}: the hub refuses it ({status}); log in with `hf auth login` as somebody who may write there"
-            ) from error
-        if status is None and _is_network(error):
-            raise FaceDiffError(_unreachable(name, done, status)) from error
-        raise FaceDiffError(
-            f"{name}: cannot be {done} ({brief(error)}); try again later, or give a folder in its place"
-        ) from error
-
-
-def _unknown(name: str) -> str:
-    return (
-        f"{name}: neither a file or folder here nor a model on the hub that you may see; check the name, and log in "
-        f"with `hf auth login` if it is private"
-    )
-
-
-def _unreachable(name: str, done: str, status: int | None) -> str:
-    offline = os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
-    answered = "the hub cannot be reached" if status is None else f"the hub answers with the status {status}"
-    reason = "HF_HUB_OFFLINE is set" if offline else answered
-    here = "neither a file or folder here nor in the hub's cache, and cannot be fetched" if done == "fetched" else ""
-    return f"{name}: {here or f'cannot be {done}'}: {reason}. Go online once, or give a checkpoint or a model folder"
-
-
-def _status(error: BaseException | None) -> int | None:
-    """The status of the answer that made an error; None if there was no answer."""
-    status = getattr(getattr(error, "response", None), "status_code", None)
-    return status if isinstance(status, int) else None
-
-
-def _is_network(error: BaseException) -> bool:
-    """Whether an error is that of a connection, under any library."""
-    kinds = {kind.__name__ for kind in type(error).__mro__}
-    return bool(kinds & {"ConnectionError", "TransportError", "TimeoutException", "ConnectError"})

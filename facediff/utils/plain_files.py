@@ -12,7 +12,6 @@ from typing import Any
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic
-from facediff.utils.limits import LIMITS, check_nesting
 
 BYTES_OF_A_CHARACTER = 32  # memory that a character of JSON can take: "[]," makes a list of 56 bytes and a pointer
 _ESCAPES = re.compile(r"\\u(?:0000|d[89a-f])", re.IGNORECASE)
@@ -38,7 +37,6 @@ def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a J
     Raises:
         FaceDiffError: if it is anything else.
     """
-    LIMITS.check("bytes", BYTES_OF_A_CHARACTER * len(text), source)
     try:
         if isinstance(text, bytes):
             text = text.decode(json.detect_encoding(text))
@@ -58,7 +56,6 @@ def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a J
     except (ValueError, RecursionError) as error:  # thousands of brackets exceed Python's depth
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise FaceDiffError(f"{source}: not readable as JSON ({reason}); {remedy}") from error
-    check_nesting(value, source)
     return value
 
 
@@ -72,7 +69,6 @@ def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file
     """
     name = name or str(path)
     try:
-        LIMITS.check("bytes", BYTES_OF_A_CHARACTER * path.stat().st_size, name)
         if not path.is_file():
             raise FaceDiffError(f"{name}: not a regular file; {remedy}")
         return parse_json(path.read_bytes(), name, remedy=remedy)
@@ -194,8 +190,6 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             for number, row in enumerate(csv.reader(stream)):
                 cells += len(row)
-                LIMITS.check("entries", number, path)
-                LIMITS.check("bytes", BYTES_OF_A_CELL * cells, path)
                 if number == 0 and len(row) == 1 and ";" in row[0]:
                     raise FaceDiffError(f"{path}: row 1: has semicolons between its columns; save it with commas")
                 if row:
@@ -219,5 +213,4 @@ def read_rows(path: Path, *, remedy: str) -> Iterator[dict[str, str]]:
     cells = 0
     for row in rows:
         cells += len(header)
-        LIMITS.check("bytes", BYTES_OF_A_CELL * cells, path)  # a short row of many columns expands
         yield dict(zip(header, row + [""] * (len(header) - len(row)), strict=False))

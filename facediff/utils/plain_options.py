@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.limits import quoted
 
 LONGEST_TEXT = 4096
 """Characters of a text, as long as a path may be."""
@@ -57,9 +57,6 @@ def read_options(source: str, owner: type, options: Mapping[str, Any], component
         if name in components:
             arguments[name] = read_component(source, name, value, components)
         elif fits(value, hints[name]):
-            if isinstance(value, int) and "seed" not in name:
-                # Sizes and counts, over which a constructor may loop; below zero, each class has its own opinion.
-                LIMITS.check("entries", abs(value), f"{source}: its option {name}")
             arguments[name] = as_hinted(value, hints[name])
         else:
             raise FaceDiffError(

@@ -1,78 +1,18 @@
-"""Arrays on disk that are damaged, hostile or larger than the budget are refused before memory is allocated."""
+"""Arrays on disk: plain ones come back, damaged files and objects are refused by name, and nothing of a file runs."""
 
 from __future__ import annotations
 
 import ast
-import io
-import struct
-import subprocess
-import sys
-import textwrap
-import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.utils.arrays import open_array, open_vertices, read_arrays
+from facediff.utils.arrays import open_array, read_arrays
+from tests.fakes.hostile import Harm
 
 PACKAGE = Path(__file__).parents[2] / "facediff"
-
-
-def npy(header: str, body: bytes = bytes(64), version: tuple[int, int] = (1, 0)) -> bytes:
-    """An array with any header."""
-    text = header.encode("latin1") + b"\n"
-    length = struct.pack("<H" if version == (1, 0) else "<I", len(text))
-    return b"\x93NUMPY" + bytes(version) + length + text + body
-
-
-def declared(shape: object, kind: str = "'<f4'", order: object = False) -> str:
-    return f"{{'descr': {kind}, 'fortran_order': {order}, 'shape': {shape}, }}"
-
-
-HEADERS: dict[str, bytes] = {
-    "empty": b"",
-    "only the magic": b"\x93NUMPY",
-    "huge": npy(declared("(1099511627776, 3)")),
-    "product beyond 64 bits": npy(declared("(4294967296, 4294967296, 3)")),
-    "thousands of digits": npy(declared(f"({'9' * 5000}, 3)")),
-    "negative": npy(declared("(-1, 3)")),
-    "negative twice": npy(declared("(-4, -4)")),
-    "endless and empty": npy(declared("(1000000000000000, 0, 3)"), b""),
-    "truth values as a shape": npy(declared("(True, 3)")),
-    "objects": npy(declared("(4,)", "'|O'")),
-    "structured": npy(declared("(4,)", "[('a', '<f4'), ('b', '<i4')]")),
-    "subarray": npy(declared("(1,)", "('<f4', (1000000000,))")),
-    "long text": npy(declared("(1,)", "'<U2147483000'")),
-    "no text at all": npy(declared("(1000000000000000,)", "'<U0'"), b""),
-    "dates": npy(declared("(4,)", "'<M8[s]'")),
-    "raw": npy(declared("(4,)", "'|V16'")),
-    "version 3": npy(declared("(4,)"), version=(3, 0)),
-    "version 9": npy(declared("(4,)"), version=(9, 9)),
-    "gigabytes of header": b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**31) + b" " * 99,
-    "megabyte of header": npy(declared("(4,)") + " " * 2**20, version=(2, 0)),
-    "nested header": npy("[" * 5000),
-    "a call in the header": npy("__import__('os').mkdir('evil')"),
-    "one number short": npy(declared("(17,)")),
-    "one number long": npy(declared("(15,)")),
-}
-
-
-@pytest.mark.parametrize("content", HEADERS.values(), ids=HEADERS)
-def test_hostile_headers_are_refused_by_name(content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    bare, packed = tmp_path / "a.npy", tmp_path / "a.npz"
-    bare.write_bytes(content)
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("vertices.npy", content)
-    for read, path in ((open_array, bare), (open_vertices, bare), (read_arrays, packed)):
-        with pytest.raises(FaceDiffError, match=path.name) as refused:
-            read(path)
-        assert "\n" not in str(refused.value)
-        assert len(str(refused.value)) < 500
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npy", "a.npz"]
 
 
 @pytest.mark.parametrize(
@@ -98,95 +38,30 @@ def test_plain_arrays_come_back(array: np.ndarray, tmp_path: Path) -> None:
         assert np.array_equal(found, array)
 
 
-def member(array: bytes | None = None, name: str = "vertices.npy") -> tuple[str, bytes]:
-    stream = io.BytesIO()
-    np.save(stream, np.zeros((4, 3), np.float32))
-    return name, stream.getvalue() if array is None else array
+def test_damaged_files_and_objects_are_refused_by_name_and_nothing_runs(tmp_path: Path) -> None:
+    harm = Harm(tmp_path / "harm")
+    np.save(tmp_path / "objects.npy", np.array([harm], dtype=object))
+    np.savez(tmp_path / "objects.npz", array=np.array([harm], dtype=object))
+    np.save(tmp_path / "a.npy", np.arange(100.0))
+    np.savez_compressed(tmp_path / "a.npz", array=np.arange(100.0))
+    for path in (tmp_path / "a.npy", tmp_path / "a.npz"):
+        content = path.read_bytes()
+        path.with_stem("cut").write_bytes(content[: len(content) * 2 // 3])
+    flipped = bytearray((tmp_path / "a.npz").read_bytes())
+    flipped[len(flipped) // 2] ^= 1
+    (tmp_path / "flipped.npz").write_bytes(flipped)
+    (tmp_path / "empty.npy").write_bytes(b"")
+    for path in [tmp_path / "missing.npz", *tmp_path.glob("[!a]*.np?")]:
+        read = open_array if path.suffix == ".npy" else read_arrays
+        with pytest.raises(FaceDiffError, match=path.name) as refused:
+            read(path)
+        assert "\n" not in str(refused.value)
+    assert not harm.path.exists()
 
 
-def archive_of(path: Path, *members: tuple[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
-    with zipfile.ZipFile(path, "w", method) as archive, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("warnings.warn", lambda *a, **k: None)  # zipfile warns of duplicate names
-        for name, content in members:
-            archive.writestr(name, content)
-    return path.read_bytes()
-
-
-def patched(path: Path, change: Callable[[bytearray, int, int], None], *, method: int = zipfile.ZIP_STORED) -> None:
-    """An archive of one array whose bytes are changed, given where the central directory and its end begin."""
-    data = bytearray(archive_of(path, member(), method=method))
-    change(data, data.rindex(b"PK\x01\x02"), data.rindex(b"PK\x05\x06"))
-    path.write_bytes(data)
-
-
-def resized(size: int) -> Callable[[bytearray, int, int], None]:
-    return lambda data, entry, end: struct.pack_into("<I", data, entry + 24, size)
-
-
-ARCHIVES: dict[str, Callable[[Path], object]] = {
-    "two of one name": lambda path: archive_of(path, member(), member()),
-    "two whose suffix differs": lambda path: archive_of(path, member(), member(name="vertices")),
-    "out of the folder": lambda path: archive_of(path, member(name="../../evil.npy")),
-    "absolute": lambda path: archive_of(path, member(name="/evil.npy")),
-    "another system's folder": lambda path: archive_of(path, member(name="..\\evil.npy")),
-    "control characters": lambda path: archive_of(path, member(name="a\x1b[31m\n.npy")),
-    "declares less than it holds": lambda path: patched(path, resized(100)),
-    "declares more than it holds": lambda path: patched(path, resized(1 << 20)),
-    "declares gigabytes": lambda path: patched(path, resized(0xFFFFFFFE)),
-    "other checksum": lambda path: patched(path, lambda d, e, n: struct.pack_into("<I", d, e + 16, 1)),
-    "encrypted": lambda path: patched(path, lambda d, e, n: struct.pack_into("<H", d, e + 8, 1)),
-    "zip64 without its record": lambda path: patched(
-        path, lambda d, e, n: struct.pack_into("<I", d, n + 16, 2**32 - 1)
-    ),
-    "directory elsewhere": lambda path: patched(path, lambda d, e, n: struct.pack_into("<I", d, n + 16, 7)),
-    "unknown compression": lambda path: patched(path, lambda d, e, n: struct.pack_into("<H", d, e + 10, 99)),
-    "lzma, whose header asks for memory": lambda path: archive_of(path, member(), method=zipfile.ZIP_LZMA),
-}
-
-
-@pytest.mark.parametrize("make", ARCHIVES.values(), ids=ARCHIVES)
-def test_hostile_archives_are_refused_by_name(make: Callable[[Path], object], tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
-    make(path)
-    with pytest.raises(FaceDiffError, match=r"a\.npz") as refused:
-        read_arrays(path)
-    assert "\n" not in str(refused.value)
-    assert "\x1b" not in str(refused.value)
-    assert [each.name for each in tmp_path.iterdir()] == ["a.npz"]
-
-
-def test_entries_that_nobody_asked_for_are_not_read(tmp_path: Path) -> None:
-    archive_of(tmp_path / "a.npz", member(), member(HEADERS["objects"], "other.npy"), member(b"text", "notes.txt"))
+def test_only_the_arrays_that_are_asked_for_are_read(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", vertices=np.zeros(3), other=np.array([None]))
     assert list(read_arrays(tmp_path / "a.npz", {"vertices"})) == ["vertices"]
-
-
-def test_bombs_are_refused_in_little_memory(tmp_path: Path) -> None:
-    """Each of the files is small, declares much and is refused although the process may hold only a little more."""
-    huge = npy(declared("(1000000000, 3)"), b"")
-    (tmp_path / "cut.npy").write_bytes(huge)
-    archive_of(tmp_path / "cut.npz", member(huge))
-    zeros = npy(declared("(15000000,)"), bytes(60_000_000))
-    archive_of(tmp_path / "zeros.npz", member(zeros), method=zipfile.ZIP_DEFLATED)
-    code = f"""
-        import resource, sys
-        from pathlib import Path
-        from facediff.errors import FaceDiffError
-        from facediff.utils.arrays import open_array, read_arrays
-        import numpy
-        used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + 100_000_000,) * 2)
-        for name, read in (("cut.npy", open_array), ("cut.npz", read_arrays), ("zeros.npz", read_arrays)):
-            try:
-                read(Path({str(tmp_path)!r}) / name)
-            except FaceDiffError as error:
-                assert name in str(error), error
-                assert "MemoryError" not in repr(error.__cause__), error
-            else:
-                sys.exit(f"{{name}} was read")
-    """
-    subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], check=True, timeout=60, env={"FACEDIFF_MAX_BYTES": "5e7"}
-    )
 
 
 def test_arrays_are_read_in_one_place_only() -> None:

@@ -19,7 +19,6 @@ from facediff.errors import FaceDiffError
 from facediff.speech.audio import CUT, cut_short, open_sound
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.checksums import sha256
-from facediff.utils.limits import LIMITS
 
 CHUNK = 16  # frames that are read at a time
 SAMPLED = 16  # frames, evenly spread, whose distance from the template is measured
@@ -227,7 +226,6 @@ def _check_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
             if not frames:
                 findings.error("sound_empty", where, "holds no samples; get the recording again")
                 return
-            LIMITS.check("seconds", frames / rate, path)
             if not rules.quick:
                 _decode(findings, file, where)
     except FaceDiffError as error:

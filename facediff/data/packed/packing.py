@@ -51,7 +51,7 @@ from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import open_sound, refuse_cut_short
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.jobs import in_order, run_tasks
-from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.limits import quoted
 from facediff.utils.plain_files import load_json, parse_json, write_json
 
 if TYPE_CHECKING:
@@ -373,15 +373,13 @@ def scored_clips(root: Path, view: CorpusView) -> frozenset[str]:
 
 def _other_files(root: Path) -> tuple[str, ...]:
     """Every file of a corpus folder but motion, speech and hidden ones, by path below it."""
-    paths, size = [], 0
+    paths = []
     for path in sorted(root.rglob("*")):
         place = path.relative_to(root)
         if place.parts[0] in (*MOTION_FOLDERS, "wav") or any(part.startswith(".") for part in place.parts):
             continue
         if path.is_file():
             paths.append(place.as_posix())
-            size += path.stat().st_size
-    LIMITS.check("bytes", size, f"{root}: its other files")
     return tuple(paths)
 
 
@@ -570,7 +568,6 @@ def encode_speech(path: Path) -> bytes:
     with open_sound(path) as file:
         refuse_cut_short(path)
         rate, channels, samples = int(file.samplerate), int(file.channels), int(file.frames)
-        LIMITS.check("seconds", samples / rate, path)
         if not samples:
             raise FaceDiffError(f"{path}: holds no samples; {REMEDY}")
         bits = BITS.get(file.subtype, 0)

@@ -34,7 +34,6 @@ from facediff.data.prepare.runner import (
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.mesh import surface_area
-from facediff.utils.limits import LIMITS
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
 TRAINING_SUBJECTS = ["F2", "F3", "F4", "M3", "M4", "M5"]
@@ -312,7 +311,6 @@ def read_vl(path: Path) -> npt.NDArray[np.float32]:
     try:
         if not path.is_file():  # a device would never end
             raise OSError(0, "no regular file")
-        LIMITS.check("bytes", path.stat().st_size, path)
         data = path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a frame of BIWI") from error

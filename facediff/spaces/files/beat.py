@@ -14,7 +14,7 @@ from facediff.spaces.files.clips import ParameterClip, checked
 from facediff.spaces.files.tables import rate_of
 from facediff.spaces.layouts import LAYOUTS, layout
 from facediff.spaces.space import Space
-from facediff.utils.limits import FRAME_RATES, LIMITS, check_number, quoted
+from facediff.utils.limits import FRAME_RATES, check_number, quoted
 from facediff.utils.plain_files import load_json, write_json
 
 REMEDY = "expected names and frames with weights, as BEAT and LAM write them"
@@ -37,7 +37,6 @@ def read_beat(path: Path) -> ParameterClip:
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(names, list) or not isinstance(frames, list) or not all(isinstance(name, str) for name in names):
         raise FaceDiffError(f"{path}: has no names and frames; {REMEDY}")
-    LIMITS.check("frames", len(frames), path)
     space = _space(path, names)
     values = np.empty((len(frames), len(names)))
     for number, frame in enumerate(frames):
@@ -83,7 +82,7 @@ def _times(path: Path, frames: list[Any]) -> np.ndarray[Any, np.dtype[np.float64
     stated = [frame.get("time") for frame in frames]
     if any(time is None for time in stated):
         return None
-    times = np.array([check_number(path, "time", time, 0, LIMITS.seconds, remedy=REMEDY) for time in stated])
+    times = np.array([check_number(path, "time", time, 0, remedy=REMEDY) for time in stated])
     if (np.diff(times) <= 0).any():
         row = int(np.argmax(np.diff(times) <= 0)) + 1
         raise FaceDiffError(f"{path}: frame {row} is no later than the one before it; write it again")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.spaces.operations import at_times
 from facediff.spaces.space import Space
-from facediff.utils.limits import FRAME_RATES, LIMITS, check_number
+from facediff.utils.limits import FRAME_RATES, check_number
 
 Values = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
@@ -66,19 +66,17 @@ def even(clip: ParameterClip) -> ParameterClip:
     if clip.times is None:
         return clip
     count = round(float(clip.times[-1]) * clip.frame_rate) + 1
-    LIMITS.check("frames", count, clip.name)
     values = at_times(clip.values, clip.space, clip.times, np.arange(count) / clip.frame_rate)
     return replace(clip, values=values.astype(np.float32), times=None)
 
 
 def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> Values:
-    """Values of a file (T, C) as float32, within the budget and finite.
+    """Values of a file (T, C) as float32, finite.
 
     Raises:
         FaceDiffError: naming the file, if they are not.
     """
     check_number(path, "frame rate", frame_rate, *FRAME_RATES)
-    LIMITS.check("frames", len(values), path)
     if not len(values):
         raise FaceDiffError(f"{path}: holds no frames; record it again")
     if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > LARGEST:

@@ -16,7 +16,7 @@ from facediff.spaces.files.clips import Array, ParameterClip, checked, columns_o
 from facediff.spaces.layouts import layout
 from facediff.spaces.operations import permuted
 from facediff.utils.files import atomic
-from facediff.utils.limits import LIMITS, quoted
+from facediff.utils.limits import quoted
 from facediff.utils.plain_files import read_table, write_table
 
 Values = npt.NDArray[np.floating]
@@ -135,7 +135,6 @@ def read_live_link(path: Path) -> ParameterClip:
     at_time = folded.index("timecode")
     times, values, numbers = [], [], []
     for number, row in enumerate(rows, start=2):
-        LIMITS.check("frames", number - 1, path)
         if not any(cell.strip() for cell in row[2:]):
             continue  # a frame in which the phone saw no face: its row has a timecode and nothing else
         seconds = seconds_of(row[at_time]) if len(row) > at_time else None
@@ -234,7 +233,6 @@ def read_audio2face(path: Path) -> ParameterClip:
     values = []
     times = []
     for number, row in enumerate(rows, start=2):
-        LIMITS.check("frames", number - 1, path)
         full = [*row, *("0" for _ in absent)]
         times.append(_numbers(path, number, full, [at_time], wide)[0])
         values.append(_numbers(path, number, full, columns, wide))

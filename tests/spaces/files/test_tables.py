@@ -14,7 +14,6 @@ from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files import ParameterClip, even, read_parameters, write_parameters
 from facediff.spaces.files.tables import seconds_of, timecode
 from facediff.spaces.rotations import convert, matrices
-from facediff.utils.limits import Limits
 
 # The first rows of a real take have such steps: two sixtieths less a thousandth now and then.
 CODES = ("13:13:04:31.652", "13:13:04:33.651", "13:13:04:35.651", "13:13:04:41.650", "13:13:04:43.650")
@@ -132,22 +131,6 @@ def test_read_live_link_counts_the_rows_without_a_face(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("\n".join(lines))
     with pytest.raises(FaceDiffError, match="row 5 is no later"):
         read_parameters(tmp_path / "take.csv")
-
-
-def test_live_link_may_have_as_many_rows_as_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_take(tmp_path / "take.csv")
-    count = len(read_parameters(tmp_path / "take.csv").values)
-    monkeypatch.setattr("facediff.spaces.files.tables.LIMITS", Limits(frames=count))
-    assert len(read_parameters(tmp_path / "take.csv").values) == count
-
-
-def test_audio2face_table_is_never_cut_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = [f"blendShapes.{name[:1].upper()}{name[1:]}" for name in layout("audio2face").channels]
-    rows = [",".join(map(str, [frame / 30, *len(names) * [0]])) for frame in range(4)]
-    (tmp_path / "a.csv").write_text("\n".join([",".join(["timeCode", *names]), *rows]))
-    monkeypatch.setattr("facediff.spaces.files.tables.LIMITS", Limits(frames=3))
-    with pytest.raises(FaceDiffError, match="frames"):
-        read_parameters(tmp_path / "a.csv")
 
 
 def test_audio2face_time_without_an_end_is_refused(tmp_path: Path) -> None:
