@@ -237,46 +237,8 @@ WRITES_NOTHING = ("components", "check-install", "data check")
 FIT = "fit"
 
 
-@dataclass(frozen=True)
-class Served:
-    """A command that serves a page until it is stopped, or until the speech is over.
-
-    Attributes:
-        command: its name in ``facediff.cli.app.COMMANDS``.
-        words: what follows the name, with ``{port}`` for the port.
-        also: inputs that the words do not mention.
-        same: whether the page is the same at each start.
-        answers: the folder of the study whose raters answer meanwhile; empty for none.
-        lines: the file of JSON lines that it writes; empty for none.
-    """
-
-    command: str
-    words: str
-    also: str = ""
-    same: bool = True
-    answers: str = ""
-    lines: str = ""
-
-    def argv(self, port: int) -> list[str]:
-        """The words after ``facediff``."""
-        return [*self.command.split(), *self.words.format(port=port).split()]
-
-    def inputs(self, folder: Path) -> list[Path]:
-        """The inputs that the words mention."""
-        return [path for path in sorted(folder.iterdir()) if path.name in f"{self.words} {self.also}".split()]
-
-
-SERVES = [
-    Served("study serve", "answered --port {port}", answers="answered"),
-    Served("serve", "face --port {port}", also=WEB_RUNTIME),
-    Served(
-        "live",
-        "face long.wav --to browser:{port} --to jsonl:take.jsonl?weights=false&vertices=true",
-        same=False,
-        lines="take.jsonl",
-    ),
-]
-"""Struck while a client asks for the page, and answers the study's questions."""
+SERVES = ("study serve", "serve", "live")
+"""Run until they are stopped; that an acknowledged answer outlives a kill is in tests/study/test_store.py."""
 
 
 def write_inputs(folder: Path, run: object) -> None:

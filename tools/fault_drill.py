@@ -1,4 +1,4 @@
-"""Kills, stops, fills the disk of, locks out and feeds damaged files to every command that writes, and counts losses.
+"""Kills, stops, fills the disk of and locks out every command that writes, and counts losses.
 
     python tools/fault_drill.py --markdown results.md
 
@@ -7,23 +7,18 @@ there, runs the command again without a fault, and compares every file with thos
 
 - lost: a file that was there before is gone, or an output does not appear when the command is run again;
 - corrupt: a file under its final name is neither the earlier one nor the finished one;
-- wrong: the second run fails, or its files differ from the uninterrupted run's; a cut input was used without a word;
+- wrong: the second run fails, or its files differ from the uninterrupted run's;
 - left over: files that the uninterrupted run does not have are there after the second run;
-- ill-mannered: a traceback, an exit status other than the documented one, no sentence or several, no end in a minute.
+- ill-mannered: a traceback, an exit status other than the documented one, no end in a minute.
 
 Faults of a command: ``kill`` (SIGKILL, half of them at the moment of a write, half at any time), ``stop`` (SIGTERM or
-Ctrl-C), ``full`` (a disk with room for a part of what the command writes), ``denied`` (folders that may not be written,
-files that may not be read) and ``damage`` (cut, flipped, empty or grown inputs and earlier outputs). ``fit`` is killed
-and resumed by ``--ckpt_path last`` until it ends; its curve and weights must equal an uninterrupted run's bit for bit.
-Commands that serve are killed and stopped while a client asks for the page and answers the study: what was acknowledged
-must be stored, every line that live has written must be whole, and the next start must serve on the same port.
+Ctrl-C), ``full`` (a disk with room for a part of what the command writes) and ``denied`` (folders that may not be
+written, files that may not be read). ``fit`` is killed and resumed by ``--ckpt_path last`` until it ends; its curve and
+weights must equal an uninterrupted run's bit for bit.
 
-With ``--dask``, every command that takes ``--scheduler`` does its tasks on a Dask cluster of two workers.
-
-Most runs are forks of a process that has imported everything, which saves seconds each; ``--real`` rounds of each
-command are processes of their own. The small disk is a tmpfs, in a user namespace if need be; where neither is allowed,
-a limit on the size of files (``RLIMIT_FSIZE``) takes its place, and the report says so. The exit status is 1 if any
-count is not 0.
+Runs are forks of a process that has imported everything, which saves seconds each. The small disk is a tmpfs, for which
+this program must be root (``unshare --map-root-user --mount`` where users may have namespaces). The exit status is 1 if
+any count is not 0.
 """
 
 from __future__ import annotations
@@ -33,27 +28,22 @@ import atexit
 import csv
 import ctypes
 import hashlib
-import http.client
 import importlib
 import json
 import os
 import pkgutil
 import random
 import re
-import resource
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 import traceback
-import urllib.error
-import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -64,11 +54,10 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from tools.dask_processes import DaskProcesses  # noqa: E402
-from tools.drill_commands import DRILLS, FIT, SERVES, WEB_RUNTIME, Drill, Served, write_inputs  # noqa: E402
+from tools.drill_commands import DRILLS, FIT, WEB_RUNTIME, Drill, write_inputs  # noqa: E402
 
 COUNTS = ("lost", "corrupt", "wrong", "left over", "ill-mannered")
-FAULTS = ("kill", "stop", "full", "denied", "damage")
+FAULTS = ("kill", "stop", "full", "denied")
 MINUTE = 60.0
 SLACK = 4.0  # a machine that others use as well; the law's minute is for an idle one
 LIBRARIES = (
@@ -76,8 +65,6 @@ LIBRARIES = (
 )
 LIBRARIES += " scipy.optimize trimesh pygltflib soundfile soxr cv2 av PIL.Image h5py yaml rich.table rich.progress"
 LIBRARIES += " matplotlib.pyplot fast_simplification dtaidistance tensorboard pxr.Usd"
-SHOWS_A_CUT = (".wav", ".npy", ".npz", ".ckpt", ".pkl", ".vl", ".hdf5")
-"""Formats that say how long they are, so that a file that was cut off is recognised."""
 CAPABILITIES = (1, 2, 3)  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAP_FOWNER: what lets root ignore permissions
 
 
@@ -135,7 +122,6 @@ def execute(
     point: int | None = None,
     delay: float = 0.0,
     prepare: Callable[[], None] = lambda: None,
-    real: bool = False,
 ) -> Run:
     """Run ``facediff`` with some words in the folder ``place/work``, and strike it.
 
@@ -147,22 +133,18 @@ def execute(
         point: or the number of the write at which to send it.
         delay: seconds between that write and the signal.
         prepare: called in the new process.
-        real: start an interpreter instead of forking.
     """
     for name in ("home", "tmp"):
         (place / name).mkdir(exist_ok=True)
     reader, writer = os.pipe()
     start = time.monotonic()
     logs = [place / "stdout", place / "stderr"]
-    if real:
-        process = start_interpreter(words, place, logs, prepare, writer)
-    else:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        process = os.fork()
-        if process == 0:
-            os.close(reader)
-            run_forked(words, place, logs, writer, point, prepare)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    process = os.fork()
+    if process == 0:
+        os.close(reader)
+        run_forked(words, place, logs, writer, point, prepare)
     os.close(writer)
     struck, points, status = False, 0, None
     os.set_blocking(reader, False)
@@ -218,26 +200,6 @@ def environment(place: Path) -> dict[str, str]:
         "PYTHONPATH": str(ROOT),
         "HF_HUB_OFFLINE": "1",
     }
-
-
-def start_interpreter(
-    words: Sequence[str], place: Path, logs: Sequence[Path], prepare: Callable[[], None], writer: int
-) -> int:
-    """Start ``python -m facediff``; its process number."""
-    with logs[0].open("wb") as out, logs[1].open("wb") as err:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "facediff", *words],
-            cwd=place / "work",
-            env={**os.environ, **environment(place)},
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-            start_new_session=True,
-            preexec_fn=prepare,  # noqa: PLW1509 - this process has no threads
-        )
-    os.write(writer, b"begun ")
-    process.returncode = 0  # waited for by the caller
-    return process.pid
 
 
 def run_forked(
@@ -421,10 +383,9 @@ def plain(value: Any) -> Any:  # noqa: ANN401
 
 
 class Disk:
-    """A file system of its own whose room a filler takes, or nothing where none can be mounted.
+    """A file system of its own in memory, whose room a filler takes.
 
-    Attributes:
-        kind: ``tmpfs`` or ``RLIMIT_FSIZE``.
+    Args:
         folder: where it is mounted.
     """
 
@@ -433,25 +394,14 @@ class Disk:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir()
-        options = ["mount", "-t", "tmpfs", "-o", f"size={self.SIZE}", "tmpfs", str(folder)]
-        self.kind = "RLIMIT_FSIZE"
-        with suppress(OSError):
-            if subprocess.run(options, capture_output=True, check=False).returncode == 0:
-                self.kind = "tmpfs"
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={self.SIZE}", "tmpfs", str(folder)], check=True)
 
     def fill(self, room: int) -> None:
         """Leave ``room`` bytes."""
-        if self.kind == "tmpfs":
-            facts = os.statvfs(self.folder)
-            size = max(facts.f_bavail * facts.f_frsize - room, 0)
-            with (self.folder / "filler").open("wb") as filler:
-                os.posix_fallocate(filler.fileno(), 0, max(size, 1))
-
-    def limit(self, room: int) -> Callable[[], None]:
-        """What a new process calls where there is no small disk."""
-        if self.kind == "tmpfs":
-            return lambda: None
-        return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+        facts = os.statvfs(self.folder)
+        size = max(facts.f_bavail * facts.f_frsize - room, 1)
+        with (self.folder / "filler").open("wb") as filler:
+            os.posix_fallocate(filler.fileno(), 0, size)
 
     def free(self) -> None:
         """Remove the filler."""
@@ -459,8 +409,7 @@ class Disk:
 
     def close(self) -> None:
         """Unmount."""
-        if self.kind == "tmpfs":
-            subprocess.run(["umount", "-l", str(self.folder)], capture_output=True, check=False)
+        subprocess.run(["umount", "-l", str(self.folder)], check=False)
 
 
 def obey_permissions() -> None:
@@ -571,7 +520,7 @@ class Driller:
         self.score.note(what, f"{self.what}: {text}")
 
     def judge_manners(self, run: Run, allowed: Sequence[int]) -> None:
-        """No traceback, a documented exit status, and a sentence if it is not 0."""
+        """No traceback, and a documented exit status."""
         said = run.out + run.err
         if run.seconds > MINUTE * SLACK:
             self.note("ill-mannered", f"took {run.seconds:.0f} s")
@@ -579,12 +528,6 @@ class Driller:
             self.note("ill-mannered", f"traceback: {said.strip()[-300:]}")
         elif run.status not in allowed:
             self.note("ill-mannered", f"status {run.status}, expected {allowed}: {said.strip()[-200:]}")
-        elif run.status == 2:
-            errors = [line for line in run.err.splitlines() if "error:" in line]
-            if len(errors) != 1:
-                self.note("ill-mannered", f"{len(errors)} sentences: {said.strip()[-300:]}")
-        elif run.status not in (0, 3) and run.status > 0 and not said.strip():
-            self.note("ill-mannered", f"status {run.status} without a word")
 
     def judge_files(
         self, place: Path, changed: Sequence[str] = (), *, clean: bool = False, other_inputs: bool = False
@@ -658,21 +601,21 @@ class Driller:
             return {"point": self.random.randint(1, self.whole.points), "delay": late}
         return {"after": self.random.uniform(0, 1.05 * self.whole.seconds)}
 
-    def kill(self, score: Score, *, real: bool = False) -> None:
+    def kill(self, score: Score) -> None:
         """Kill -9, then run again."""
-        moment = {"after": self.random.uniform(0.2, 10)} if real else self.moment()
+        moment = self.moment()
         with self.round(score, f"SIGKILL {moment}") as place:
-            run = execute(self.drill.argv(), place, real=real, **moment)
+            run = execute(self.drill.argv(), place, **moment)
             score.struck += run.status == -signal.SIGKILL
             self.judge_files(place)
             self.judge_again(place)
 
-    def stop(self, score: Score, *, real: bool = False) -> None:
+    def stop(self, score: Score) -> None:
         """SIGTERM or Ctrl-C, then run again."""
         number = self.random.choice([signal.SIGTERM, signal.SIGINT])
-        moment = {"after": self.random.uniform(1, 10)} if real else self.moment()
+        moment = self.moment()
         with self.round(score, f"{signal.Signals(number).name} {moment}") as place:
-            run = execute(self.drill.argv(), place, number=number, real=real, **moment)
+            run = execute(self.drill.argv(), place, number=number, **moment)
             score.struck += run.status != 0
             # A process that a signal ends has the same status for the shell as one that ends with 128 + number.
             self.judge_manners(run, (0, 128 + number, -number))
@@ -696,7 +639,7 @@ class Driller:
             for name in ("stdout", "stderr"):
                 (place / name).unlink(missing_ok=True)
                 (place / name).symlink_to(logs / name)
-            run = execute(self.drill.argv(), place, prepare=self.disk.limit(max(room, 1)))
+            run = execute(self.drill.argv(), place)
             self.disk.free()
             score.struck += run.status != 0
             self.judge_manners(run, (0, 1, 2))
@@ -708,8 +651,6 @@ class Driller:
 
     def disk_folder(self) -> Path:
         """A folder on the small disk for this command."""
-        if self.disk.kind != "tmpfs":
-            return self.scratch
         folder = self.disk.folder / self.scratch.name
         folder.mkdir(exist_ok=True)
         (folder / "matplotlib").mkdir(exist_ok=True)
@@ -746,68 +687,6 @@ class Driller:
         files = [path for path in sorted(work.rglob("*")) if path.is_file()]
         skipped = {"bystander.txt", "demo.yaml"}
         return [path for path in files if path.name not in skipped and path.relative_to(work).as_posix() not in earlier]
-
-    def damage(self, score: Score) -> None:
-        """Damaged bytes of an input or of an earlier output."""
-        outputs = [
-            name for name, mark in self.after.items() if self.before.get(name) != mark and not name.endswith("/")
-        ]
-        inputs = self.input_files(self.scratch / "begin" / "work")
-        earlier = (self.random.random() < 0.3 or not inputs) and bool(outputs)
-        if not earlier and not inputs:
-            return
-        with self.round(score, "damage of an output" if earlier else "damage of") as place:
-            work = place / "work"
-            if earlier:
-                # As it is after a run that was not interrupted; then something else on this machine went wrong.
-                shutil.rmtree(work)
-                copy(self.scratch / "whole" / "work", work)
-                path = work / self.random.choice(outputs)
-            else:
-                path = self.random.choice(self.input_files(work))
-            name = path.relative_to(work).as_posix()
-            # A run that continues compares its earlier files by size; flipped bytes are for `data check` to find.
-            kinds = (
-                ("cut", "empty", "grow") if earlier and self.drill.pieces else ("cut", "flip", "flip", "empty", "grow")
-            )
-            kind, data = damaged(path.read_bytes(), self.random, kinds)
-            self.what += f" {name}: {kind}"
-            path.write_bytes(data)
-            run = execute(self.drill.argv(), place)
-            score.struck += run.status != 0
-            self.judge_manners(run, (0, 1, 2))
-            if earlier:
-                if run.status == 0:
-                    self.judge_result(place)
-                return
-            if run.status == 0:
-                if (
-                    kind == "cut"
-                    and path.suffix in SHOWS_A_CUT
-                    and tree(work) != {**self.after, name: fingerprint(path)}
-                ):
-                    self.note("wrong", "was used without a word")
-            else:
-                self.judge_files(place, [name], clean=True, other_inputs=True)
-            leftovers = [each for each in tree(work) if each not in self.after and each not in self.before]
-            if run.status == 0 and leftovers and not self.drill.pieces:
-                self.note("left over", f"{leftovers}")
-
-
-def damaged(data: bytes, rng: random.Random, kinds: Sequence[str]) -> tuple[str, bytes]:
-    """Damaged bytes, and how they were damaged."""
-    kind = rng.choice(kinds)
-    body = bytearray(data)
-    if kind == "cut" and len(body) > 1:
-        del body[rng.randrange(1, len(body)) :]
-    elif kind == "flip" and body:
-        for _ in range(rng.choice([1, 8, 64])):
-            body[rng.randrange(len(body))] ^= 1 << rng.randrange(8)
-    elif kind == "grow":
-        body += rng.randbytes(rng.choice([1, 100, 100_000]))
-    else:
-        kind, body = "empty", bytearray()
-    return kind, bytes(body)
 
 
 def copy(source: Path, target: Path) -> None:
@@ -859,16 +738,16 @@ class FitDriller:
             copy(self.inputs / each, place / "work" / each)
         return place
 
-    def drill(self, kills: int, stops: int, real: int) -> dict[str, Score]:
+    def drill(self, kills: int, stops: int) -> dict[str, Score]:
         """Train until so many kills and stops have come before the end of a run."""
         wanted = {"kill": kills, "stop": stops}
         for run in range(1, 10 * (kills + stops)):
             if all(self.scores[fault].struck >= wanted[fault] for fault in wanted):
                 break
-            self.train(f"run{run}", wanted, real=run <= real)
+            self.train(f"run{run}", wanted)
         return self.scores
 
-    def train(self, name: str, wanted: Mapping[str, int], *, real: bool) -> None:
+    def train(self, name: str, wanted: Mapping[str, int]) -> None:
         """Train once, from the start to the end, with several strikes between."""
         place = self.new(name)
         story: list[str] = []
@@ -876,10 +755,10 @@ class FitDriller:
             missing = [fault for fault in wanted if self.scores[fault].struck < wanted[fault]]
             fault = self.random.choice(missing) if missing and attempt < self.MOST_ATTEMPTS else ""
             number = signal.SIGKILL if fault != "stop" else self.random.choice([signal.SIGTERM, signal.SIGINT])
-            moment = self.moment(real=real) if fault else {}
+            moment = self.moment() if fault else {}
             resumes = any(place.rglob("last.ckpt"))
             words = [*self.WORDS, *(["--ckpt_path", "last"] if resumes else [])]
-            run = execute(words, place, number=number, real=real and bool(fault), **moment)
+            run = execute(words, place, number=number, **moment)
             story.append(f"{fault} {moment} {'resumed ' if resumes else ''}{run.status}")
             score = self.scores[fault or "kill"]
             if run.status == 0:
@@ -905,160 +784,12 @@ class FitDriller:
             score.note("left over", f"fit, {name}: {file}; {story}")
         shutil.rmtree(place)
 
-    def moment(self, *, real: bool) -> dict[str, Any]:
+    def moment(self) -> dict[str, Any]:
         """When to strike; writes are the moments of steps, logs and checkpoints."""
-        if real:
-            return {"after": self.random.uniform(4, 16)}
         if self.random.random() < 0.7:
             late = self.random.choice([0.0, self.random.uniform(0, 0.05)])
             return {"point": self.random.randint(1, self.whole.points), "delay": late}
         return {"after": self.random.uniform(0, self.whole.seconds)}
-
-
-# Serving
-
-
-class ServeDriller:
-    """Kills and stops a command that serves, while a client is at work.
-
-    Args:
-        served: the command.
-        inputs: the folder of all inputs.
-        scratch: an empty folder.
-        seed: of the moments.
-    """
-
-    SECONDS = 4.0
-    """Longest time until a strike; live speech ends before, sometimes."""
-
-    def __init__(self, served: Served, inputs: Path, scratch: Path, seed: int) -> None:
-        self.served = served
-        self.scratch = scratch
-        self.random = random.Random(f"{seed} {served.command} serves")  # noqa: S311
-        self.scores = {"kill": Score(), "stop": Score()}
-        self.page = ""
-        (scratch / "matplotlib").mkdir()
-        (scratch / "begin" / "work").mkdir(parents=True)
-        for path in served.inputs(inputs):
-            copy(path, scratch / "begin" / "work" / path.name)
-        self.before = tree(scratch / "begin" / "work")
-
-    def drill(self, kills: int, stops: int) -> dict[str, Score]:
-        """All rounds."""
-        for fault, count in (("kill", kills), ("stop", stops)):
-            for index in range(count):
-                number = signal.SIGKILL if fault == "kill" else self.random.choice([signal.SIGTERM, signal.SIGINT])
-                self.round(f"{fault}{index}", number, self.scores[fault])
-        return self.scores
-
-    def round(self, name: str, number: int, score: Score) -> None:
-        """Serve, strike, look, serve again on the same port, and end by Ctrl-C."""
-        place = self.scratch / name
-        copy(self.scratch / "begin", place)
-        port = free_port()
-        score.rounds += 1
-        after = self.random.uniform(0.2, self.SECONDS)
-        what = f"{self.served.command}, {name}, {signal.Signals(number).name} after {after:.2f} s"
-        for again, signalled, seconds in ((False, number, after), (True, signal.SIGINT, self.SECONDS)):
-            log = place / f"client{again:d}.json"
-            client = os.fork()
-            if client == 0:
-                run_client(port, log, self.served.answers)
-            run = execute(self.served.argv(port), place, number=signalled, after=seconds)
-            os.kill(client, signal.SIGTERM)
-            os.waitpid(client, 0)
-            score.struck += run.struck and not again
-            said = (run.out + run.err).strip()[-300:]
-            orderly = () if signalled == signal.SIGKILL else (128 + signalled,)
-            if run.status not in (0, -signalled, *orderly) or "Traceback" in said or "Exception ignored" in said:
-                score.note("ill-mannered", f"{what}: status {run.status}: {said}")
-            told = json.loads(log.read_text()) if log.exists() else {"pages": [], "raters": [], "statuses": []}
-            self.judge(place, told, what, score, again=again)
-        shutil.rmtree(place)
-
-    def judge(self, place: Path, told: dict[str, Any], what: str, score: Score, *, again: bool) -> None:
-        """What the client was told, and what is there now."""
-        if again and not told["pages"]:
-            score.note("wrong", f"{what}: the next start served nothing")
-        if bad := [status for status in told["statuses"] if status != 200]:
-            score.note("wrong", f"{what}: answered {bad[:5]}")
-        for page in told["pages"]:
-            self.page = self.page or page
-            if self.served.same and page != self.page:
-                score.note("wrong", f"{what}: another page")
-        if self.served.answers:
-            from facediff.study import read_study
-            from facediff.study.definition import DATABASE
-            from facediff.study.store import AnswerStore
-
-            folder = place / "work" / self.served.answers
-            stored = {rater.token: rater for rater in AnswerStore(folder / DATABASE, read_study(folder)).raters()}
-            for token, trial in told["raters"]:
-                if token not in stored or trial not in stored[token].answers:
-                    score.note("lost", f"{what}: an answer that was acknowledged")
-        if self.served.lines and (file := place / "work" / self.served.lines).exists():
-            for index, line in enumerate(file.read_text().split("\n")[:-1]):  # a kill may cut the last one
-                with suppress(ValueError):
-                    json.loads(line)
-                    continue
-                score.note("corrupt", f"{what}: line {index} of {self.served.lines}")
-        found = tree(place / "work")
-        for name, mark in self.before.items():
-            if found.get(name) != mark and not (self.served.answers and ".sqlite" in name):
-                score.note("corrupt" if name in found else "lost", f"{what}: {name}")
-        for name in found.keys() - self.before.keys() - {self.served.lines}:
-            if again and not name.endswith(("-wal", "-shm")):
-                score.note("left over", f"{what}: {name}")
-
-
-def free_port() -> int:
-    """A port that nobody listens at."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        return int(listening.getsockname()[1])
-
-
-def run_client(port: int, log: Path, answers: str) -> None:
-    """Ask for the page, and answer as raters do, until this process is ended; what was answered goes to a file."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    told: dict[str, list[Any]] = {"pages": [], "raters": [], "statuses": []}
-
-    def ask(path: str, content: object = None) -> bytes:
-        body = None if content is None else json.dumps(content).encode()
-        request = urllib.request.Request(  # noqa: S310 - our own server
-            f"http://127.0.0.1:{port}{path}", body, {"Content-Type": "application/json"}
-        )
-        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310
-            return bytes(response.read())
-
-    try:
-        study = None
-        if answers:
-            from facediff.study import read_study
-
-            study = read_study(log.parent / "work" / answers)
-        while True:
-            time.sleep(0.05)
-            try:
-                told["pages"].append(hashlib.sha256(ask("/")).hexdigest()[:16])
-                if study is not None:
-                    token = os.urandom(16).hex()
-                    common = {"study": study.id, "rater": token}
-                    begun = {**common, "language": "en", "code": "", "agreed": True}
-                    number = json.loads(ask("/api/raters", begun))["number"]
-                    trial = study.trials_of(number)[0].id
-                    given = {name: "left" for name in ("realism", "style")}
-                    facts = {"trial": trial, "answers": given, "seconds": 1.0, "plays": 1}
-                    ask("/api/answers", {**common, **facts, "at": "2026-01-01T00:00:00.000Z"})
-                    told["raters"].append([token, trial])
-            except urllib.error.HTTPError as error:
-                told["statuses"].append(error.code)
-            except (OSError, http.client.HTTPException):  # not yet, or no longer
-                pass
-            partial = log.with_suffix(".new")
-            partial.write_text(json.dumps(told))
-            partial.rename(log)
-    finally:
-        os._exit(1)
 
 
 # The whole drill
@@ -1076,7 +807,7 @@ def drill_one(drill: Drill, inputs: Path, scratch: Path, args: argparse.Namespac
 def drill_on(drill: Drill, inputs: Path, scratch: Path, disk: Disk, args: argparse.Namespace) -> dict[str, Score]:
     """The rounds, on a disk."""
     driller = Driller(drill, inputs, scratch, disk, args.seed)
-    wanted = {"kill": args.kills, "stop": args.stops, "full": args.full, "denied": args.denied, "damage": args.damages}
+    wanted = {"kill": args.kills, "stop": args.stops, "full": args.full, "denied": args.denied}
     scores = {}
     for fault in FAULTS:
         score = scores[fault] = Score()
@@ -1085,10 +816,7 @@ def drill_on(drill: Drill, inputs: Path, scratch: Path, disk: Disk, args: argpar
         while (score.struck if fault in ("kill", "stop") else index) < wanted[fault] and index < 3 * wanted[fault]:
             index += 1
             try:
-                if fault in ("kill", "stop"):
-                    getattr(driller, fault)(score, real=index <= args.real)
-                else:
-                    getattr(driller, fault)(score)
+                getattr(driller, fault)(score)
             finally:
                 disk.free()
     return scores
@@ -1156,16 +884,11 @@ def options(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--stops", type=int, default=2, metavar="N", help="SIGTERM or Ctrl-C of each command")
     parser.add_argument("--full", type=int, default=3, metavar="N", help="full disks of each command")
     parser.add_argument("--denied", type=int, default=2, metavar="N", help="permissions removed, of each command")
-    parser.add_argument("--damages", type=int, default=5, metavar="N", help="damaged files of each command")
     parser.add_argument(
         "--fit-kills", type=int, default=50, metavar="N", help="kill -9 of fit, each followed by a resume"
     )
     parser.add_argument("--fit-stops", type=int, default=10, metavar="N", help="SIGTERM or Ctrl-C of fit")
-    parser.add_argument("--real", type=int, default=0, metavar="N", help="of these, in interpreters of their own")
     parser.add_argument("--only", action="append", metavar="TEXT", help="commands whose name contains this; repeatable")
-    parser.add_argument(
-        "--dask", action="store_true", help="tasks run on a Dask cluster of two workers on the loopback"
-    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="commands drilled at a time")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there as well")
@@ -1177,13 +900,8 @@ def main(words: Sequence[str] | None = None) -> int:
     args = options(words)
     started = time.monotonic()
     import_everything()
-    with tempfile.TemporaryDirectory(prefix="fault-drill-") as name, ExitStack() as stack:
+    with tempfile.TemporaryDirectory(prefix="fault-drill-") as name:
         folder = Path(name)
-        if args.dask:
-            for library in ("distributed", "cloudpickle"):
-                importlib.import_module(library)
-            cluster = stack.enter_context(DaskProcesses(folder / "dask"))
-            os.environ["DASK_SCHEDULER_ADDRESS"] = cluster.address
         inputs = folder / "inputs"
         inputs.mkdir()
         separately({"inputs": lambda: make_inputs(inputs, folder)}, 1, folder)
@@ -1191,46 +909,20 @@ def main(words: Sequence[str] | None = None) -> int:
         if (args.fit_kills or args.fit_stops) and (not args.only or FIT in args.only):
             scratch = folder / "fit"
             scratch.mkdir()
-            tasks[FIT] = lambda: FitDriller(inputs, scratch, args.seed).drill(args.fit_kills, args.fit_stops, args.real)
+            tasks[FIT] = lambda: FitDriller(inputs, scratch, args.seed).drill(args.fit_kills, args.fit_stops)
         for index, drill in enumerate(DRILLS):
             if args.only and not any(text in drill.name for text in args.only):
                 continue
             place = folder / f"drill{index}"
             place.mkdir()
             tasks[drill.name] = lambda drill=drill, place=place: drill_one(drill, inputs, place, args)
-        for index, served in enumerate(SERVES):
-            if args.only and not any(text in served.command for text in args.only):
-                continue
-            place = folder / f"serve{index}"
-            place.mkdir()
-            tasks[f"{served.command} (served)"] = lambda served=served, place=place: ServeDriller(
-                served, inputs, place, args.seed
-            ).drill(args.kills, args.stops)
         results = separately(tasks, args.jobs, folder)
     text = table(results)
-    text += f"\n\nSeed {args.seed}; small disk: {small_disk()}; {time.monotonic() - started:.0f} s.\n"
+    text += f"\n\nSeed {args.seed}; {time.monotonic() - started:.0f} s.\n"
     print(text)
     if args.markdown is not None:
         args.markdown.write_text(text, encoding="utf-8")
     return int(any(sum(score.counts.values()) for scores in results.values() for score in scores.values()))
-
-
-def small_disk() -> str:
-    """What takes the place of a small disk here."""
-    with tempfile.TemporaryDirectory() as name:
-        disk = Disk(Path(name) / "disk")
-        disk.close()
-    return "a tmpfs" if disk.kind == "tmpfs" else "RLIMIT_FSIZE, since no file system could be mounted"
-
-
-def in_user_namespace(words: Sequence[str]) -> None:
-    """Start this program again as root of a user namespace, where one is allowed: it may mount a file system there."""
-    if os.geteuid() == 0 or "FAULT_DRILL_NAMESPACE" in os.environ or shutil.which("unshare") is None:
-        return
-    inside = ["unshare", "--map-root-user", "--mount"]
-    if subprocess.run([*inside, "true"], capture_output=True, check=False).returncode == 0:
-        os.environ["FAULT_DRILL_NAMESPACE"] = "1"
-        os.execvp(inside[0], [*inside, sys.executable, __file__, *words])  # noqa: S606
 
 
 def make_inputs(inputs: Path, folder: Path) -> dict[str, Score]:
@@ -1252,5 +944,4 @@ def make_inputs(inputs: Path, folder: Path) -> dict[str, Score]:
 
 
 if __name__ == "__main__":
-    in_user_namespace(sys.argv[1:])
     sys.exit(main())

@@ -104,7 +104,7 @@ class Check:
     def training(self) -> Any:  # noqa: ANN401 - the benchmark's
         """A model and a corpus of the benchmark of training."""
         if self._training is None:
-            from training_parts import Bench, write_corpus
+            from training import Bench, write_corpus
 
             write_corpus(self.sizes.root, self.sizes.clips, self.sizes.frames, self.sizes.vertices)
             self._training = Bench(self.sizes, frozen=2)
@@ -146,7 +146,7 @@ class Check:
 
     def train(self) -> Iterator[Row]:
         """Clips a second of each way of training, and what batches of a frame budget, bf16 and compiling bring."""
-        from training_parts import COMPILED, FLOAT32, MIXED, PEERS, in_turn
+        from training import COMPILED, FLOAT32, MIXED, PEERS, in_turn
 
         single = 3 if self.cuda else 1
         size = f"{self.sizes.vertices} vertices"
@@ -170,7 +170,7 @@ class Check:
 
     def loader(self) -> Iterator[Row]:
         """Whether batches are read as quickly as they are trained on."""
-        from training_parts import MIXED
+        from training import MIXED
 
         batches = self.training.batches(MIXED)
         next(batches)
@@ -186,40 +186,9 @@ class Check:
         yield Row("loading, to the device", f"{read:.1f} clips/s, {read / trained:.1f} × training", "≥ 1 × training",
                   self.speed(read >= trained))  # fmt: skip
 
-    def losses(self) -> Iterator[Row]:
-        """The fused losses at several sizes of their blocks, forward and backward."""
-        from facediff.models import losses_fused
-
-        name = "DEVICE_SIZE" if self.cuda else "CACHE_SIZE"
-        usual = getattr(losses_fused, name)
-        from training_parts import FLOAT32
-
-        batch = next(self.training.batches(FLOAT32)).to(self.device)
-        model, steps = self.training.model, self.training.model.process.draw_steps(len(batch), self.device)
-        noise = torch.randn(batch.motion.flatten(2).shape, device=self.device)
-
-        def step() -> None:
-            model.losses_at(batch, steps, noise.clone())["loss"].backward()  # it overwrites the noise
-            model.zero_grad()
-
-        seconds = {}
-        try:
-            for power in (-4, -2, 0, 2):
-                setattr(losses_fused, name, int(usual * 2.0**power))
-                seconds[power] = self.clock(step)
-        finally:
-            setattr(losses_fused, name, usual)
-        best = min(seconds, key=lambda power: seconds[power])
-        told = ", ".join(
-            f"2^{usual.bit_length() - 1 + power}: {1e3 * value:.1f} ms" for power, value in seconds.items()
-        )
-        yield Row("a step by block size of the fused losses", f"{told}; best 2^{usual.bit_length() - 1 + best}",
-                  f"2^{usual.bit_length() - 1}, as built in, within 10 % of the best",
-                  self.speed(seconds[0] <= 1.1 * seconds[best]))  # fmt: skip
-
     def long_batches(self) -> Iterator[Row]:
         """A training step on one long clip."""
-        from training_parts import FLOAT32, MIXED
+        from training import FLOAT32, MIXED
 
         from facediff.data import Batch, Sample, collate
 
@@ -239,7 +208,7 @@ class Check:
 
     def sampling(self) -> Iterator[Row]:
         """Real-time factors by sampler, the first frame, memory, and folded against vertex space."""
-        from sampling_parts import build
+        from sampling import build
 
         from facediff.data.batch import Reference
 
@@ -250,7 +219,6 @@ class Check:
             factor = self.clock(lambda: model.generate(batch), 2) / seconds
             told = f"real-time factor {factor:.4f}, {self.peak()}"
             yield Row(f"sampling, {name}, {model.sampler.steps} steps", told, "< 1", self.speed(factor < 1))
-        yield from self._spaces(model, batch)
         style = Reference("reference", batch.reference[0])
         speech = (0.1 * torch.randn(16000 * 6, generator=torch.Generator().manual_seed(0))).numpy()
 
@@ -265,18 +233,6 @@ class Check:
         ahead = model.windows.look_ahead
         yield Row("first frame of a stream", f"computed in {taken:.3f} s, after {ahead:.2f} s of speech",
                   "computed within the 3 s until the next frames", self.speed(taken < 3))  # fmt: skip
-
-    def _spaces(self, model: Any, batch: Any) -> Iterator[Row]:  # noqa: ANN401
-        """The sampling in folded coordinates and on all vertices; they draw other noise of the same distribution."""
-        seconds, finite = {}, True
-        for space in ("folded", "vertices"):
-            model.sampling_space = space
-            seconds[space] = self.clock(lambda: model.generate(batch), 2)
-            finite &= bool(torch.isfinite(model.generate(batch)).all())
-        model.sampling_space = "folded"
-        ratio = seconds["vertices"] / seconds["folded"]
-        yield Row("folded against vertex space", f"{ratio:.2f} × as quick", "≥ 1 ×", self.speed(ratio >= 1))
-        yield Row("motion in both", "finite" if finite else "not finite", "finite", finite)
 
     def tests(self) -> Iterator[Row]:
         """The tests that need CUDA."""
@@ -332,7 +288,7 @@ def train_distributed(device: str) -> None:
 def run(check: Check, limit: float) -> Iterator[Row]:
     """Rows of all checks; a check that breaks is a row of its own, and one that there is no time for too."""
     started = time.monotonic()
-    parts = ("environment", "distributed", "train", "loader", "losses", "long_batches", "sampling", "tests")
+    parts = ("environment", "distributed", "train", "loader", "long_batches", "sampling", "tests")
     for name in parts:
         used = (time.monotonic() - started) / limit
         if used > (1 - RESERVE if name != "tests" else 0.9):

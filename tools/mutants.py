@@ -87,7 +87,6 @@ class Mutant:
         start: first byte of what is replaced.
         end: the byte after it.
         text: what stands there instead.
-        exchangeable: whether it lies in the body of a function, and not in what is run at import.
         key: names the change, also after lines elsewhere were edited.
     """
 
@@ -98,7 +97,6 @@ class Mutant:
     start: int
     end: int
     text: str
-    exchangeable: bool
     key: str
 
     def applied(self, source: bytes) -> bytes:
@@ -123,7 +121,6 @@ class Finder(ast.NodeVisitor):
         self.starts = starts
         self.scope: list[str] = []
         self.inside = False
-        self.body = False
         self.found: list[tuple[ast.AST, str, str, str, bool]] = []
         self.signless: set[ast.AST] = set()
         self.written: set[ast.AST] = set()
@@ -137,7 +134,7 @@ class Finder(ast.NodeVisitor):
 
     def add(self, node: ast.AST, what: str, new: ast.AST | str) -> None:
         text = new if isinstance(new, str) else f"({ast.unparse(new)})"
-        self.found.append((node, what, text, ".".join(self.scope), self.body))
+        self.found.append((node, what, text, ".".join(self.scope)))
 
     # What is left alone.
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
@@ -163,12 +160,11 @@ class Finder(ast.NodeVisitor):
         for default in [*node.args.defaults, *node.args.kw_defaults]:
             if default is not None:
                 self.visit(default)
-        self.body = True
         for statement in node.body:
             self.visit(statement)
         if outermost:
             self.scope.pop()
-            self.inside = self.body = False
+            self.inside = False
 
     def enter(self, name: str, body: Iterable[ast.stmt]) -> None:
         if not self.inside:
@@ -335,14 +331,14 @@ def mutants_of(file: str, source: bytes) -> list[Mutant]:
     found: list[Mutant] = []
     seen: collections.Counter[str] = collections.Counter()
     lines = source.decode().splitlines()
-    for node, what, text, function, body in finder.found:
+    for node, what, text, function in finder.found:
         start, end = finder.span(node)
         old = source[start:end].decode()
         parts = (file, function, what, lines[node.lineno - 1].strip(), old, text)  # type: ignore[attr-defined]
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:12]
         seen[key] += 1
         key += f"-{seen[key]}" if seen[key] > 1 else ""
-        found.append(Mutant(file, node.lineno, function, what, start, end, text, body, key))  # type: ignore[attr-defined]
+        found.append(Mutant(file, node.lineno, function, what, start, end, text, key))  # type: ignore[attr-defined]
     return found
 
 

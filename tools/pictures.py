@@ -4,8 +4,8 @@
     python tools/pictures.py                      # all of them, in about ten minutes on two cores
     python tools/pictures.py own_mesh viewer_overlay --scratch made
 
-Not made here: convergence.svg (docs/results/puppet_methods.md), export_blender.png and live_path.svg (by the
-commands next to them) and architecture.svg.
+Not made here: convergence.svg (docs/results/puppet_methods.md), and export_blender.png, live_path.svg and
+architecture.svg, which were drawn by hand or by programs of version 1.1.0.
 """
 
 from __future__ import annotations

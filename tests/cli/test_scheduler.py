@@ -85,7 +85,7 @@ def test_threads_write_what_is_written_without_the_option(place: Path, capsys: p
 def test_a_cluster_of_other_processes_writes_the_same(place: Path, checkpoint: Path) -> None:
     """With one of its two workers killed between the commands."""
     pytest.importorskip("distributed")
-    from tools.dask_processes import DaskProcesses
+    from tests.fakes.dask_processes import DaskProcesses
 
     animate = ["animate", "speech", "--checkpoint", str(checkpoint), "--suffix", ".npz", "--quiet", "-o"]
     with DaskProcesses(place / "cluster") as cluster:

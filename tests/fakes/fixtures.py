@@ -17,9 +17,9 @@ import torch
 
 from facediff.models import DualPathDiffusion
 from facediff.runtime.onnxruntime_web import VERSION
+from tests.fakes.chromium import Chromium, find_chromium
 from tests.fakes.parsing import parse_imports_once
 from tests.fakes.tiny import Tiny, tiny_model_options, write_tiny
-from tools.browser.chromium import Chromium, find_chromium
 
 # Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
 torch.set_num_threads(1)

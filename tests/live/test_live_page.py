@@ -15,7 +15,7 @@ from facediff.synthetic.face import build_face
 from tests.live.conftest import FRAME_RATE
 from tests.live.test_browser_receiver import serving
 from tests.live.test_json_lines import wait_for
-from tools.browser.chromium import Chromium, Page
+from tests.fakes.chromium import Chromium, Page
 
 
 @pytest.fixture(scope="module")

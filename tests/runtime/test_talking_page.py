@@ -24,7 +24,7 @@ from tests.runtime.test_every_model import CASES, PLAN, Sources, ready, sources
 from tests.runtime.test_runtime import folder as as_exported
 from tests.runtime.test_runtime import largest, model, sound
 from tests.runtime.test_site import Serve, serve
-from tools.browser.chromium import Chromium, Page
+from tests.fakes.chromium import Chromium, Page
 
 __all__ = ["as_exported", "model", "serve", "sources"]
 

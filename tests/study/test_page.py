@@ -15,7 +15,7 @@ from facediff.study.definition import DATABASE, PAGE_FOLDER
 from facediff.study.report import analyse_folder
 from facediff.study.store import AnswerStore
 from tests.study.conftest import Serve
-from tools.browser.chromium import Chromium, Page
+from tests.fakes.chromium import Chromium, Page
 
 HOSTILE = "'); DROP TABLE answers; -- </script><script>window.hacked = 1</script> =cmd() ü😀"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import subprocess
 import sys
 from pathlib import Path
@@ -11,19 +10,16 @@ from pathlib import Path
 import pytest
 
 from facediff.cli.app import COMMANDS
-from facediff.study.definition import DATABASE
-from facediff.study.store import AnswerStore
-from tests.fakes.study import small_study, write_study
 from tools import fault_drill
-from tools.drill_commands import DRILLS, FIT, SERVES, WRITES_NOTHING, Drill, Served
-from tools.fault_drill import COUNTS, Driller, Run, Score, ServeDriller, damaged, table, tree
+from tools.drill_commands import DRILLS, FIT, SERVES, WRITES_NOTHING, Drill
+from tools.fault_drill import COUNTS, Driller, Run, Score, table, tree
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_every_command_is_drilled_or_writes_nothing() -> None:
     drilled = {drill.command for drill in DRILLS}
-    assert drilled | {FIT} | {*WRITES_NOTHING} | {served.command for served in SERVES} == set(COMMANDS)
+    assert drilled | {FIT} | {*WRITES_NOTHING} | {*SERVES} == set(COMMANDS)
     assert not drilled & {*WRITES_NOTHING}
     assert len({drill.name for drill in DRILLS}) == len(DRILLS)
 
@@ -93,8 +89,6 @@ def test_files_after_the_next_run_are_those_of_an_uninterrupted_one(
     [
         (0, "", True),
         (2, "facediff: error: a.npz: is damaged; write it again\n", True),
-        (2, "", False),
-        (2, "facediff: error: one\nfacediff: error: two\n", False),
         (1, "Traceback (most recent call last):\n  …\nKeyError: 'a'\n", False),
         (7, "facediff: error: one\n", False),
     ],
@@ -103,31 +97,6 @@ def test_manners(driller: Driller, status: int, error: str, mannered: bool) -> N
     driller.judge_manners(Run(status, "", error, 1.0), (0, 1, 2))
     assert bool(driller.score.counts) != mannered
     assert set(driller.score.counts) <= {"ill-mannered"}
-
-
-@pytest.mark.parametrize(
-    ("told", "lines", "count"),
-    [
-        ({}, '{"a": 1}\n{"b"', ""),  # the last line was cut by a kill
-        ({}, '{"a"\n{"b": 1}\n', "corrupt"),
-        ({"pages": []}, "", "wrong"),
-        ({"pages": ["one", "two"]}, "", "wrong"),
-        ({"statuses": [200, 500]}, "", "wrong"),
-        ({"raters": [["0" * 32, "1" * 16]]}, "", "lost"),
-    ],
-)
-def test_what_a_server_has_said_and_written_is_looked_at(
-    told: dict[str, list[object]], lines: str, count: str, tmp_path: Path
-) -> None:
-    made = ServeDriller.__new__(ServeDriller)
-    made.served, made.page, score = Served("live", "", lines="take.jsonl", answers="answered"), "", Score()
-    (tmp_path / "work").mkdir()
-    asked = small_study(clips=3)
-    AnswerStore(write_study(tmp_path / "work" / "answered", asked) / DATABASE, asked)
-    made.before = tree(tmp_path / "work")
-    write(tmp_path, "take.jsonl", lines)
-    made.judge(tmp_path, {"pages": ["one"], "raters": [], "statuses": [], **told}, "round", score, again=True)
-    assert dict(score.counts) == ({count: 1} if count else {})
 
 
 def test_what_a_clock_wrote_makes_no_difference(tmp_path: Path) -> None:
@@ -141,29 +110,23 @@ def test_what_a_clock_wrote_makes_no_difference(tmp_path: Path) -> None:
     assert tree(tmp_path / "one") != tree(tmp_path / "two")
 
 
-def test_damage_changes_bytes() -> None:
-    rng = random.Random(0)  # noqa: S311
-    kinds = {damaged(bytes(1000), rng, ("cut", "flip", "empty", "grow"))[0] for _ in range(40)}
-    assert kinds == {"cut", "flip", "empty", "grow"}
-    assert all(damaged(b"abc", rng, ("cut", "flip", "empty", "grow"))[1] != b"abc" for _ in range(40))
-
-
 def test_the_table_counts_rounds_and_findings() -> None:
     bad = Score(3, 2)
     bad.note("corrupt", "a.npz")
     text = table({"view": {"kill": Score(4, 3), "full": Score(2, 1)}, "fit": {"kill": bad}})
     head, _, view, fit, everything = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
     assert head == ["command", *fault_drill.FAULTS, *COUNTS]
-    assert view == ["`view`", "3", "0", "2", "0", "0", *"00000"]
-    assert fit == ["`fit`", "2", "0", "0", "0", "0", "0", "1", "0", "0", "0"]
-    assert everything == ["all", "5", "0", "2", "0", "0", "0", "1", "0", "0", "0"]
+    assert view == ["`view`", "3", "0", "2", "0", *"00000"]
+    assert fit == ["`fit`", "2", "0", "0", "0", "0", "1", "0", "0", "0"]
+    assert everything == ["all", "5", "0", "2", "0", "0", "1", "0", "0", "0"]
 
 
 def test_the_small_disk_is_small(tmp_path: Path) -> None:
-    disk = fault_drill.Disk(tmp_path / "disk")
     try:
-        if disk.kind != "tmpfs":
-            pytest.skip("no file system can be mounted here")
+        disk = fault_drill.Disk(tmp_path / "disk")
+    except subprocess.CalledProcessError:
+        pytest.skip("no file system can be mounted here")
+    try:
         disk.fill(100_000)
         with pytest.raises(OSError, match="No space left"):
             (disk.folder / "big").write_bytes(bytes(200_000))
@@ -177,11 +140,11 @@ def test_the_small_disk_is_small(tmp_path: Path) -> None:
 def test_a_drill_of_one_command(tmp_path: Path) -> None:
     words = ["--only", "figure training", "--kills", "3", "--stops", "1", "--full", "1", "--denied", "1"]
     done = subprocess.run(
-        [sys.executable, "tools/fault_drill.py", *words, "--damages", "1", "--markdown", str(tmp_path / "table.md")],
+        [sys.executable, "tools/fault_drill.py", *words, "--markdown", str(tmp_path / "table.md")],
         cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=280,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "| `figure training` | 3 | 1 | 1 | 1 | 1 | 0 | 0 | 0 | 0 | 0 |" in (tmp_path / "table.md").read_text()
+    assert "| `figure training` | 3 | 1 | 1 | 1 | 0 | 0 | 0 | 0 | 0 |" in (tmp_path / "table.md").read_text()

@@ -2,11 +2,9 @@
 
     python tools/benchmarks/live.py puppet-onnx --shapes puppet --minutes 10
 
-First a click track through the loop with a face that only follows the level of the sound, so that nothing but the loop
-and the receivers is measured: from the moment that a click is written to standard input to the moment that the first
-packet with an open mouth arrives. Then the exported model with speech of the built-in corpus on standard input: from
-the moment that the last sample of a frame is written until the frame's packet arrives. Packets arrive at sockets of
-this program: Live Link Face and VMC by UDP, JSON lines by TCP, the page's frames by WebSocket.
+An exported model hears speech of the built-in corpus on standard input: the lag is from the moment that the last sample
+of a frame is written until the frame's packet arrives. Packets arrive at sockets of this program: Live Link Face and
+VMC by UDP, JSON lines by TCP, the page's frames by WebSocket.
 """
 
 from __future__ import annotations
@@ -27,13 +25,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from sampling_tables import processor
+from machine import machine
 
 from facediff.data.puppet import Puppet
-from facediff.live.frames import Performance, open_receivers
-from facediff.live.loop import Loop
-from facediff.live.model import LiveModel
-from facediff.live.sources import Pcm
 from facediff.reporting.documents import markdown_table
 from facediff.speech.audio import read_speech
 from facediff.utils import SAMPLE_RATE
@@ -42,61 +36,58 @@ RATE = 30.0
 PIECE = SAMPLE_RATE // 100
 
 
-class Heard:
-    """What arrived at a socket: number of the frame, when, and how far the mouth was open (NaN if not known)."""
+class Arrivals:
+    """What arrived at a socket: numbers of frames, and when."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.rows: list[tuple[int, float, float]] = []
+        self.rows: list[tuple[int, float]] = []
 
-    def add(self, index: int, opened: float = float("nan")) -> None:
+    def add(self, index: int) -> None:
         """Note a frame that arrives now."""
-        self.rows.append((index, time.monotonic(), opened))
+        self.rows.append((index, time.monotonic()))
 
-    def table(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """The numbers, the times and the openings."""
-        index, when, opened = zip(*self.rows, strict=True)
-        return np.array(index), np.array(when), np.array(opened)
+    def table(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """The numbers and the times."""
+        index, when = zip(*self.rows, strict=True)
+        return np.array(index), np.array(when)
 
 
-def listen_live_link(sock: socket.socket, heard: Heard) -> None:
-    """Packets by their description: version, two texts, frame, part, rate, count, values."""
+def listen_live_link(sock: socket.socket, arrivals: Arrivals) -> None:
+    """Packets by their description: version, two texts, number of the frame, and more."""
     first = None
     while data := sock.recv(4096):
         place = 1
         for _ in range(2):
             place += 4 + struct.unpack_from(">i", data, place)[0]
-        number, _, _, _, count = struct.unpack_from(">ifiiB", data, place)
-        values = struct.unpack_from(f">{count}f", data, place + 17)
+        (number,) = struct.unpack_from(">i", data, place)
         first = number if first is None else first
-        heard.add(number - first, values[17])  # jawOpen
+        arrivals.add(number - first)
 
 
-def listen_vmc(sock: socket.socket, heard: Heard, rate: float) -> None:
+def listen_vmc(sock: socket.socket, arrivals: Arrivals, rate: float) -> None:
     """Bundles by python-osc; a frame has arrived with its last message."""
     from pythonosc.osc_bundle import OscBundle
 
-    index, opened = 0, float("nan")
+    index = 0
     while data := sock.recv(65_536):
         for message in OscBundle(data):
             if message.address == "/VMC/Ext/T":
                 index = round(message.params[0] * rate)
-            elif message.address == "/VMC/Ext/Blend/Val" and message.params[0] == "JawOpen":
-                opened = message.params[1]
             elif message.address == "/VMC/Ext/Blend/Apply":
-                heard.add(index, opened)
+                arrivals.add(index)
 
 
-def listen_lines(port: int, heard: Heard) -> None:
+def listen_lines(port: int, arrivals: Arrivals) -> None:
     """JSON lines of a TCP port."""
     with connected(lambda: socket.create_connection(("127.0.0.1", port))) as connection:
         for line in connection.makefile():
             frame = json.loads(line)
             if frame["type"] == "frame":
-                heard.add(frame["index"], frame["weights"]["jawOpen"])
+                arrivals.add(frame["index"])
 
 
-def listen_page(port: int, heard: Heard) -> None:
+def listen_page(port: int, arrivals: Arrivals) -> None:
     """What the page in the browser is sent."""
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
@@ -107,7 +98,7 @@ def listen_page(port: int, heard: Heard) -> None:
                 data = connection.recv()
                 if isinstance(data, bytes) and data[0] == 1:
                     index = struct.unpack_from("<I", data, 4)[0]
-                    heard.add(index)
+                    arrivals.add(index)
                     connection.send(str(index))
         except ConnectionClosed:
             pass
@@ -140,13 +131,13 @@ class Listeners:
     """
 
     def __init__(self, rate: float) -> None:
-        self.heard = [Heard(name) for name in ("Live Link Face", "VMC", "JSON lines", "page")]
+        self.arrivals = [Arrivals(name) for name in ("Live Link Face", "VMC", "JSON lines", "page")]
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
         for sock in self._sockets:
             sock.bind(("127.0.0.1", 0))
         udp = [sock.getsockname()[1] for sock in self._sockets]
         tcp = [free_port() for _ in range(2)]
-        link, vmc, lines, page = self.heard
+        link, vmc, lines, page = self.arrivals
         work: list[tuple[Callable[..., None], tuple[Any, ...]]] = [
             (listen_live_link, (self._sockets[0], link)),
             (listen_vmc, (self._sockets[1], vmc, rate)),
@@ -175,80 +166,6 @@ def write_in_real_time(
         os.write(descriptor, samples[first : first + PIECE].tobytes())
         times.append(time.monotonic())
     os.close(descriptor)
-
-
-class LevelFace:
-    """A stream whose jaw opens with the largest sample of each frame, as soon as the frame has been heard."""
-
-    heads = None
-
-    def __init__(self) -> None:
-        self.made = 0
-        self._speech = np.zeros(0, np.float32)
-
-    def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Frames (m, 4, 3) of whole frames of sound."""
-        self._speech = np.concatenate([self._speech, samples])
-        frames = []
-        while len(self._speech) >= (size := round((self.made + 1) * SAMPLE_RATE / RATE) - self._until(self.made)):
-            frame = np.zeros((4, 3), np.float32)
-            frame[0, 0] = np.abs(self._speech[:size]).max()
-            frames.append(frame)
-            self._speech = self._speech[size:]
-            self.made += 1
-        return np.stack([np.zeros((4, 3), np.float32), *frames])[1:]
-
-    def finish(self) -> npt.NDArray[np.float32]:
-        """Nothing is left."""
-        return np.zeros((0, 4, 3), np.float32)
-
-    @staticmethod
-    def _until(frame: int) -> int:
-        return round(frame * SAMPLE_RATE / RATE)
-
-
-def clicks(seconds: float) -> str:
-    """The table of the click track."""
-    rng, count = np.random.default_rng(0), int(seconds / 0.7)
-    places = (0.5 + 0.7 * np.arange(count) + 0.1 * rng.random(count)) * SAMPLE_RATE
-    track = np.zeros(round((seconds + 1) * SAMPLE_RATE), np.int16)
-    for place in places.astype(int):
-        track[place : place + 80] = 30_000
-    listeners = Listeners(RATE)
-    out, into = os.pipe()
-    before, sys.stdin = sys.stdin, os.fdopen(out)
-    neutral = np.random.default_rng(1).normal(size=(4, 3)).astype(np.float32)
-    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
-    model = LiveModel(LevelFace, RATE, np.zeros((4, 3), np.float32), faces, "m", look_ahead=1 / RATE, hop=1 / RATE)
-    receivers = open_receivers(listeners.addresses)
-    performance = Performance(RATE, neutral, faces, shapes=("jawOpen",))
-    for receiver in receivers:
-        receiver.open(performance)
-    time.sleep(1.0)  # until all are connected
-    written: list[float] = []
-    threading.Thread(target=write_in_real_time, args=(track, into, written), daemon=True).start()
-    Loop(
-        model,
-        Pcm(),
-        receivers,
-        solve=lambda offsets: np.clip(offsets[:1, 0], 0, 1).astype(np.float32),
-        report=lambda text: print(text, file=sys.stderr),
-        every=None,
-    ).run()
-    for receiver in receivers:
-        receiver.close()
-    sys.stdin.close()
-    sys.stdin = before
-    rows = []
-    for heard in listeners.heard[:3]:
-        _, when, opened = heard.table()
-        arrived = when[1:][(opened[1:] > 0.5) & (opened[:-1] <= 0.5)]
-        spoken = np.array([written[int(place) // PIECE] for place in places])
-        # A click arrives in the first open frame after it.
-        lags = np.array([arrived[arrived > moment][0] - moment for moment in spoken if (arrived > moment).any()])
-        rows.append([heard.name, str(len(lags)), *shown(lags)])
-    head = ["receiver", f"clicks of {count}", "median", "95 %", "worst"]
-    return markdown_table(head, rows)
 
 
 def shown(lags: npt.NDArray[np.float64]) -> list[str]:
@@ -306,13 +223,13 @@ def model(options: argparse.Namespace) -> Iterator[str]:
     last = (np.arange(round(seconds * rate)) + 1) / rate * SAMPLE_RATE  # the sample with which each frame ends
     spoken = np.array(written)[np.minimum(last.astype(int) // PIECE, len(written) - 1)]
     rows, minutes = [], []
-    for heard in listeners.heard:
-        index, when, _ = heard.table()
+    for arrivals in listeners.arrivals:
+        index, when = arrivals.table()
         lags = when - spoken[index]
         order = "yes" if (np.diff(index) > 0).all() else "no"
-        rows.append([heard.name, str(len(index)), str(len(spoken) - len(index)), order, *shown(lags)])
+        rows.append([arrivals.name, str(len(index)), str(len(spoken) - len(index)), order, *shown(lags)])
         first, middle, end = (lags[part] for part in parts(index / rate, seconds))
-        minutes.append([heard.name, *(f"{1000 * np.median(each):.0f} ms" for each in (first, middle, end))])
+        minutes.append([arrivals.name, *(f"{1000 * np.median(each):.0f} ms" for each in (first, middle, end))])
     at, megabytes = np.array(sizes).T
     memory = [f"{np.median(megabytes[part]):.1f} MB" for part in parts(at, seconds)]
     yield markdown_table(["receiver", "frames", "missing", "in order", "median", "95 %", "worst"], rows)
@@ -338,10 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--window", type=float)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args(arguments)
-    about = f"{processor('cpu')}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start"
-    print(f"{about}\n\nA click track, and a face that follows its level:\n")
-    print(clicks(60.0 * min(options.minutes, 1.0)))
-    print(f"\nThe model, with speech (load {os.getloadavg()[0]:.1f} at the start):\n", flush=True)
+    print(f"{machine()}\n", flush=True)
     for line in model(options):
         print(line)
 

@@ -1,11 +1,8 @@
-"""How many pictures a second: facediff's renderer, and matplotlib's ways where it is installed; what a preview costs.
+"""How many pictures a second: facediff's renderer, and matplotlib where it is installed; seconds for videos.
 
 Run ``python tools/benchmarks/rendering.py``; half a minute. The meshes are dented spheres with about as many
 vertices as FLAME (5 023) and BIWI (23 370). OpenCV is held to one thread, and seconds are the process's own, so that
 other programs on the machine disturb little.
-
-``python tools/benchmarks/rendering.py preview`` trains on the built-in corpus for some epochs, and says what share of
-training the previews of `SamplingPreview` are; some minutes.
 
 ``python tools/benchmarks/rendering.py video`` writes videos and prints seconds for each second of speech; with
 ``--against REVISION`` it also runs an older version of the package, in turn with this one, and prints the ratio.
@@ -17,25 +14,21 @@ import importlib.util
 import json
 import math
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 import numpy.typing as npt
+from machine import machine
 
 from facediff.render import Renderer
 
 SIZES = (5023, 23370)
 FRAMES = 12
-SLOW_FRAMES = 4
-"""Frames drawn by what takes seconds for one."""
-EPOCHS = 4
 
 Array = npt.NDArray[np.float64]
 Faces = npt.NDArray[np.int64]
@@ -104,70 +97,6 @@ def matplotlib_painter(faces: Faces, pixels: int) -> Callable[[Array], object]:
     return draw
 
 
-def matplotlib_surface(faces: Faces, pixels: int) -> Callable[[Array], object]:
-    """What scripts of the field use most: ``plot_trisurf``, lit flat polygons sorted in three dimensions."""
-    agg, figures = (importlib.import_module(f"matplotlib.{name}") for name in ("backends.backend_agg", "figure"))
-    figure = figures.Figure(figsize=(pixels / 100, pixels / 100), dpi=100)
-    canvas = agg.FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1), projection="3d")
-
-    def draw(vertices: Array) -> object:
-        axes.clear()
-        axes.set_axis_off()
-        x, y, z = vertices.T
-        axes.plot_trisurf(x, z, y, triangles=faces, color=(0.9, 0.75, 0.66), linewidth=0)
-        axes.view_init(elev=0, azim=90)
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())
-
-    return draw
-
-
-def machine() -> str:
-    """Processor, cores and Python, in words."""
-    name = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
-    except OSError:
-        pass  # not Linux: the processor's family is enough
-    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
-
-
-def preview() -> None:
-    """Print what training epochs, default previews and those of the shipped config cost on the built-in corpus."""
-    import yaml
-
-    from facediff.cli.lightning import run_cli
-    from facediff.utils.files import config_dir
-
-    callbacks = yaml.safe_load((config_dir() / "trainer" / "cpu.yaml").read_text(encoding="utf-8"))["callbacks"]
-    (bundled,) = (found["init_args"] for found in callbacks if found["class_path"].endswith("SamplingPreview"))
-    with tempfile.TemporaryDirectory() as folder:
-        words = ["--trainer.callbacks+=preview_clock.Clock", "--trainer.enable_progress_bar=false"]
-        words += [f"--trainer.max_epochs={EPOCHS}", "--trainer.check_val_every_n_epoch=2"]
-        for name, options in (("TimedPreview", {}), ("ShippedPreview", bundled)):
-            words.append(f"--trainer.callbacks+=preview_clock.{name}")
-            words += [f"--trainer.callbacks.{key}={value}" for key, value in {**options, "every_n_epochs": 2}.items()]
-        words += ["--trainer.enable_model_summary=false", f"--trainer.logger.save_dir={folder}"]
-        fitted = run_cli("fit", ["--config", "configs/experiment/puppet.yaml", *words])
-    costs = {type(found).__name__: getattr(found, "costs", []) for found in fitted.trainer.callbacks}
-    # Epochs with a validation, and so with previews, are left out.
-    epoch = [median(column) for column in zip(*costs["Clock"][::2], strict=True)]
-    print(f"machine: {machine()}; corpus puppet, model of configs/experiment/puppet.yaml")
-    print(f"{'':<46}{'seconds':>9}{'CPU s':>9}")
-    print(f"{'a training epoch':<46}{epoch[0]:>9.1f}{epoch[1]:>9.1f}")
-    every = bundled["every_n_epochs"]
-    for words_for, name, epochs in (
-        ("default", "TimedPreview", 10),
-        (f"shipped ({bundled['clips']} clip, {bundled['size']} pixels)", "ShippedPreview", every),
-    ):
-        cost = [median(column) for column in zip(*costs[name], strict=True)]
-        print(f"{f'a preview, {words_for}':<46}{cost[0]:>9.1f}{cost[1]:>9.1f}")
-        shares = [part / whole / epochs for part, whole in zip(cost, epoch, strict=True)]
-        print(f"{f'  share of training, every {epochs} epochs':<46}{shares[0]:>9.1%}{shares[1]:>9.1%}")
-
-
 def talking_faces(frames: int) -> dict[str, tuple[Array, Faces, npt.NDArray[np.uint8]]]:
     """Motion (T, V, 3), faces and colours of the built-in face and of an egg of BIWI's size, whose mouths open."""
     from facediff.synthetic.face import build_face
@@ -220,7 +149,7 @@ def video(options: argparse.Namespace) -> None:
                 environment = {**os.environ, "PYTHONPATH": str(folder)}
                 done = subprocess.run(command, capture_output=True, check=True, env=environment, text=True)
                 found[version].append(json.loads(done.stdout))
-    print(f"machine: {machine()}; {options.size} pixels, 25 frames a second, best of {options.rounds}")
+    print(f"{machine()}; {options.size} pixels, 25 frames a second, best of {options.rounds}")
     print(f"{'seconds for each second of video':<36}{'':<22}{'clock':>8}{'CPU':>8}{'ratio':>8}")
     for face in found["this version"][0]:
         best = {
@@ -235,7 +164,7 @@ def video(options: argparse.Namespace) -> None:
 def main() -> None:
     """Print what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", nargs="?", choices=("frames", "preview", "video"), default="frames")
+    parser.add_argument("what", nargs="?", choices=("frames", "video"), default="frames")
     parser.add_argument("--against", help="video: a revision of git to compare with")
     parser.add_argument("--seconds", type=float, default=4.0, help="video: length")
     parser.add_argument("--size", type=int, default=512, help="video: pixels")
@@ -245,7 +174,7 @@ def main() -> None:
     if options.json:
         print(json.dumps(video_seconds(options.seconds, options.size)))
     else:
-        {"frames": drawing, "preview": preview, "video": lambda: video(options)}[options.what]()
+        video(options) if options.what == "video" else drawing()
 
 
 def drawing() -> None:
@@ -254,7 +183,7 @@ def drawing() -> None:
 
     cv2.setNumThreads(1)
     compare = importlib.util.find_spec("matplotlib") is not None
-    print(f"machine: {machine()}; OpenCV {cv2.__version__}, one thread, seconds of its core")
+    print(f"{machine()}; OpenCV {cv2.__version__}, one thread, seconds of its core")
     print(f"512 x 512, median of {FRAMES} frames")
     if not compare:
         print("matplotlib is not installed: no comparison")
@@ -274,12 +203,11 @@ def drawing() -> None:
         if compare:
             ways = {
                 "matplotlib, PolyCollection": matplotlib_painter(faces, 512),
-                "matplotlib, plot_trisurf": matplotlib_surface(faces, 512),
                 **ways,
             }
         base: float | None = None
         for name, draw in ways.items():
-            speed = frames_per_second(draw, frames[:SLOW_FRAMES] if "trisurf" in name else frames)
+            speed = frames_per_second(draw, frames)
             base = speed if base is None and compare else base
             ratio = f"{speed / base:.1f}" if base else "-"
             print(f"{len(vertices):>9}{len(faces):>9}  {name:<34}{speed:>9.1f}{ratio:>7}")

@@ -2,96 +2,170 @@
 
 Run ``python tools/benchmarks/sampling.py``: 10 s of noise as speech, 23 370 vertices as in BIWI, HuBERT base and the
 dual-path network at width 512, all with random weights, so nothing is downloaded. The default sampler is run from
-start to end. A step's cost does not depend on its number, so for the others a few steps are timed and multiplied.
-A student, with the mel encoder that ``facediff adapt --low-latency --audio-encoder mel`` puts in HuBERT's place and a
-few steps, is run too; how good it is, random weights cannot tell (docs/streaming.md, docs/generation.md).
-The quickest of the repeats counts, since other programs make work slower but never quicker, and steps that are
-compared take turns, so that whatever else the machine does meets them alike.
+start to end, as is a student with the mel encoder that ``facediff adapt --low-latency --audio-encoder mel`` puts in
+HuBERT's place and a few steps. A step's cost does not depend on its number, so for the other samplers a few steps are
+timed and multiplied. The quickest of the repeats counts, since other programs make work slower but never quicker, and
+steps that are compared take turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from sampling_parts import SPACES, Bench, Costs, build
-from sampling_tables import heading, peak_memory, tables
+from machine import machine, peak_memory
 
 from facediff import registry
-from facediff.speech.audio import SAMPLE_RATE
+from facediff.data import Assets, Batch, Sample, collate
+from facediff.models import DualPathDiffusion
+from facediff.models.audio_encoders import HubertEncoder, MelEncoder
+from facediff.models.decoders import StyleTransformer
+from facediff.models.dual_path.network import Conditions
+from facediff.models.folding import SamplingSpace
+from facediff.models.fusions import BidirectionalCrossAttention
+from facediff.models.inference import ClipNoise
+from facediff.models.samplers import Sampler
+from facediff.models.speaker_encoders import TcnGruTransformer
+from facediff.speech.audio import samples_for
 
+FRAME_RATE = 25.0
+IDENTITIES = ["F2", "F3", "F4", "M3", "M4", "M5"]
 PEER_STEPS = 500
+"""Steps of a peer that encodes the speech and projects to vertices in each of them."""
 STUDENT_STEPS = 3
-SAMPLERS = ("ddpm", "ddim", "dpm_solver")
 FLAME = 5023
+SPACES: tuple[SamplingSpace, ...] = ("folded", "vertices")
 CONFIGURATIONS = (("ddpm", 1000), ("ddim", 50), ("ddim", 25), ("ddim", 10), ("dpm_solver", 20), ("dpm_solver", 10))
+TINY_HUBERT: dict[str, Any] = {
+    "num_hidden_layers": 3,
+    "num_attention_heads": 2,
+    "hidden_size": 32,
+    "intermediate_size": 64,
+    "conv_dim": (16,) * 7,
+    "num_conv_pos_embeddings": 16,
+    "num_conv_pos_embedding_groups": 2,
+}
 
 
-def ratios(costs: Costs, rows: list[dict[str, Any]], usual: dict[str, Any]) -> tuple[str, dict[str, float]]:
-    """What one run says about the relations, which carry over to other machines better than seconds do.
+@dataclass(frozen=True)
+class Bench:
+    """A model in evaluation mode and one clip to sample for it.
+
+    Attributes:
+        model: the model.
+        batch: the clip.
+        repeats: timed repetitions of every part; one more before them warms up.
+    """
+
+    model: DualPathDiffusion
+    batch: Batch
+    repeats: int
+
+    def clock(self, work: Callable[[], object]) -> float:
+        """Seconds that a call takes, with everything that it started on the device."""
+        started = self._now()
+        work()
+        return self._now() - started
+
+    def quickest(self, work: Callable[[], object]) -> float:
+        """Seconds of the quickest of several calls, after one to warm up."""
+        work()
+        return min(self.clock(work) for _ in range(self.repeats))
+
+    def in_turn(self, calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+        """Seconds of the quickest call of each, taken in turn after two that warm up."""
+        seconds: dict[str, list[float]] = {name: [] for name in calls}
+        for _ in range(repeats + 2):
+            for name, call in calls.items():
+                seconds[name].append(self.clock(call))
+        return {name: min(times[2:]) for name, times in seconds.items()}
+
+    def conditions(self) -> Conditions:
+        """The conditions of the clip, which are computed once."""
+        style = self.model.encode_style(self.batch.reference, self.batch.reference_mask)
+        return self.model.network.conditions(self.batch, self.batch.identity, style)
+
+    def stepper(self, space: SamplingSpace, sampler: Sampler, conditions: Conditions) -> Callable[[], None]:
+        """A call that takes one step of the sampling loop: prediction, noise, update."""
+        steps = self.model.process.steps
+        denoiser = self.model.network.prepare_for_inference(conditions, steps, folded=space == "folded")
+        noise = ClipNoise(self.batch.names, self.batch.frame_lengths.tolist(), [0], self.model.device)
+        state = denoiser.noise(
+            noise(torch.empty((*self.batch.motion.shape[:2], denoiser.width), device=self.model.device))
+        )
+        timesteps = iter(enumerate(sampler.timesteps))
+        predictions: list[torch.Tensor] = []
+
+        def step() -> None:
+            nonlocal state, predictions
+            i, timestep = next(timesteps)
+            predictions = [*predictions, denoiser.denoise(state, timestep)][-sampler.memory :]
+            state = sampler.update(i, state, predictions, lambda like: denoiser.noise(noise(like)))
+
+        return step
+
+    def _now(self) -> float:
+        if self.model.device.type == "cuda":
+            torch.cuda.synchronize(self.model.device)
+        return time.perf_counter()
+
+
+def build(args: argparse.Namespace, vertices: int, *, tiny_encoder: bool, student: bool = False) -> Bench:
+    """The model with random weights, its assets, and one clip of noise as speech.
 
     Args:
-        costs: of all parts.
-        rows: all configurations.
-        usual: the default sampler's row.
+        args: the sizes, as attributes.
+        vertices: number of vertices of the face.
+        tiny_encoder: a tiny HuBERT instead of HuBERT base.
+        student: the mel encoder in HuBERT's place.
     """
-    by = {(row["space"], row["sampler"], row["steps"]): row for row in rows}
-    peer_step = costs.audio_encoder + costs.step["vertices"]["ddpm"]
-    peer = costs.conditions + PEER_STEPS * peer_step
-    middle, few = by["folded", "ddim", 25], by["folded", "dpm_solver", 10]
-    found = {
-        "step": costs.step["vertices"]["ddpm"] / costs.step["folded"]["ddpm"],
-        "peer_seconds": peer,
-        "peer_to_default": peer / usual["total"],
-        "peer_to_ddim_25": peer / middle["total"],
-        "peer_to_dpm_solver_10": peer / few["total"],
-        "peer_to_folded_ddpm_500": peer
-        / (costs.audio_encoder + costs.conditions + PEER_STEPS * costs.step["folded"]["ddpm"] + usual["rest"]),
-    }
-    lines = [
-        "",
-        "ratios, from this run alone",
-        f"  (a) a step of ddpm on vertices takes {found['step']:.1f} times as long as folded",
-        f"  (c) encoding the speech and projecting in each of {PEER_STEPS} steps takes {peer:.1f} s (EXTRAPOLATED):",
-        f"      {found['peer_to_default']:.0f} times as long as the default sampler, folded {usual['sampler']} "
-        f"{usual['steps']}; {found['peer_to_ddim_25']:.0f} times as long as folded ddim 25,",
-        f"      {found['peer_to_dpm_solver_10']:.0f} times as long as folded dpm_solver 10,",
-        f"      {found['peer_to_folded_ddpm_500']:.1f} times as long as folded ddpm with as many steps",
-    ]
-    return "\n".join(lines), found
+    from transformers import HubertConfig
 
-
-def sizes(args: argparse.Namespace, bench: Bench) -> dict[str, float]:
-    """Seconds of a folded step at two sizes of mesh, the quickest of many that take turns."""
-    steppers = {}
-    for vertices in (FLAME, args.vertices):
-        one = bench if vertices == args.vertices else build(args, vertices, tiny_encoder=True)
-        sampler = registry.sampler.get("ddpm")(process=one.model.process)
-        steppers[str(vertices)] = one.stepper("folded", sampler, one.conditions())
-    found = bench.in_turn(steppers, 3 * bench.repeats)
-    small, large = found[str(FLAME)], found[str(args.vertices)]
-    print(
-        f"  (d) the quickest folded step takes {1e3 * small:.3f} ms at {FLAME} vertices, {1e3 * large:.3f} ms at "
-        f"{args.vertices}: ratio {large / small:.3f}"
+    torch.manual_seed(0)
+    config = HubertConfig(**(TINY_HUBERT if tiny_encoder else {})).to_dict()
+    model = DualPathDiffusion(
+        n_vertices=vertices,
+        identities=IDENTITIES,
+        frame_rate=FRAME_RATE,
+        dim=args.dim,
+        audio_encoder=MelEncoder if student else partial(HubertEncoder, config=config),
+        style_encoder=partial(TcnGruTransformer, num_heads=args.heads),
+        fusion=partial(BidirectionalCrossAttention, num_heads=args.heads),
+        decoder=partial(StyleTransformer, num_layers=args.layers, num_heads=args.heads),
     )
-    return found
-
-
-def student(args: argparse.Namespace, seconds: float, peer: float) -> dict[str, Any]:
-    """The student from start to end, and how many times as long a peer takes that encodes the speech in each step."""
-    bench = build(args, args.vertices, tiny_encoder=args.tiny_encoder, student=True)
-    bench.model.choose_sampler(steps=STUDENT_STEPS)
-    took = bench.quickest(lambda: bench.model.generate(bench.batch))
-    print(
-        f"  (f) the mel encoder in place of HuBERT and {STUDENT_STEPS} steps, in full: {took:.4f} s, real-time factor "
-        f"{took / seconds:.4f}; the {PEER_STEPS} steps of (c) take {peer / took:.0f} times as long",
-        flush=True,
+    model.adopt(
+        Assets(
+            corpus="random weights",
+            synthetic=True,
+            unit="m",
+            frame_rate=FRAME_RATE,
+            identities=IDENTITIES,
+            templates={name: torch.zeros(vertices, 3) for name in IDENTITIES},
+            faces=None,
+            regions={name: torch.arange(3) for name in ("lips", "upper_face")},
+            motion_scale=100.0,
+        )
     )
-    return {"steps": STUDENT_STEPS, "measured": took, "real_time_factor": took / seconds, "peer": peer / took}
+    frames = max(1, round(args.seconds * FRAME_RATE))
+    sample = Sample(
+        audio=torch.randn(samples_for(frames, FRAME_RATE)),
+        motion=torch.zeros(frames, vertices, 3),
+        template=torch.zeros(vertices, 3),
+        identity=0,
+        reference=1e-2 * torch.randn(100, vertices, 3),
+        name="speech",
+        identity_name=IDENTITIES[0],
+        sentence="",
+        reference_name="reference",
+    )
+    return Bench(model.eval().to(args.device), collate([sample]).to(args.device), args.repeats)
 
 
 def options() -> argparse.Namespace:
@@ -107,28 +181,9 @@ def options() -> argparse.Namespace:
     parser.add_argument("--precision", default="32", choices=["32", "bf16"], help="of the network (default: 32)")
     parser.add_argument("--threads", type=int, help="threads of PyTorch (default: its own choice)")
     parser.add_argument("--tiny-encoder", action="store_true", help="a tiny HuBERT instead of HuBERT base, for trials")
-    parser.add_argument("--quick", action="store_true", help="one repetition of every part and no full run")
-    parser.add_argument("--full", type=int, help="steps of the run in full (default: the sampler's own; 0: none)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers there too, unrounded")
-    args = parser.parse_args()
-    if args.quick:
-        args.repeats, args.full = 1, 0
-    return args
-
-
-def in_full(args: argparse.Namespace, bench: Bench, seconds: float) -> dict[str, Any]:
-    """The default sampler from start to end, the first time with folding, and memory before anything else ran."""
-    bench.model.choose_sampler(steps=args.full)
-    name, steps = bench.usual()
-    first = bench.clock(lambda: bench.model.generate(bench.batch))
-    again = min(bench.clock(lambda: bench.model.generate(bench.batch)) for _ in range(bench.repeats))
-    print(
-        f"\n(b) {name} {steps}, folded, in full: {again:.4f} s, real-time factor {again / seconds:.4f}; "
-        f"the first time, with folding and warming up, {first:.4f} s\n"
-        f"(e) peak memory of that: {peak_memory(args.device)}",
-        flush=True,
-    )
-    return {"sampler": name, "steps": steps, "measured": again, "first": first, "real_time_factor": again / seconds}
+    parser.add_argument("--steps", type=int, help="steps of the run in full (default: the sampler's own)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the seconds there too, unrounded")
+    return parser.parse_args()
 
 
 @torch.inference_mode()
@@ -137,25 +192,60 @@ def main(args: argparse.Namespace) -> None:
     if args.threads:
         torch.set_num_threads(args.threads)
     bench = build(args, args.vertices, tiny_encoder=args.tiny_encoder)
-    print(heading(args, bench), flush=True)
-    seconds = bench.batch.audio.shape[1] / SAMPLE_RATE
-    process = bench.model.process
+    millions = sum(p.numel() for p in bench.model.network.parameters()) / 1e6
+    print(machine(args.device))
+    print(f"model: {args.vertices} vertices, width {args.dim}, {millions:.1f} million random weights, {args.precision}")
+    print(f"speech: {args.seconds:g} s; the quickest of {args.repeats} after a warm-up\n", flush=True)
+
     # First, since the highest memory so far is all that a process can tell.
-    full = in_full(args, bench, seconds) if args.full != 0 else None
-    costs = bench.measure({name: registry.sampler.get(name)(process=process, steps=1000) for name in SAMPLERS})
-    rows = [costs.row(space, name, steps, seconds) for space in SPACES for name, steps in CONFIGURATIONS]
-    print(tables(costs, rows))
-    usual = costs.row("folded", *bench.usual(), seconds)
-    text, relations = ratios(costs, rows, usual)
-    print(text, flush=True)
-    relations |= {"vertices_" + name: value for name, value in sizes(args, bench).items()}
-    found = {"seconds": seconds, "costs": asdict(costs), "rows": rows, "ratios": relations, "full": full}
-    if full is not None:
-        found["student"] = student(args, seconds, relations["peer_seconds"])
-        print(f"  the default sampler in full: measured / extrapolated {full['measured'] / usual['total']:.3f}")
-    print(f"peak memory with sampling on vertices: {peak_memory(args.device)}")
+    bench.model.choose_sampler(steps=args.steps)
+    sampler = f"{bench.model.hparams['sampler']['class_path'].rpartition('.')[2]} {bench.model.sampler.steps}"
+    seconds = {"default": bench.quickest(lambda: bench.model.generate(bench.batch))}
+    print(f"{sampler}, folded, in full: {seconds['default']:.4f} s; peak memory {peak_memory(args.device)}", flush=True)
+
+    encoder = bench.model.network.audio_encoder
+    speech = bench.batch.audio, bench.batch.audio_lengths, bench.batch.frame_lengths
+    seconds["audio encoder"] = bench.quickest(lambda: encoder(*speech))
+    seconds["conditions"] = bench.quickest(bench.conditions)
+    conditions = bench.conditions()
+    for name in ("ddpm", "ddim", "dpm_solver"):
+        sampler_of = registry.sampler.get(name)
+        calls = {
+            f"{name} {space}": bench.stepper(space, sampler_of(process=bench.model.process, steps=1000), conditions)
+            for space in SPACES
+        }
+        seconds |= bench.in_turn(calls, bench.repeats)
+    print("\none step in milliseconds, folded and on vertices")
+    for name in ("ddpm", "ddim", "dpm_solver"):
+        folded, vertices = (1e3 * seconds[f"{name} {space}"] for space in SPACES)
+        print(f"  {name:<12}{folded:>10.3f}{vertices:>10.3f}   ratio {vertices / folded:.2f}")
+    print("\na clip in seconds, EXTRAPOLATED from one step, and as real-time factor, folded and on vertices")
+    for name, steps in CONFIGURATIONS:
+        folded, vertices = (seconds["conditions"] + steps * seconds[f"{name} {space}"] for space in SPACES)
+        factors = f"{folded / args.seconds:>8.4f}{vertices / args.seconds:>10.4f}"
+        print(f"  {name:<12}{steps:>5}{folded:>10.3f}{vertices:>10.3f}{factors}")
+
+    peer = seconds["conditions"] + PEER_STEPS * (seconds["audio encoder"] + seconds["ddpm vertices"])
+    print(f"\nencoding the speech and projecting in each of {PEER_STEPS} steps: {peer:.1f} s (EXTRAPOLATED), "
+          f"{peer / seconds['default']:.0f} times the default sampler")  # fmt: skip
+    small = build(args, FLAME, tiny_encoder=True)
+    ddpm = registry.sampler.get("ddpm")
+    steppers = {
+        str(one.model.hparams["n_vertices"]): one.stepper(
+            "folded", ddpm(process=one.model.process, steps=1000), one.conditions()
+        )
+        for one in (small, bench)
+    }
+    by_size = bench.in_turn(steppers, 3 * bench.repeats)
+    print("a folded step by vertices: " + ", ".join(f"{n}: {1e3 * took:.3f} ms" for n, took in by_size.items()))
+    student = build(args, args.vertices, tiny_encoder=args.tiny_encoder, student=True)
+    student.model.choose_sampler(steps=STUDENT_STEPS)
+    seconds["student"] = student.quickest(lambda: student.model.generate(student.batch))
+    taken = seconds["student"]
+    print(f"the mel encoder in place of HuBERT and {STUDENT_STEPS} steps, in full: {taken:.4f} s, real-time factor "
+          f"{taken / args.seconds:.4f}; the peer takes {peer / taken:.0f} times as long")  # fmt: skip
     if args.json:
-        args.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        args.json.write_text(json.dumps(seconds | {"peer": peer}, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from facediff.live import LiveFrame, Performance, Receiver, open_receiver
 from facediff.spaces.arkit import ARKIT
 from facediff.synthetic.known_faces import built_in_shapes
 from facediff.utils.hub import BUNDLED
-from tools.browser.chromium import Chromium, find_chromium
+from tests.fakes.chromium import Chromium, find_chromium
 
 FRAMES, FRAME_RATE, LAG = 60, 30.0, 0.12
 

@@ -20,8 +20,8 @@ import trimesh
 
 from facediff.animation import write_archive
 from facediff.editing.landmarks import NAMES
+from tests.fakes.chromium import Chromium, Page, find_chromium
 from tests.fakes.heads import lower_face, lower_face_marks, talking
-from tools.browser.chromium import Chromium, Page, find_chromium
 
 
 def click(page: Page, side: str, vertex: int) -> None:

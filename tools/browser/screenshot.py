@@ -11,7 +11,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from tools.browser.chromium import Chromium, find_chromium
+from tests.fakes.chromium import Chromium, find_chromium
 
 READY = "window.facediff && (facediff.ready || facediff.errors.length)"
 

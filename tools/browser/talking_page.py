@@ -20,7 +20,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from facediff.reporting.documents import markdown_table
-from tools.browser.chromium import Chromium, Page, find_chromium
+from tests.fakes.chromium import Chromium, Page, find_chromium
 
 ROUNDS = 3
 # The frame that is furthest from the face at rest.

@@ -9,7 +9,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.export.viewer import write_page
-from tools.browser.chromium import Chromium, Page
+from tests.fakes.chromium import Chromium, Page
 
 # Colour in the middle of the first face's place, read in the moment in which it was drawn.
 PIXEL = """

@@ -14,9 +14,9 @@ import trimesh
 from facediff.animation import Animation
 from facediff.export.viewer import write_page
 from facediff.render.occlusion import occlusion
+from tests.fakes.chromium import Chromium, Page
 from tests.fakes.clicks import FRAMES, OPEN_FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
-from tools.browser.chromium import Chromium, Page
 
 Show = Callable[..., Page]
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">'

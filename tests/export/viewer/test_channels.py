@@ -12,9 +12,9 @@ from facediff.animation import Animation, read_archive
 from facediff.mesh.flame import rotations
 from facediff.spaces import layout
 from tests.export.viewer.test_editor import downloaded
+from tests.fakes.chromium import Page
 from tests.fakes.clicks import clicks
 from tests.fakes.glb_reader import Reader
-from tools.browser.chromium import Page
 
 
 def in_weights() -> Animation:

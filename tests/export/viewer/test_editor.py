@@ -23,11 +23,11 @@ from facediff.speech.phonemes import TimedPhoneme, phonemes_text
 from facediff.synthetic.corpus import rig_of
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import CONTROLS
+from tests.fakes.chromium import Page
 from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
 from tests.fakes.glb_reader import Reader
 from tests.fakes.waiting import wait_until
-from tools.browser.chromium import Page
 
 Show = Callable[..., Page]
 HOSTILE = "</script><img src=x onerror='window.hacked = 1'>"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.fakes.chromium import Chromium
 from tests.fakes.clicks import FRAMES, RATE, clicks
-from tools.browser.chromium import Chromium
 
 
 @pytest.mark.parametrize("kind", ["animation", "comparison"])

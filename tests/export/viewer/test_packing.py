@@ -23,7 +23,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.viewer import write_page
 from facediff.render.panels import heat_ramp
 from tests.fakes.clicks import FRAMES, OPEN_FRAMES, OPENING, RATE, SAMPLE_RATE, clicks
-from tools.benchmarks.viewer import minute
+from tests.fakes.meshes import sphere
 
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">{{facts}}&amp;\u2028'
 
@@ -284,10 +284,14 @@ def test_page_above_the_limit_is_refused_and_the_old_one_stays(tmp_path: Path) -
 
 
 def test_page_of_a_minute_of_flames_size_stays_below_the_limit(tmp_path: Path) -> None:
-    animation = minute(
-        5023, seconds=6, noise=0.1
-    )  # on every coordinate of every frame: more than models and scans have
-    assert len(animation.vertices) == 180
+    """Six seconds of twelve waves, with 0.1 mm of noise on every coordinate: more than models and scans have."""
+    rng = np.random.default_rng(0)
+    vertices, faces = sphere(50, 100)
+    shapes = 0.001 * np.sin(vertices @ rng.normal(0, 2, (3, 36))).reshape(-1, 12, 3)
+    waves = np.einsum("tk,vkc->tvc", np.sin(rng.uniform(6, 36, 12) * np.arange(180)[:, None] / 30), shapes)
+    motion = 0.11 * vertices + waves + rng.normal(0, 1e-4, waves.shape)
+    template = (0.11 * vertices).astype(np.float32)
+    animation = Animation("sphere", motion.astype(np.float32), template, 30, faces.astype(np.int32))
     write_page(tmp_path / "a.html", [animation])
     assert 10 * (tmp_path / "a.html").stat().st_size < 30e6
 

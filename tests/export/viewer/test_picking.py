@@ -30,9 +30,9 @@ from facediff.mesh.parts import MeshPart
 from facediff.synthetic.face import build_face
 from facediff.synthetic.rig import build_rig
 from facediff.utils.server import LOOPBACK, names_of
+from tests.fakes.chromium import Chromium, Page
 from tests.fakes.heads import LONG, talking
 from tests.fakes.serving import servers
-from tools.browser.chromium import Chromium, Page
 
 FACE, MARKS = build_face(), puppet_landmarks()
 
