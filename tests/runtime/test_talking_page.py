@@ -19,12 +19,12 @@ from facediff.runtime.folder import read_folder
 from facediff.runtime.onnxruntime_web import web_runtime
 from facediff.runtime.site import make_site
 from facediff.speech.audio import read_speech
+from tests.fakes.chromium import Chromium, Page
 from tests.fakes.contrasts import CONTRASTS
 from tests.runtime.test_every_model import CASES, PLAN, Sources, ready, sources
 from tests.runtime.test_runtime import folder as as_exported
 from tests.runtime.test_runtime import largest, model, sound
 from tests.runtime.test_site import Serve, serve
-from tests.fakes.chromium import Chromium, Page
 
 __all__ = ["as_exported", "model", "serve", "sources"]
 

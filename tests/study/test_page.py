@@ -14,8 +14,8 @@ from facediff.study.answers import check_rater
 from facediff.study.definition import DATABASE, PAGE_FOLDER
 from facediff.study.report import analyse_folder
 from facediff.study.store import AnswerStore
-from tests.study.conftest import Serve
 from tests.fakes.chromium import Chromium, Page
+from tests.study.conftest import Serve
 
 HOSTILE = "'); DROP TABLE answers; -- </script><script>window.hacked = 1</script> =cmd() ü😀"
 

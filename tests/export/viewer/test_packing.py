@@ -284,10 +284,12 @@ def test_page_above_the_limit_is_refused_and_the_old_one_stays(tmp_path: Path) -
 
 
 def test_page_of_a_minute_of_flames_size_stays_below_the_limit(tmp_path: Path) -> None:
-    """Six seconds of twelve waves, with 0.1 mm of noise on every coordinate: more than models and scans have."""
+    """Six seconds of twelve bumps that move, with 0.1 mm of noise on every coordinate: more than models have."""
     rng = np.random.default_rng(0)
     vertices, faces = sphere(50, 100)
-    shapes = 0.001 * np.sin(vertices @ rng.normal(0, 2, (3, 36))).reshape(-1, 12, 3)
+    centres = vertices[rng.choice(len(vertices), 12)]
+    bumps = np.exp(-((vertices[:, None] - centres) ** 2).sum(-1) / 0.07)
+    shapes = 0.004 * bumps[..., None] * rng.normal(size=(12, 3))
     waves = np.einsum("tk,vkc->tvc", np.sin(rng.uniform(6, 36, 12) * np.arange(180)[:, None] / 30), shapes)
     motion = 0.11 * vertices + waves + rng.normal(0, 1e-4, waves.shape)
     template = (0.11 * vertices).astype(np.float32)
