@@ -258,9 +258,6 @@ class Rig:
         """A linear rig as that of all speakers of a corpus; channels that it has no displacements for move nothing.
 
         Its lips and upper face are the vertices that the channels of these regions move at least half as far as any.
-
-        Raises:
-            FaceDiffError: if it has none of the channels.
         """
         rows = {name.casefold(): row for row, name in enumerate(linear.names)}
         names = [assets.space.channels[channel].casefold() for channel in assets.space.face]
@@ -363,11 +360,7 @@ class Assets:
 
     @property
     def mesh(self) -> Assets:
-        """The corpus as vertices: these assets, or those of the rig.
-
-        Raises:
-            FaceDiffError: if its motion is channels, and no rig is known.
-        """
+        """The corpus as vertices: these assets, or those of the rig."""
         if self.space.is_vertices:
             return self
         if self.rig is None:
@@ -391,22 +384,14 @@ class Assets:
     def to_vertices(
         self, motion: Float[Tensor, "*frames points dims"], identity: str
     ) -> Float[Tensor, "*frames vertices 3"]:
-        """Offsets from the template as offsets of vertices; those of vertices are themselves.
-
-        Raises:
-            FaceDiffError: if there is no rig.
-        """
+        """Offsets from the template as offsets of vertices; those of vertices are themselves."""
         if self.space.is_vertices:
             return motion
         _ = self.mesh
         return cast(Rig, self.rig).decode(motion, self.space, identity)
 
     def template(self, identity: str) -> Float[Tensor, "points dims"]:
-        """The neutral face of an identity, in the corpus's unit.
-
-        Raises:
-            OptionError: if there is no such identity.
-        """
+        """The neutral face of an identity, in the corpus's unit."""
         if identity not in self.templates:
             raise OptionError(
                 "identity", f'there is no "{identity}"; the checkpoint has {", ".join(sorted(self.templates))}'
@@ -438,12 +423,7 @@ class Assets:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Assets:
-        """The inverse of :meth:`state`.
-
-        Raises:
-            FaceDiffError: naming the field that is missing, of another type, or does not fit the others. A checkpoint
-                may be hostile, and these fields reach meshes, file names and sizes of arrays.
-        """
+        """The inverse of :meth:`state`."""
         expected = {attribute.name for attribute in fields(cls)}
         if isinstance(state, dict):
             # Checkpoints of 0.2 and older have no colours, and those of vertices no space.

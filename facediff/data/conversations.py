@@ -25,9 +25,6 @@ def conversation_file(root: Path, folder: str, clip: str, stride: int = 1) -> np
         folder: ``partner`` or ``speaking``.
         clip: the clip's name.
         stride: of so many stored frames, the first is read.
-
-    Raises:
-        FaceDiffError: if the file is missing, or of another shape.
     """
     path = root / folder / f"{clip}.npy"
     array = open_array(path, kinds=CONVERSATION[folder])

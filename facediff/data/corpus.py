@@ -402,11 +402,7 @@ def load_template_dict(path: Path) -> dict[Any, Any]:
 
 
 def as_template(value: object, n_vertices: int, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
-    """One entry of ``templates.pkl`` as a neutral face (V, 3).
-
-    Raises:
-        ValueError: with the reason, to be completed by the file's name.
-    """
+    """One entry of ``templates.pkl`` as a neutral face (V, 3)."""
     try:
         entry = np.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:  # lists of unequal length

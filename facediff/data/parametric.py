@@ -53,11 +53,7 @@ class ParametricDataModule(SpeechMotionDataModule):
 
     @classmethod
     def check_root(cls, root: str | Path) -> None:
-        """Refuse a folder without recordings, whose speakers are the model's identities.
-
-        Raises:
-            FaceDiffError: if it is missing, or holds none.
-        """
+        """Refuse a folder without recordings, whose speakers are the model's identities."""
         folder = Path(root).expanduser()
         if is_packed(root):  # is refused when it is read
             return

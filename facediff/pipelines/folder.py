@@ -120,11 +120,7 @@ def _in_words(value: object) -> str:
 
 
 def check_directions(options: AnimationOptions, found: Sequence[Path], folder: Path) -> None:
-    """Read the keys of every recording, and say which recordings have none.
-
-    Raises:
-        FaceDiffError: if a file is wrong, or no recording has one.
-    """
+    """Read the keys of every recording, and say which recordings have none."""
     from facediff.editing.direction import direction_file
 
     files = {recording: direction_file(folder, recording) for recording in found}
@@ -187,11 +183,7 @@ def computes_on_processor(options: AnimationOptions) -> bool:
 
 
 def write_correspondence(options: AnimationOptions, files: Sequence[Path]) -> None:
-    """Fit the target mesh and write its correspondence, judged by how the first readable recording moves it.
-
-    Raises:
-        FaceDiffError: if the fit is poor, or no recording can be read.
-    """
+    """Fit the target mesh and write its correspondence, judged by how the first readable recording moves it."""
     problems = []
     for file in files:
         try:

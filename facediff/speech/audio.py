@@ -74,11 +74,6 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
     Args:
         path: the file.
         max_seconds: longest speech allowed; None for any.
-
-    Raises:
-        FaceDiffError: if the file is missing, empty, cut short, no sound file, too long, or holds values that are not
-            finite.
-        MissingExtraError: if PyAV is not installed, which videos need.
     """
     return to_speech(*_read(path, max_seconds), str(path))
 
@@ -114,11 +109,7 @@ def _read_open(file: IO[bytes], name: str, max_seconds: float | None) -> tuple[n
 
 
 def write_wav(path: Path, samples: npt.NDArray[Any], rate: int, bits: int = 16) -> None:
-    """Write samples (S,) or (S, channels) as a .wav; libsndfile itself would not say that the disk is full.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write samples (S,) or (S, channels) as a .wav; libsndfile itself would not say that the disk is full."""
     import soundfile
 
     sound = io.BytesIO()
@@ -284,9 +275,6 @@ def read_stretch(
 
     Of a 16 kHz mono file only these samples are read. Any other file is decoded as a whole once and kept in ``store``.
     Files that were looked at to the end are kept in ``whole``, so that a training does so once.
-
-    Raises:
-        FaceDiffError: as :func:`read_speech`.
     """
     if not path.is_file() or not path.stat().st_size:
         return fit_length(read_speech(path), length)  # which reports what is wrong
@@ -438,11 +426,7 @@ def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
 
 
 def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
-    """A piece (n,) of a stream, which may be empty.
-
-    Raises:
-        FaceDiffError: if it has several channels, holds samples that are not finite, or is of another kind.
-    """
+    """A piece (n,) of a stream, which may be empty."""
     if isinstance(chunk, bytes):
         if len(chunk) % 2:
             raise FaceDiffError(f"chunks: one has {len(chunk)} bytes, half a sample too much; give 16-bit samples")

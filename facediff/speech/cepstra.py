@@ -72,9 +72,6 @@ def align_features(first: npt.NDArray[np.float64], second: npt.NDArray[np.float6
 
     Returns:
         indices (T,) into ``second``, never falling; where several frames go with one, the middle one.
-
-    Raises:
-        MissingExtraError: if dtaidistance is not installed.
     """
     with needs_extra("dtaidistance", "mesh", "aligning two recordings of one sentence"):
         from dtaidistance import dtw_ndim

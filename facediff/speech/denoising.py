@@ -11,11 +11,7 @@ from facediff.utils import SAMPLE_RATE
 
 
 def denoised(speech: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Speech (S,) at 16 kHz without its steady noise, by spectral gating; silence stays silence.
-
-    Raises:
-        MissingExtraError: if noisereduce is not installed.
-    """
+    """Speech (S,) at 16 kHz without its steady noise, by spectral gating; silence stays silence."""
     with needs_extra("noisereduce", "voice", "--denoise"):
         import noisereduce
     if not speech.any():

@@ -25,9 +25,6 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
         source: a file with a descriptor.
         rate: samples a second.
         read: works as ``os.read``; half a sample at the end is dropped.
-
-    Raises:
-        FaceDiffError: if a sound file comes in.
     """
     rest, first = b"", True
     # A read of a pipe gives what is there, at least one byte, and nothing at its end.

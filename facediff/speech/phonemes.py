@@ -75,11 +75,7 @@ def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
 
 
 def read_phonemes(path: Path) -> list[TimedPhoneme]:
-    """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``.
-
-    Raises:
-        FaceDiffError: if the file is not that.
-    """
+    """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``."""
     expected = "expected a table with the columns start, end (seconds), ipa"
     try:
         phonemes = [
@@ -135,11 +131,7 @@ def closures(phonemes: Iterable[TimedPhoneme], frame_rate: float) -> list[tuple[
 
 
 def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPhoneme]]:
-    """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses.
-
-    Raises:
-        MissingExtraError: if espeak-ng is not installed.
-    """
+    """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses."""
     from facediff.speech.espeak import EspeakVoice, speak
 
     utterance = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
@@ -152,9 +144,6 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
     """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
 
     Labels may be IPA, also with marks, or ARPAbet with or without digits of stress.
-
-    Raises:
-        FaceDiffError: if the file is neither, or holds no phonemes.
     """
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected a .TextGrid, or a .csv with the columns start, end, ipa")

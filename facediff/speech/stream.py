@@ -95,11 +95,7 @@ class AnimationStream:
         return self._feed(samples if self._convert is None else self._convert(samples, False))
 
     def finish(self) -> Array:
-        """The frames (m, V, 3) that are left.
-
-        Raises:
-            FaceDiffError: if the speech was shorter than a frame.
-        """
+        """The frames (m, V, 3) that are left."""
         self.heads = None
         resampled = [] if self._convert is None else [self._feed(self._convert(np.zeros(0, np.float32), True))]
         vertices = self.generator.finish()

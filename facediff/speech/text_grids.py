@@ -22,11 +22,7 @@ Interval = tuple[float, float, str]
 
 
 def phones_in(path: Path) -> list[Interval]:
-    """The intervals of a TextGrid's tier of phones: start and end in seconds, and label.
-
-    Raises:
-        FaceDiffError: if the file is no TextGrid, is damaged, or has no such tier.
-    """
+    """The intervals of a TextGrid's tier of phones: start and end in seconds, and label."""
     tiers = read_text_grid(path)
     intervals = find_tier(tiers, PHONES)
     if not intervals:

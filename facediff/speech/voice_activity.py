@@ -297,9 +297,6 @@ class WebRtcGate(VoiceGate):
         lead: seconds before speech at which it is open, since a mouth moves before it is heard.
         hold: seconds after speech for which it stays open.
         release: seconds in which it closes.
-
-    Raises:
-        MissingExtraError: if webrtcvad is not installed.
     """
 
     def __init__(

@@ -125,9 +125,6 @@ class WindowPlan:
         ahead: motion after the window that is generated with it and not given out. Its noise is known before its
             speech, which is replaced by silence where it is not heard yet.
 
-    Raises:
-        FaceDiffError: if a length is impossible.
-
     Example:
         >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
         >>> plan.in_frames(25.0)
@@ -161,11 +158,7 @@ class WindowPlan:
             raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
 
     def in_frames(self, frame_rate: float) -> FramePlan:
-        """The same in whole frames.
-
-        Raises:
-            FaceDiffError: if windows are too short for frames.
-        """
+        """The same in whole frames."""
         lengths = (self.seconds, self.overlap, self.before, self.after, self.past, self.ahead)
         frames, overlap, before, after, past, ahead = (round(length * frame_rate) for length in lengths)
         if past:
@@ -181,11 +174,7 @@ class WindowPlan:
         return FramePlan(frames, overlap, before, after, past, ahead)
 
     def chosen(self, seconds: float | None, overlap: float | None) -> WindowPlan:
-        """The plan with other lengths; None keeps a length.
-
-        Raises:
-            FaceDiffError: if a length is impossible.
-        """
+        """The plan with other lengths; None keeps a length."""
         length = self.seconds if seconds is None else seconds
         shared = min(self.overlap, length / 2) if overlap is None else overlap
         # A chosen window is used also with a model that otherwise takes speech of any length in one pass.
@@ -391,11 +380,7 @@ class SpeechWindows(ABC, Generic[M]):
         """Motion of consecutive frames in one piece; there may be no parts."""
 
     def feed(self, samples: Speech) -> M:
-        """Take more speech at 16 kHz, and give the motion that has become certain; it may have no frames.
-
-        Raises:
-            FaceDiffError: if the stream was finished.
-        """
+        """Take more speech at 16 kHz, and give the motion that has become certain; it may have no frames."""
         self._refuse_finished()
         self._speech = np.concatenate([self._speech, np.asarray(samples, np.float32)])
         parts = []
@@ -410,10 +395,6 @@ class SpeechWindows(ABC, Generic[M]):
 
         Args:
             frames: how many frames the speech lasts in all; as many as fit its length if None.
-
-        Raises:
-            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
-                the stream was finished.
         """
         self._refuse_finished()
         self._finished = True

@@ -66,10 +66,6 @@ def run_batch(
             finished after Ctrl-C is recorded; picklable.
         survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
             task; it is raised otherwise.
-
-    Raises:
-        FaceDiffError: as soon as a task fails for a reason that would let all others fail too: the set-up of a worker
-            failed, a package is missing or the disk is full.
     """
     attempt = partial(_attempt, work, record, survive_bugs)
     places: dict[str, Any] = {"scheduler": scheduler, "writes": writes, "reads": reads}

@@ -161,9 +161,6 @@ def run_tasks(
         task and result, in the order in which they are done. The result of a task that kills its process is
         :class:`WorkerDied`: what was running then is tried again, one at a time, so that no other is lost.
 
-    Raises:
-        Exception: the first one that ``work`` raises; tasks that have not been begun are dropped.
-
     Example:
         >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
         {'a': 1, 'bb': 2}

@@ -81,10 +81,6 @@ def check(
         workers: clips at a time; if None, as many as processors where there is much to read, or all of a cluster.
         scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
         progress: show a progress bar on standard error.
-
-    Raises:
-        FaceDiffError: if there is no such folder, corpus or split. Defects of the folder are in the report.
-        MissingExtraError: if soundfile or trimesh is not installed.
     """
     packed = None
     if is_packed(root):

@@ -48,11 +48,7 @@ class Findings(list[Finding]):
 
     @contextmanager
     def guard(self, kind: str, path: Path, root: Path) -> Iterator[None]:
-        """Turn every exception about a file into an error of the report: the folder is not trusted.
-
-        Raises:
-            MissingExtraError: unchanged, since that is not the folder's fault.
-        """
+        """Turn every exception about a file into an error of the report: the folder is not trusted."""
         try:
             yield
         except MissingExtraError:

@@ -56,9 +56,6 @@ def measure_truth(root: Path, names: Iterable[str], rate: float) -> list[dict[st
         root: the corpus folder.
         names: its clips.
         rate: motion frames a second.
-
-    Raises:
-        FaceDiffError: if the files do not fit together.
     """
     if not all((root / f"{part}_npy").is_dir() for part in ("weights", "gaze", "head")):
         return []

@@ -133,9 +133,6 @@ def into_coordinates(face: Array, best: Similarity, fixed_scale: float | None) -
     (millimetres, centimetres, metres), it is that power; else, as with a corpus of normalised size, it is as measured.
     ``best`` lays the speaker's neutral face onto the corpus's mean face best, and is kept but for its scale, about the
     face's centre; a scale that is given is used instead.
-
-    Raises:
-        OptionError: if that makes the face far larger or smaller than those of the corpus.
     """
     if fixed_scale is not None and not abs(math.log(fixed_scale / best.scale)) < math.log(MOST_SCALED):
         raise OptionError(

@@ -84,9 +84,6 @@ def import_person(
 
     Returns:
         the report of the import.
-
-    Raises:
-        FaceDiffError: for anything that is wrong with files or arguments; nothing is left behind then.
     """
     output = output.expanduser().absolute()
     if not NAME.fullmatch(name):

@@ -123,9 +123,6 @@ def import_take(
         offset: seconds of the sound before the motion begins; found if None.
         most_offset: largest offset to look for, either way.
         clip_seconds: approximate length of the clips.
-
-    Raises:
-        FaceDiffError: for anything that is wrong with files or arguments; nothing is left behind then.
     """
     output = output.expanduser().absolute()
     if not NAME.fullmatch(name):

@@ -151,9 +151,6 @@ def codetalker(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer
 
     Source: the preprocessing published with CodeTalker (Xing et al., CVPR 2023; repository Doubiiu/CodeTalker), which
     most later work adopts.
-
-    Raises:
-        ValueError: if the mesh has no area, or a vertex is not finite.
     """
     turned = np.asarray(vertices, np.float64) * (1.0, -1.0, -1.0)
     centred = turned - turned.mean(axis=0)

@@ -49,9 +49,6 @@ class Job:
         work: gets the output folder, writes the clip with :func:`write_clip` and returns its number of frames. Must be
             picklable: a ``functools.partial`` of a function of a module.
         frames: number of frames if that is known cheaply, for the estimate of the disk space.
-
-    Raises:
-        FaceDiffError: if the name is unfit for a file name; names come from raw data and must not leave the folder.
     """
 
     name: str
@@ -137,10 +134,6 @@ def prepare(
         scheduler: where clips are written; see :func:`facediff.utils.jobs.run_tasks`.
         reads: the raw files, which workers of a cluster must see.
         quiet: no progress bars.
-
-    Raises:
-        FaceDiffError: if the folder cannot be written, holds something else or was begun with other options, if the
-            disk is too small, or if another run is at work in it.
     """
     if workers is not None and workers < 1:
         raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
