@@ -250,7 +250,7 @@ def pack(
 
     Args:
         root: the corpus folder
-        out: packed corpus to write, a name that ends in .zarr: a new one, or one that this command has begun
+        out: packed corpus to write (OUT.zarr): a new one, or one that this command has begun
         corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, or package.module.Class
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import sys
 import time
 import traceback
@@ -15,15 +16,17 @@ from typing import Any, Generic, TypeVar
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.checksums import sha256
-from facediff.utils.files import short_name
+from facediff.utils.files import remove_partial, short_name
 from facediff.utils.jobs import SetupError, run_tasks
-from facediff.utils.plain_files import read_json, write_json
+from facediff.utils.plain_files import parse_json, read_json, write_json
 from facediff.utils.workers import WorkerDied
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+SHOWN = 60
+"""Characters of a setting in messages."""
 RECORDS = ".facediff-batch"
 """Hidden folder next to the outputs of a batch; it holds one small file for each output."""
 
@@ -52,6 +55,7 @@ def run_batch(
     reads: Iterable[Path] = (),
     record: Callable[[Task, str, Result | None], None] | None = None,
     survive_bugs: bool = False,
+    progress: str = "",
 ) -> Generator[tuple[Task, Outcome[Result]]]:
     """Do tasks in several workers past failures, as :func:`~facediff.utils.jobs.run_tasks` does them.
 
@@ -66,10 +70,11 @@ def run_batch(
             finished after Ctrl-C is recorded; picklable.
         survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
             task; it is raised otherwise.
+        progress: title of a progress bar; none if empty.
     """
     attempt = partial(_attempt, work, record, survive_bugs)
-    places: dict[str, Any] = {"scheduler": scheduler, "writes": writes, "reads": reads}
-    with closing(run_tasks(attempt, tasks, workers=workers, **places)) as results:
+    options: dict[str, Any] = {"scheduler": scheduler, "writes": writes, "reads": reads, "progress": progress}
+    with closing(run_tasks(attempt, tasks, workers=workers, **options)) as results:
         for task, outcome in results:
             if isinstance(outcome, WorkerDied):
                 problem = f"{task}: killed its process, perhaps for lack of memory; try --workers 1"
@@ -81,6 +86,59 @@ def run_batch(
             if outcome.fatal:
                 raise FaceDiffError(outcome.problem)
             yield task, outcome
+
+
+def do_all(work: Callable[[Task], object], tasks: Sequence[Task], **options: Any) -> None:  # noqa: ANN401
+    """Do tasks that must all succeed: of those that fail, the first in their order is reported at the end.
+
+    Args:
+        work: does a task.
+        tasks: hashable.
+        options: as :func:`run_batch` takes them.
+    """
+    outcomes = {task: outcome.problem for task, outcome in run_batch(work, tasks, **options)}
+    if problem := next(filter(None, map(outcomes.__getitem__, tasks)), ""):
+        raise FaceDiffError(problem)
+
+
+def begin_folder(
+    out: Path, state: str, recipe: Mapping[str, Any], command: str, finished: Mapping[str, Any] | None = None
+) -> None:
+    """Begin or continue a folder, which a killed run has left; a folder of anything else is refused.
+
+    While ``state`` is there, readers refuse the folder: remove it when the last file is written. The caller holds a
+    lock.
+
+    Args:
+        out: the folder.
+        state: file in it that holds the recipe while the folder is unfinished.
+        recipe: all that determines the bytes of the output, plain data; a run is continued only with the same.
+        command: what writes it, for messages.
+        finished: the recipe of a finished folder that lacks something.
+    """
+    recipe = parse_json(json.dumps(recipe), state)  # as the file will hold it: lists, no tuples
+    earlier = read_json(out / state) or finished
+    if earlier is None and (others := [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]):
+        raise FaceDiffError(
+            f"{out}: holds other files ({', '.join(others[:3])}{' …' if len(others) > 3 else ''}) and was not begun by "
+            f"`{command}`; choose a new folder"
+        )
+    if earlier is not None:
+        changed = [name for name in {**earlier, **recipe} if earlier.get(name) != recipe.get(name)]
+        changes = [f"{name} was {_value(earlier.get(name))} and is {_value(recipe.get(name))}" for name in changed]
+        if changes:
+            raise FaceDiffError(
+                f"{out}: was begun with other settings ({'; '.join(changes)}); use the same, choose another folder, or "
+                f"remove this one"
+            )
+    write_json(out / state, recipe)
+    remove_partial(out, recursive=True)
+
+
+def _value(value: object) -> str:
+    """A setting in words."""
+    words = " ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return words if len(words) <= SHOWN else f"{words[:SHOWN]}…"
 
 
 def _attempt(

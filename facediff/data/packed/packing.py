@@ -6,12 +6,12 @@ import hashlib
 import io
 import json
 from collections.abc import Iterable, Iterator
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,6 @@ from facediff.data.packed.layout import (
     ROOM,
     SHARD_BYTES,
     STATE,
-    SUFFIX,
     ArrayFacts,
     PackedClip,
     PackedFile,
@@ -44,15 +43,15 @@ from facediff.data.packed.layout import (
 )
 from facediff.data.packed.shards import shard_key
 from facediff.data.packed.stores import is_packed
-from facediff.data.prepare.runner import refuse_foreign, version
+from facediff.data.prepare.runner import version
 from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, motion_path, open_motion, refuse_out_of_range
 from facediff.errors import FaceDiffError, needs_extra
 from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import open_sound, refuse_cut_short
-from facediff.utils.files import atomic, check_writable, locked, remove_partial
-from facediff.utils.jobs import in_order, run_tasks
+from facediff.utils.batch import begin_folder, do_all
+from facediff.utils.files import atomic, check_writable, locked
 from facediff.utils.limits import quoted
-from facediff.utils.plain_files import load_json, parse_json, write_json
+from facediff.utils.plain_files import parse_json
 
 if TYPE_CHECKING:
     from facediff.data.check.layouts import CorpusView
@@ -183,29 +182,16 @@ def pack(
             f"--tolerance {tolerance:g}: is finer than single precision allows; expected {FINEST:g} mm or more, or "
             f"--lossless"
         )
-    if out.suffix != SUFFIX:
-        raise FaceDiffError(f'{out}: unknown suffix "{out.suffix}"; expected a name that ends in {SUFFIX}')
-    if out.exists() and not out.is_dir():
-        raise FaceDiffError(f"{out}: is a file; expected a new folder")
     if is_packed(root):
         raise FaceDiffError(f"{root}: is packed already; expected a corpus folder with wav/ and vertices_npy/")
     if out.resolve().is_relative_to(root.resolve()):
         raise FaceDiffError(f"{out}: lies in the corpus folder {root}; choose a folder outside it")
-    require_zarr("packing a corpus")
-    if exact not in get_args(Exact):
-        raise FaceDiffError(f"--exact {exact}: unknown; expected one of {', '.join(get_args(Exact))}")
-    if codec not in CODECS:
-        raise FaceDiffError(f"--codec {codec}: unknown; expected one of {', '.join(CODECS)}")
+    with needs_extra("zarr", "packed", "packing a corpus"):
+        import zarr  # noqa: F401
     plan = PackingPlan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact, codec)
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data pack"):
         return _carry_out(plan, out, workers, scheduler, quiet)
-
-
-def require_zarr(purpose: str) -> None:
-    """Refuse to begin what needs the zarr package where it is not installed."""
-    with needs_extra("zarr", "packed", purpose):
-        import zarr  # noqa: F401
 
 
 @dataclass(frozen=True)
@@ -386,32 +372,12 @@ def _other_files(root: Path) -> tuple[str, ...]:
 def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str | None, quiet: bool) -> PackingReport:
     if (out / METADATA).is_file():
         return _finished(plan, out)
-    begun = {"recipe": plan.recipe, "sources": plan.sources}
-    if (out / STATE).is_file():
-        if load_json(out / STATE, remedy=f"remove {out}") != begun:
-            raise FaceDiffError(
-                f"{out}: was begun with other options, or the corpus has changed since; remove it, or choose another "
-                f"folder"
-            )
-    else:
-        refuse_foreign(out, "facediff data pack")
-        write_json(out / STATE, begun)
-    remove_partial(out, recursive=True)
+    begin_folder(out, STATE, {**plan.recipe, "state of the corpus": plan.sources}, "facediff data pack")
     # Every task writes one file, which appears whole or not at all: a file that exists is finished.
     tasks = [task for task in plan.tasks() if not (out / task.target).is_file()]
     work = partial(_write, out, plan.root, plan.record)
-    results = run_tasks(
-        work,
-        tasks,
-        workers=workers,
-        scheduler=scheduler,
-        writes=out,
-        reads=[plan.root],
-        progress="" if quiet else "packing",
-    )
-    with closing(results):
-        for _ in in_order(results, tasks):
-            pass
+    places = {"workers": workers, "scheduler": scheduler, "writes": out, "reads": [plan.root]}
+    do_all(work, tasks, **places, progress="" if quiet else "packing")
     record = _finish(plan, out)
     return _report(plan, record, out, sum(bool(task.coding) for task in tasks))
 

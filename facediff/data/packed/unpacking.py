@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ from facediff.data.packed.layout import EXACT
 from facediff.data.packed.reader import PackedCorpus
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import write_wav
+from facediff.utils.batch import do_all
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import atomic_folder
-from facediff.utils.jobs import PerWorker, in_order, run_tasks
+from facediff.utils.jobs import PerWorker
 from facediff.utils.plain_files import write_json
 from facediff.utils.workers import processors
 
@@ -48,18 +48,8 @@ def unpack(
         for name in ("vertices_npy", "wav"):
             (folder / name).mkdir(exist_ok=True)
         work = PerWorker(partial(_clip_writer, str(source), folder))
-        results = run_tasks(
-            work,
-            packed.names(),
-            workers=workers,
-            scheduler=scheduler,
-            writes=folder,
-            reads=packed.places,
-            progress="" if quiet else "unpacking",
-        )
-        with closing(results):
-            for _ in in_order(results, packed.names()):
-                pass
+        places = {"workers": workers, "scheduler": scheduler, "writes": folder, "reads": packed.places}
+        do_all(work, packed.names(), **places, progress="" if quiet else "unpacking")
         _correct_manifest(folder, packed, workers)
     return len(packed.names())
 

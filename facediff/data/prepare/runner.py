@@ -20,12 +20,10 @@ import numpy.typing as npt
 from facediff.data.manifest import FORMAT, load_manifest
 from facediff.errors import FaceDiffError, choices, needs_extra
 from facediff.utils.arrays import open_array
-from facediff.utils.batch import run_batch
+from facediff.utils.batch import begin_folder, run_batch
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
-from facediff.utils.jobs import is_cluster
 from facediff.utils.plain_files import parse_json, write_json
-from facediff.utils.progress import progress_bar
 from facediff.utils.workers import processors
 
 Precision = Literal["float32", "float64"]
@@ -91,8 +89,7 @@ class PreparationPlan:
     @property
     def recipe(self) -> dict[str, Any]:
         """All that determines the bytes of the output; a run may be resumed only with the same."""
-        options = parse_json(json.dumps(self.options), "options")  # as the manifest will hold them: lists, no tuples
-        return {"facediff": version(), "format": FORMAT, "corpus": self.corpus, "options": options}
+        return settings({"facediff": version(), "corpus": self.corpus, "options": self.options})
 
 
 @dataclass(frozen=True)
@@ -135,31 +132,21 @@ def prepare(
         reads: the raw files, which workers of a cluster must see.
         quiet: no progress bars.
     """
-    if workers is not None and workers < 1:
-        raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
-    if out.exists() and not out.is_dir():
-        raise FaceDiffError(f"{out}: is a file; expected a folder to write the corpus to")
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data prepare"):
-        manifest = _read_record(out / MANIFEST)
-        begun = _read_record(out / STATE) or manifest
-        if begun is None:
-            refuse_foreign(out, "facediff data prepare")
+        manifest = _read_manifest(out / MANIFEST)
         recorded = {} if manifest is None else manifest.get("files", {})
         finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out, recorded))}
         if manifest is not None and not (out / STATE).exists() and _is_complete(plan, finished, out, manifest):
             return _report(plan, out, manifest, 0)
-        if begun is not None:
-            _refuse_other_recipe(plan, out, begun)
         _refuse_strays(plan, out)
         pending = [job for job in plan.jobs if job.name not in finished]
         _check_space(plan, pending, out)
         # A run may be killed at any time, so the state marks the folder as unfinished before the first clip appears,
         # and is removed only once the manifest is written: readers refuse a folder with a state and without a manifest.
-        write_json(out / STATE, plan.recipe)
-        remove_partial(out, recursive=True)
-        places = {"scheduler": scheduler, "writes": out, "reads": reads}
-        return _write_all(plan, pending, finished, out, workers, places, quiet)
+        begin_folder(out, STATE, plan.recipe, "facediff data prepare", None if manifest is None else settings(manifest))
+        places = {"workers": workers, "scheduler": scheduler, "writes": out, "reads": reads}
+        return _write_all(plan, pending, finished, out, places, quiet)
 
 
 def _write_all(
@@ -167,15 +154,13 @@ def _write_all(
     pending: list[Job],
     finished: dict[str, int],
     out: Path,
-    workers: int | None,
     places: Mapping[str, Any],
     quiet: bool,
 ) -> PreparationReport:
     shared = plan.shared(out)
     clips, failed = dict(finished), {}
-    bar = progress_bar(plan.corpus, len(plan.jobs), done=len(finished), shown=not quiet)
-    outcomes = run_batch(methodcaller("work", out), pending, workers=workers, **places)
-    with bar as step, closing(outcomes):
+    outcomes = run_batch(methodcaller("work", out), pending, **places, progress="" if quiet else plan.corpus)
+    with closing(outcomes):
         for job, outcome in outcomes:
             if outcome.result is None:
                 failed[job.name] = outcome.problem
@@ -183,11 +168,9 @@ def _write_all(
                     file.unlink(missing_ok=True)
             else:
                 clips[job.name] = outcome.result
-            step()
-    if is_cluster(places["scheduler"]):
-        remove_partial(out, recursive=True)  # of a worker that was lost on another machine
+    remove_partial(out, recursive=True)  # of a worker of a cluster that was lost
     names = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in clip_files(out, name))]
-    files = describe_files(out, names, workers=workers or processors(), progress="" if quiet else "checksums")
+    files = describe_files(out, names, workers=places["workers"] or processors(), progress="" if quiet else "checksums")
     manifest = _manifest(plan, clips, failed, files)
     write_json(out / MANIFEST, manifest)
     (out / STATE).unlink()
@@ -200,7 +183,10 @@ def _manifest(
     """The final record. Nothing in it depends on the time or the order in which the files were made."""
     frames = sum(clips.values())
     return {
-        **plan.recipe,
+        "facediff": version(),
+        "format": FORMAT,
+        "corpus": plan.corpus,
+        "options": plan.options,
         "frame_rate": plan.frame_rate,
         "unit": plan.unit,
         "n_vertices": plan.n_vertices,
@@ -257,17 +243,24 @@ def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mappin
 def _is_complete(plan: PreparationPlan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
     """Whether the manifest records just this plan, carried out without a failure, and all its files are there."""
     # A newer version of facediff accepts a complete folder of an older one; it only refuses to continue it.
-    expected = {name: value for name, value in plan.recipe.items() if name not in ("facediff", "format")}
-    expected |= {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
+    expected = {**plan.recipe, "facediff": manifest.get("facediff")}
+    parts = {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
     return (
-        len(finished) == len(plan.jobs)
-        and all(manifest.get(name) == value for name, value in expected.items())
+        settings(manifest) == parse_json(json.dumps(expected), MANIFEST)
+        and len(finished) == len(plan.jobs)
+        and all(manifest.get(name) == value for name, value in parts.items())
         and same_sizes(out, manifest.get("files", {}))
     )
 
 
-def _read_record(path: Path) -> dict[str, Any] | None:
-    """The manifest or the state of a run; None if there is none."""
+def settings(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What a manifest says of how its folder was written; options as the user gives them."""
+    options = {f"--{name.replace('_', '-')}": value for name, value in record["options"].items()}
+    return {"facediff": record.get("facediff"), "corpus": record["corpus"], **options}
+
+
+def _read_manifest(path: Path) -> dict[str, Any] | None:
+    """The manifest of an earlier run; None if there is none."""
     if not path.is_file():
         return None
     record = load_manifest(path, remedy=f"remove {path.parent}, or choose another folder")
@@ -275,35 +268,6 @@ def _read_record(path: Path) -> dict[str, Any] | None:
     if not all(isinstance(part, dict) for part in parts) or "corpus" not in record:
         raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
     return record
-
-
-def _refuse_other_recipe(plan: PreparationPlan, out: Path, record: dict[str, Any]) -> None:
-    """Refuse to mix clips that were written with other options or by another version with those of this plan."""
-
-    def settings(recipe: Mapping[str, Any]) -> dict[str, Any]:
-        options = {f"--{name.replace('_', '-')}": value for name, value in dict(recipe["options"]).items()}
-        return {"facediff": recipe.get("facediff"), "corpus": recipe["corpus"], **options}
-
-    def words(value: object) -> str:
-        return " ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-    before, now = settings(record), settings(plan.recipe)
-    changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    if changed:
-        shown = "; ".join(f"{name} was {words(before.get(name))} and is {words(now.get(name))}" for name in changed)
-        raise FaceDiffError(
-            f"{out}: was begun with other settings ({shown}); use the same, choose another folder, or remove this one"
-        )
-
-
-def refuse_foreign(out: Path, command: str) -> None:
-    """Refuse to write into a folder with files that ``command`` has not written."""
-    others = [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]
-    if others:
-        raise FaceDiffError(
-            f"{out}: holds other files ({', '.join(others[:3])}{' …' if len(others) > 3 else ''}) and was not begun by "
-            f"`{command}`; choose a new folder"
-        )
 
 
 def _refuse_strays(plan: PreparationPlan, out: Path) -> None:

@@ -27,7 +27,7 @@ import soundfile
 from facediff.cli.app import main, run
 from facediff.cli.data import CORPORA, grouped, options_of, plan_options, read_prepare
 from facediff.cli.parsing import Parameter
-from facediff.data.prepare import biwi, runner
+from facediff.data.prepare import biwi
 from facediff.data.prepare.runner import Job, PreparationPlan, prepare, write_motion, write_speech, write_templates
 from facediff.errors import FaceDiffError, MissingExtraError
 from tests.fakes.biwi import vl_bytes, write_raw_biwi
@@ -224,10 +224,10 @@ def test_foreign_folders_and_strays_are_refused(tmp_path: Path) -> None:
         prepare(toy_plan({"A_e01": partial(write_toy, "A_e01", 3)}), out, workers=1)
 
 
-@pytest.mark.parametrize(("where", "sentence"), [("file", "is a file"), ("file/out", "cannot be written")])
-def test_a_folder_that_cannot_be_written_gets_one_sentence(tmp_path: Path, where: str, sentence: str) -> None:
+@pytest.mark.parametrize("where", ["file", "file/out"])
+def test_a_folder_that_cannot_be_written_gets_one_sentence(tmp_path: Path, where: str) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(FaceDiffError, match=sentence):
+    with pytest.raises(FaceDiffError, match="cannot be written"):
         prepare(toy_plan(), tmp_path / where, workers=1)
 
 
@@ -398,12 +398,6 @@ def test_wrong_arguments_are_refused(arguments: list[str]) -> None:
 def test_lines_for_the_screen_are_grouped_by_subject_and_reason() -> None:
     entries = {"F1_e01": "expected a/e01", "F1_e02": "expected a/e02", "F1_e03": "expected b/e03", "x.ply": "no"}
     assert grouped(entries) == ["F1_e01 … F1_e02 (2 in all): expected a/e01", "F1_e03: expected b/e03", "x.ply: no"]
-
-
-def test_workers_must_be_positive(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="--workers: is 0"):
-        prepare(toy_plan(), tmp_path / "out", workers=0)
-    assert runner.processors() >= 1
 
 
 @pytest.mark.parametrize("corpus", CORPORA)
