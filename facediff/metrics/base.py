@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import math
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -65,6 +66,28 @@ def check_option(name: str, value: object, allowed: Any) -> None:  # noqa: ANN40
         raise ValueError(f"unknown {name} {value!r}: {choices(str(value), names)}")
 
 
+def check_range(name: str, value: float, low: float, high: float = math.inf) -> None:
+    """Refuse a number below ``low`` or above ``high``, infinity and NaN.
+
+    >>> check_range("threshold", 1.5, 0, 1)
+    Traceback (most recent call last):
+    ...
+    ValueError: threshold is 1.5; expected 0 to 1
+    """
+    if not low <= value <= high or value == math.inf:
+        expected = f"{low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
+        raise ValueError(f"{name} is {value:g}; expected {expected}")
+
+
+def whole_numbers(name: str, values: Tensor | Sequence[int], count: int, most: int) -> list[int]:
+    """One whole number from 0 to ``most`` for each of ``count`` sequences."""
+    numbers = torch.as_tensor(values)
+    whole = not numbers.is_floating_point() and numbers.dtype != torch.bool
+    if numbers.numel() != count or (count and not (whole and numbers.min() >= 0 and numbers.max() <= most)):
+        raise ValueError(f"{name} must be {count} whole numbers from 0 to {most}, one for each sequence")
+    return list(map(int, numbers.flatten().tolist()))
+
+
 # From padded batches to pairs of sequences that can be compared frame by frame.
 
 Lengths = Tensor | Sequence[int] | int
@@ -122,17 +145,37 @@ class Clips:
         """The same sequences with their neutral vertices: (batch, vertices, 3), or (vertices, 3) for all sequences."""
         if template is None:
             return self
-        check_tensor(name, template)
         batch, vertices, dims = len(self.clips), self.n_vertices, self.dims
         if template.shape not in ((batch, vertices, dims), (vertices, dims)):
             raise ValueError(
                 f"{name} has shape {tuple(template.shape)}; expected {(batch, vertices, dims)} or {(vertices, dims)}"
             )
         templates = list(template.detach().expand(batch, vertices, dims))
-        for clip, neutral in zip(self.clips, templates, strict=True):
-            if not bool(neutral.isfinite().all()):
-                raise NotFiniteError(f"the template of {clip.name} holds NaN or infinity; repair or omit this clip")
-        return self.attach("template", templates)
+        return self.attach("template", self.finite("template", templates))
+
+    def rows(self, name: str, values: Tensor | None, *, single: bool, ndim: int) -> list[Tensor]:
+        """Further values of each sequence, such as its speech.
+
+        Args:
+            name: of the argument.
+            values: (batch, …), or without the batch axis if ``single``.
+            single: whether there is one sequence without batch axis.
+            ndim: how many axes there are with that of the batch.
+        """
+        rows = None if values is None else values.detach()[None] if single else values.detach()
+        if rows is None or rows.ndim != ndim or len(rows) != len(self.clips) or not rows.is_floating_point():
+            shape = "missing" if values is None else f"{values.dtype} of shape {tuple(values.shape)}"
+            raise ValueError(
+                f"{name} is {shape}; expected numbers with a point, for each of {len(self.clips)} sequences"
+            )
+        return list(rows)
+
+    def finite(self, name: str, values: Sequence[Tensor]) -> Sequence[Tensor]:
+        """The same values of each sequence; NaN and infinity among them are refused."""
+        for clip, value in zip(self.clips, values, strict=True):
+            if not bool(value.isfinite().all()):
+                raise NotFiniteError(f"the {name} of {clip.name} holds NaN or infinity; repair or omit this clip")
+        return values
 
     def check_finite(self) -> None:
         """Refuse NaN and infinity in the frames that are scored."""
@@ -186,31 +229,28 @@ def align(
         rule: what to do where the lengths differ.
 
     Raises:
-        ValueError: if shapes, types or lengths do not fit, a clip has no frame, or the rule refuses the
-            lengths.
+        ValueError: if shapes, types or lengths do not fit, a clip has no frame, or the rule refuses the lengths.
     """
-    check_option("length rule", rule, LengthRule)
     check_tensor("prediction", prediction)
     check_tensor("truth", truth)
     prediction, truth = prediction.detach(), truth.detach()  # scores are read, not optimised: keep no graph
     single = truth.ndim == 3
-    for name, motion in (("prediction", prediction), ("truth", truth)):
-        if motion.ndim not in (3, 4) or motion.ndim != truth.ndim or motion.shape[-1] not in (1, 3):
-            raise ValueError(
-                f"{name} has shape {tuple(motion.shape)}; prediction and truth must both be "
-                "(batch, frames, vertices, 3) or both (frames, vertices, 3), or so with 1 for channels"
-            )
-        if motion.shape[-2] == 0:
-            raise ValueError(f"{name} has no vertex: shape {tuple(motion.shape)}")
-        if not motion.is_floating_point():
-            raise ValueError(f"{name} must be floating point, not {motion.dtype}")
+    axes = [(motion.ndim, *motion.shape[:-3], *motion.shape[-2:]) for motion in (prediction, truth)]  # all but frames
+    floating = prediction.is_floating_point() and truth.is_floating_point()
+    if (
+        axes[0] != axes[1]
+        or truth.ndim not in (3, 4)
+        or truth.shape[-1] not in (1, 3)
+        or not (truth.shape[-2] and floating)
+    ):
+        raise ValueError(
+            f"the prediction is {prediction.dtype} of shape {tuple(prediction.shape)}, the truth {truth.dtype} of "
+            f"{tuple(truth.shape)}; both must be floating-point (batch, frames, vertices, 3) or (frames, vertices, 3), "
+            "or so with 1 for channels, and agree in batch and vertices"
+        )
     if single:
         prediction, truth = prediction[None], truth[None]
     batch = len(truth)
-    if len(prediction) != batch or prediction.shape[2:] != truth.shape[2:]:
-        raise ValueError(
-            f"prediction {tuple(prediction.shape)} and truth {tuple(truth.shape)} must agree in batch and vertices"
-        )
     if prediction.shape[1] != truth.shape[1] and lengths is not None and prediction_lengths is None:
         raise ValueError(
             f"prediction and truth are padded to {prediction.shape[1]} and {truth.shape[1]} frames, "
@@ -220,8 +260,6 @@ def align(
         names = ["the clip"] if single else [f"clip {place} of the batch" for place in range(batch)]
     else:
         names = [clip_names] if isinstance(clip_names, str) else list(clip_names)
-    if len(names) != batch:
-        raise ValueError(f"{len(names)} clip_names for {batch} sequences; give one per sequence")
     valid = _valid_frames("lengths", lengths, truth)
     effective_lengths = prediction_lengths if prediction_lengths is not None else lengths
     predicted = _valid_frames("prediction_lengths", effective_lengths, prediction)
@@ -250,18 +288,14 @@ def _valid_frames(name: str, lengths: Lengths | None, motion: Tensor) -> list[in
     values = torch.as_tensor(lengths)
     if values.dtype == torch.bool:
         mask = values.reshape(-1, values.shape[-1]) if values.ndim else values
-        if mask.shape != (batch, padded):
-            raise ValueError(f"the mask {name} has shape {tuple(values.shape)}, not {(batch, padded)}")
-        values = mask.sum(1)
-        if not torch.equal(mask, torch.arange(padded, device=mask.device) < values[:, None]):
-            raise ValueError(f"the mask {name} must be true from the first frame on, without gaps")
-    if values.is_floating_point() or values.ndim > 1 or values.numel() != batch:
-        raise ValueError(f"{name} must hold {batch} whole numbers, one per sequence, not {tuple(values.shape)}")
-    frames: list[int] = values.reshape(-1).tolist()
-    for value in frames:
-        if not 0 <= value <= padded:
-            raise ValueError(f"{name} holds {value}; the motion has {padded} frames, so 0 to {padded} can be valid")
-    return frames
+        values = mask.sum(-1)
+        fits = mask.shape == (batch, padded)
+        if not fits or not torch.equal(mask, torch.arange(padded, device=mask.device) < values[:, None]):
+            raise ValueError(
+                f"the mask {name} of shape {tuple(mask.shape)} must be {(batch, padded)}, true from the first frame "
+                "on, without gaps"
+            )
+    return whole_numbers(name, values, batch, padded)
 
 
 # The classes from which metrics are derived.
@@ -543,7 +577,7 @@ class SequenceMetric(ExactMetric):
         """The score over all sequences so far, a float64 scalar.
 
         Raises:
-            ValueError: if no process had any sequence, or none that has a value.
+            ValueError: if no process had any sequence that has a value.
         """
         frames, sequences = self.counts[0], self.counts[1]
         if int(sequences) == 0:
@@ -553,10 +587,9 @@ class SequenceMetric(ExactMetric):
     def refuse_to_compute(self, left_out: int) -> NoReturn:
         """Raise the error of a metric that has nothing to score, or has left out all sequences."""
         self.leave_synchronised_state()
-        name = type(self).__name__
-        if left_out:
-            raise ValueError(f"{name} has no value on any of its {left_out} sequences: {self.leaves_out}")
-        raise ValueError(f"{name} has no sequence to score; call update before compute")
+        reason = f"has no value on any of its {left_out} sequences: {self.leaves_out}"
+        reason = reason if left_out else "has no sequence to score; call update before compute"
+        raise ValueError(f"{type(self).__name__} {reason}")
 
     def coverage(self) -> Coverage:
         """How much was scored, cut and left out, over all processes."""
@@ -568,6 +601,13 @@ class SequenceMetric(ExactMetric):
     def covered(self) -> Coverage:
         """The :meth:`coverage` of the states as they are, without reducing them over processes."""
         return Coverage(*self.counts.tolist())
+
+
+def of_side(of: Side, clip: Clip, score: Callable[[Tensor], Tensor]) -> Tensor:
+    """A score of one side's motion (frames, vertices, 3) alone, or the prediction's minus the truth's."""
+    if of == "gap":
+        return score(clip.prediction) - score(clip.truth)
+    return score(clip.prediction if of == "prediction" else clip.truth)
 
 
 class LipMetric(SequenceMetric):

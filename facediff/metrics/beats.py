@@ -7,7 +7,7 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from facediff.metrics.base import Clip, SequenceOptions, Side, UpdateOptions, functional
+from facediff.metrics.base import Clip, SequenceOptions, Side, UpdateOptions, check_range, functional, of_side
 from facediff.metrics.channels import OneSideMetric
 from facediff.metrics.regions import RegionLike
 from facediff.metrics.timing import extrema, smooth
@@ -97,12 +97,10 @@ class HeadBeatAlignment(OneSideMetric):
         of: Side = "prediction",
         **options: Unpack[SequenceOptions],
     ) -> None:
-        if frames_per_second is None or not 0 < frames_per_second <= sample_rate:
-            raise ValueError(
-                f"frames_per_second is {frames_per_second}; expected the motion's, up to {sample_rate} as the sound has"
-            )
-        if not (0 <= smoothing < float("inf") and 0 < variance < float("inf")):
-            raise ValueError(f"smoothing is {smoothing} and variance {variance}; expected 0 or more, and above 0")
+        frames_per_second = frames_per_second or 0.0
+        check_range("frames_per_second", frames_per_second, 1e-9, sample_rate)
+        check_range("smoothing", smoothing, 0)
+        check_range("variance", variance, 1e-9)
         definition = (
             f"in each sequence the mean over onsets of the speech of exp(−d² / {2 * variance:g}), d being the frames "
             f"to the nearest minimum of the speed of {{region}} smoothed over {smoothing:g} frames, at "
@@ -130,11 +128,7 @@ class HeadBeatAlignment(OneSideMetric):
             gaps = (beats[:, None] - torch.tensor(slow, dtype=torch.float64)).abs().amin(1)
             return torch.exp(-gaps.square() / (2 * self.variance)).mean()
 
-        if self.of == "gap":
-            value = alignment(clip.prediction) - alignment(clip.truth)
-        else:
-            value = alignment(clip.prediction if self.of == "prediction" else clip.truth)
-        return value.to(clip.truth.device)
+        return of_side(self.of, clip, alignment).to(clip.truth.device)
 
     def update(
         self, prediction: Tensor, truth: Tensor, *, waveform: Tensor | None = None, **batch: Unpack[UpdateOptions]
@@ -148,21 +142,10 @@ class HeadBeatAlignment(OneSideMetric):
                 Samples beyond the scored frames are not read.
         """
         clips = self.align(prediction, truth, **batch)
-        if waveform is None:
-            raise ValueError("the alignment with the speech needs waveform=")
-        sounds = waveform.detach()[None] if truth.ndim == 3 else waveform.detach()
-        if sounds.ndim != 2 or len(sounds) != len(clips.clips) or not sounds.is_floating_point():
-            raise ValueError(
-                f"waveform has shape {tuple(waveform.shape)} and type {waveform.dtype}; expected floating-point "
-                f"numbers, one row for each of {len(clips.clips)} sequences"
-            )
-        beats = []
-        for clip, sound in zip(clips.clips, sounds, strict=True):
-            scored = sound[: int(clip.frames * self.sample_rate / self.frames_per_second)]
-            if not bool(scored.isfinite().all()):
-                raise ValueError(f"the speech of {clip.name} holds NaN or infinity; repair or omit this clip")
-            beats.append(onsets(scored, self.sample_rate) * self.frames_per_second)
-        self.add(clips.attach("beats", beats))
+        sounds = clips.rows("waveform", waveform, single=truth.ndim == 3, ndim=2)
+        samples = [int(clip.frames * self.sample_rate / self.frames_per_second) for clip in clips.clips]
+        scored = clips.finite("speech", [sound[:count] for sound, count in zip(sounds, samples, strict=True)])
+        self.add(clips.attach("beats", [onsets(sound, self.sample_rate) * self.frames_per_second for sound in scored]))
 
 
 head_beat_alignment = functional(HeadBeatAlignment)

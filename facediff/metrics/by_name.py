@@ -104,12 +104,7 @@ class Request:
         return replace(self, options={**self.options, "scale": scale}) if takes and scale != 1.0 else self
 
     def build(self, context: Context) -> Metric:
-        """The metric, made for a corpus.
-
-        Raises:
-            FaceDiffError: if the corpus lacks something that the metric needs, naming all of it, or an option is
-                refused.
-        """
+        """The metric, made for a corpus."""
         lacking = [need for need in self.needs if need not in context.has]
         if lacking:
             reasons = "; ".join(

@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal, Unpack, cast
 import torch
 from torch import Tensor
 
-from facediff.errors import NotFiniteError
 from facediff.metrics.base import (
     SIDE_WORDS,
     Clip,
@@ -22,11 +21,12 @@ from facediff.metrics.base import (
     Side,
     UpdateOptions,
     check_option,
+    check_range,
     functional,
+    of_side,
 )
 from facediff.metrics.mouth import OpeningMetric, correlation
 from facediff.metrics.regions import LipPairsLike, RegionLike
-from facediff.metrics.vertex_errors import check_scale
 from facediff.registry import metric
 
 
@@ -85,9 +85,7 @@ class OneSideMetric(ChannelMetric):
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The score of one sequence."""
-        if self.of == "gap":
-            return self.of_motion(self.flat(clip.prediction)) - self.of_motion(self.flat(clip.truth))
-        return self.of_motion(self.flat(clip.prediction if self.of == "prediction" else clip.truth))
+        return of_side(self.of, clip, lambda motion: self.of_motion(self.flat(motion)))
 
 
 @metric.register("channel_variance")
@@ -134,8 +132,7 @@ class FramePairDistance(OneSideMetric):
         of: Side = "prediction",
         **options: Unpack[SequenceOptions],
     ) -> None:
-        if pairs < 1:
-            raise ValueError(f"pairs is {pairs}; expected 1 or more")
+        check_range("pairs", pairs, 1)
         definition = (
             f"in each sequence the mean distance over {{region}} of {pairs} pairs of frames drawn with the seed "
             f"{seed}, {{side}}; mean over sequences [unit]"
@@ -219,7 +216,7 @@ class LipDynamicsDeviation(OpeningMetric):
     higher_is_better = False
 
     def __init__(self, pairs: LipPairsLike, *, scale: float = 1.0, **options: Unpack[SequenceOptions]) -> None:
-        check_scale(scale)
+        check_range("scale", scale, 1e-12)
         unit = "unit" if scale == 1.0 else f"unit of lengths times {scale:g}"
         definition = (
             "in each sequence the difference, without sign, between the standard deviations over time of the mouth's "
@@ -237,31 +234,23 @@ class LipDynamicsDeviation(OpeningMetric):
 # Conversations: the motion of whom the person talks with is read too.
 
 
-def attach_partners(clips: Clips, partner: Tensor, *, single: bool) -> Clips:
+def attach_partners(clips: Clips, partner: Tensor | None, *, single: bool) -> Clips:
     """The sequences with their partners' motion, cut to the frames that are scored.
 
     Args:
         clips: the sequences.
         partner: (batch, frames, channels, dims); without the batch axis if ``single``.
         single: whether there is one sequence without batch axis.
-
-    Raises:
-        ValueError: if shapes do not fit, a partner has fewer frames than are scored, or holds NaN or infinity.
     """
-    motions = partner.detach()[None] if single else partner.detach()
-    expected = (len(clips.clips), clips.n_vertices, clips.dims)
-    if motions.ndim != 4 or (len(motions), *motions.shape[2:]) != expected or not motions.is_floating_point():
-        raise ValueError(
-            f"partner has shape {tuple(partner.shape)}; expected the shape of the truth, one partner for each sequence"
-        )
-    scored = []
+    motions = clips.rows("partner", partner, single=single, ndim=4)
     for clip, motion in zip(clips.clips, motions, strict=True):
-        if len(motion) < clip.frames:
-            raise ValueError(f"{clip.name}: the partner has {len(motion)} frames for {clip.frames} frames of motion")
-        if not bool(motion[: clip.frames].isfinite().all()):
-            raise NotFiniteError(f"the partner of {clip.name} holds NaN or infinity; repair or omit this clip")
-        scored.append(motion[: clip.frames])
-    return clips.attach("partner", scored)
+        if len(motion) < clip.frames or motion.shape[1:] != clip.truth.shape[1:]:
+            raise ValueError(
+                f"{clip.name}: the partner has the shape {tuple(motion.shape)}; expected that of the motion, "
+                f"{tuple(clip.truth.shape)}"
+            )
+    scored = [motion[: clip.frames] for clip, motion in zip(clips.clips, motions, strict=True)]
+    return clips.attach("partner", clips.finite("partner", scored))
 
 
 @metric.register("residual_partner_correlation")
@@ -300,8 +289,6 @@ class ResidualPartnerCorrelation(ChannelMetric):
             truth: of the same shape as the prediction.
             partner: motion of whom the person talks with, of the truth's shape.
         """
-        if partner is None:
-            raise ValueError("the correlation with a partner needs partner=")
         self.add(attach_partners(self.align(prediction, truth, **batch), partner, single=truth.ndim == 3))
 
 
@@ -400,23 +387,19 @@ class FrechetDistance(DistributionMetric):
         if clips.dims != self.dims:
             raise ValueError(f"a point of the motion has {clips.dims} numbers, the metric's have {self.dims}; set dims")
         if self.with_partner:
-            if partner is None:
-                raise ValueError("the Fréchet distance of both people needs partner=")
             clips = attach_partners(clips, partner, single=truth.ndim == 3)
         self.add(clips)
 
     def compute(self) -> Tensor:
         """The distance over all frames so far, a float64 scalar.
 
-        Raises:
-            ValueError: if there are fewer than two frames.
+        NaN of a single frame, which has no covariance.
         """
         frames = int(self.counts[0])
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
         if frames < 2:
-            self.leave_synchronised_state()
-            raise ValueError("FrechetDistance has one frame, which has no covariance; score more")
+            return torch.full_like(self.sums[0, 0], torch.nan)
         means = self.sums / frames
         covariances = (self.products - frames * means[:, :, None] * means[:, None, :]) / (frames - 1)
         # tr (A B)^½ is the sum of the roots of the eigenvalues of A^½ B A^½, which is symmetric.
@@ -505,8 +488,7 @@ class ShannonIndex(DistributionMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Literal["prediction", "truth"])
-        if clusters < 1:
-            raise ValueError(f"clusters is {clusters}; expected 1 or more")
+        check_range("clusters", clusters, 1)
         definition = (
             f"entropy of the shares of {clusters} clusters of the truth's frames (k-means, seed {seed}) among the "
             f"frames {SIDE_WORDS[of]}, over {{region}}, all sequences together [bit]"

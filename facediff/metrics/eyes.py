@@ -12,7 +12,7 @@ from typing import ClassVar, Literal, Unpack
 import torch
 from torch import Tensor
 
-from facediff.metrics.base import Clip, SequenceOptions, check_option, functional
+from facediff.metrics.base import Clip, SequenceOptions, check_option, check_range, functional
 from facediff.metrics.generation import RatioMetric
 from facediff.metrics.mouth import OpeningMetric
 from facediff.metrics.regions import EyelidPairs, LipPairs, LipPairsLike
@@ -77,8 +77,8 @@ class BlinkMetric(LidMetric):
         reopened: float = REOPENED,
         **options: Unpack[SequenceOptions],
     ) -> None:
-        if not 0 <= reopened <= closed < 1:
-            raise ValueError(f"closed is {closed:g} and reopened {reopened:g}; expected 0 <= reopened <= closed < 1")
+        check_range("closed", closed, 0, 1)
+        check_range("reopened", reopened, 0, closed)
         definition = (
             f"{definition}, a blink being a rise of 1 − opening / median opening of the sequence above {closed:g} "
             f"after it was below {reopened:g}, an opening the mean distance of {{pairs}}"
@@ -161,8 +161,8 @@ class BlinkRate(BlinkMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Blinker)
-        if frames_per_second is None or not frames_per_second > 0:
-            raise ValueError(f"frames_per_second is {frames_per_second}; a rate a minute needs the motion's, above 0")
+        frames_per_second = frames_per_second or 0.0
+        check_range("frames_per_second", frames_per_second, 1e-9)
         definition = f"blinks of the {of} over minutes at {frames_per_second:g} frames a second"
         super().__init__(pairs, definition=definition, closed=closed, reopened=reopened, **options)
         self.frames_per_second = frames_per_second
@@ -198,8 +198,7 @@ class EyelidDrift(LidMetric):
     divides_by = "the truth's lids do not move between blinks"
 
     def __init__(self, pairs: LipPairsLike, *, reopened: float = REOPENED, **options: Unpack[SequenceOptions]) -> None:
-        if not 0 < reopened < 1:
-            raise ValueError(f"reopened is {reopened:g}; expected a number between 0 and 1")
+        check_range("reopened", reopened, 0, 1)
         definition = (
             f"mean |1 − opening / median opening| over frames in which it is below {reopened:g}, an opening the mean "
             f"distance of {{pairs}}, over that of the truth"

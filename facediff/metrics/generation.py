@@ -21,6 +21,7 @@ from facediff.metrics.base import (
     SequenceMetric,
     SequenceOptions,
     check_option,
+    check_range,
     functional,
 )
 from facediff.metrics.one_pass import ErrorOf, one_pass
@@ -29,14 +30,25 @@ from facediff.metrics.samples import OfSamples
 from facediff.registry import metric
 
 
-class RatioMetric(SequenceMetric):
+class Denominator(SequenceMetric):
+    """Base of metrics that divide by a sum over all sequences."""
+
+    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
+
+    def check_denominator(self, sums: Tensor) -> None:
+        """Refuse to divide by zero."""
+        if bool((sums == 0).any()):
+            self.leave_synchronised_state()
+            raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
+
+
+class RatioMetric(Denominator):
     """Base of metrics that divide one sum over all sequences by another; a subclass defines :meth:`clip_parts`.
 
     The mean of each sequence's own ratio would be ruled by the sequences in which hardly anything happens.
     """
 
     unit: ClassVar[str] = "1"
-    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
     parts: Tensor
 
     def __init__(self, region: RegionLike | None = None, *, definition: str, **options: Any) -> None:  # noqa: ANN401 - the next base's
@@ -76,9 +88,7 @@ class RatioMetric(SequenceMetric):
         """
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
-        if bool((self.parts[1] == 0).any()):
-            self.leave_synchronised_state()
-            raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
+        self.check_denominator(self.parts[1])
         return self.finish(self.parts[0] / self.parts[1])
 
 
@@ -195,7 +205,7 @@ class DifferenceRatio(RatioMetric):
 
 
 @metric.register("spectrum_distance")
-class SpectrumDistance(SequenceMetric):
+class SpectrumDistance(Denominator):
     r"""Spectrum distance: by how many decibels the power of a region's motion is off, mean over octaves.
 
     Of every sequence, offsets are taken from their mean over time, multiplied by the window w[t] = sin(π(t + ½)/T) and
@@ -215,14 +225,14 @@ class SpectrumDistance(SequenceMetric):
     """
 
     unit: ClassVar[str] = "dB"
+    divides_by = "the truth does not move in any sequence"
     in_order = True
     powers: Tensor
 
     def __init__(
         self, region: RegionLike | None = None, *, octaves: int = 5, **options: Unpack[SequenceOptions]
     ) -> None:
-        if octaves < 1:
-            raise ValueError(f"octaves={octaves}: expected 1 or more")
+        check_range("octaves", octaves, 1)
         definition = (
             f"mean over {octaves} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
         )
@@ -267,9 +277,7 @@ class SpectrumDistance(SequenceMetric):
         """The score over all sequences so far, a float64 scalar."""
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
-        if float(self.powers[1].sum()) == 0:
-            self.leave_synchronised_state()
-            raise ValueError("SpectrumDistance would divide by zero: the truth does not move in any sequence")
+        self.check_denominator(self.powers[1].sum())
         return _decibels(self.powers)
 
 

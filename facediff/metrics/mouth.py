@@ -8,8 +8,9 @@ names so that a :class:`torchmetrics.MetricCollection` can pass both.)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Literal, Unpack
+import operator
+from collections.abc import Sequence
+from typing import ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -25,10 +26,11 @@ from facediff.metrics.base import (
     Side,
     UpdateOptions,
     check_option,
+    check_range,
     functional,
 )
 from facediff.metrics.one_pass import frames_per_step, squared_norm
-from facediff.metrics.regions import LipPairs, LipPairsLike, as_lip_pairs, whole
+from facediff.metrics.regions import LipPairs, LipPairsLike, as_lip_pairs
 from facediff.registry import metric
 
 
@@ -290,8 +292,7 @@ class BilabialClosureRate(OpeningMetric):
     ) -> None:
         check_option("count", count, Counted)
         check_option("of", of, Side)
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"threshold is {threshold:g}; expected a share of the truth's opening range, 0 to 1")
+        check_range("threshold", threshold, 0, 1)
         over = "all sequences" if pooling == "frames" else "each sequence, then mean over sequences"
         definition = (
             f"share of {COUNTED_WORDS[count]}, {SIDE_WORDS[of]}; closed is an opening (mean distance of {{pairs}}) up "
@@ -317,9 +318,8 @@ class BilabialClosureRate(OpeningMetric):
             closed = hits.sum() if self.count == "frames" else (hits > 0).sum()
             return closed.double() / self.clip_weight(clip)
 
-        if self.of == "gap":
-            return rate(predicted) - rate(true)
-        return rate(predicted if self.of == "prediction" else true)
+        rates = {"prediction": rate(predicted), "truth": rate(true)}
+        return rates["prediction"] - rates["truth"] if self.of == "gap" else rates[self.of]
 
     def clip_weight(self, clip: Clip) -> int:
         """Frames in closures, or closures, whichever are counted."""
@@ -330,7 +330,7 @@ class BilabialClosureRate(OpeningMetric):
         prediction: Tensor,
         truth: Tensor,
         *,
-        closures: Closures | None = None,
+        closures: Closures,
         offsets_from: Tensor | None = None,
         **batch: Unpack[UpdateOptions],
     ) -> None:
@@ -341,61 +341,44 @@ class BilabialClosureRate(OpeningMetric):
             truth: of the same shape as the prediction.
             closures: frames of the truth in which the mouth is known to close: a boolean mask (batch, frames),
                 a run of true frames being one closure, or for each sequence a list of intervals (first frame,
-                frame after the last) in order and without overlap. They must be given; frames that are not scored
-                do not count.
+                frame after the last) in order and without overlap. Frames that are not scored do not count.
             offsets_from: neutral vertices that prediction and truth are offsets from; **None means that they
                 are absolute vertices**.
         """
-        if closures is None:
-            raise ValueError("closures= is missing; say in which frames the mouth is known to close")
         clips = self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from")
         self.add(_attach_closures(clips, closures, padded=truth.shape[-3], single=truth.ndim == 3))
 
 
 def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: bool) -> Clips:
     """The sequences with their closures, as far as these lie in scored frames; a mask has as many as are padded."""
-    count = len(clips.clips)
     if isinstance(closures, Tensor):
-        shape = (padded,) if single else (count, padded)
-        if closures.dtype != torch.bool or closures.shape != shape:
-            raise ValueError(
-                f"closures must be a boolean mask of shape {shape} or lists of intervals, not "
-                f"{closures.dtype} of shape {tuple(closures.shape)}"
-            )
-        by_clip: list[object] = []
-        for row in closures.reshape(count, padded).tolist():
-            framed = [False, *row, False]
-            edges = [place for place in range(padded + 1) if framed[place] != framed[place + 1]]
-            by_clip.append(list(zip(edges[::2], edges[1::2], strict=True)))  # runs of true values as intervals
+        by_clip = [_runs(row) for row in closures.reshape(-1, closures.shape[-1]).tolist()]
+        fits = closures.dtype == torch.bool and closures.shape[-1] == padded
     else:
-        by_clip = [closures] if single else list(closures)
-    if len(by_clip) != count:
-        raise ValueError(f"closures of {len(by_clip)} sequences for {count}; give a list of intervals for each")
-    checked = [_checked(clip, intervals) for clip, intervals in zip(clips.clips, by_clip, strict=True)]
-    return clips.attach("closures", checked)
-
-
-def _checked(clip: Clip, intervals: object) -> tuple[Interval, ...]:
-    """The intervals of one clip, each checked, as far as they lie in its frames."""
-    kept: list[Interval] = []
-    earlier = 0
-    pairs: Iterable[Any] = intervals if isinstance(intervals, Sequence) else [intervals]
-    for pair in pairs:
-        try:
-            start, end = (whole(frame) for frame in pair)
-        except (TypeError, ValueError):
+        by_clip, fits = [closures] if single else list(closures), True  # type: ignore[list-item]  # as the shape says
+    if not fits or len(by_clip) != len(clips.clips):
+        raise ValueError(
+            f"closures of {len(by_clip)} sequences; expected, for each of {len(clips.clips)}, {padded} booleans or a "
+            "list of intervals"
+        )
+    scored = []
+    for clip, intervals in zip(clips.clips, by_clip, strict=True):
+        ends = [0, *(operator.index(frame) for pair in intervals for frame in pair)]
+        bounds = zip(ends[:-1:2], ends[1::2], ends[2::2], strict=True)
+        if any(start < before or end <= start for before, start, end in bounds):
             raise ValueError(
-                f"the closures of {clip.name} must be a list of pairs of whole numbers (first frame, end)"
-            ) from None
-        if start < earlier or end <= start:
-            raise ValueError(
-                f"the closures of {clip.name} hold the interval {(start, end)}; expected intervals that are not empty, "
-                "in order and without overlap, each a first frame from 0 and the frame after the last"
+                f"the closures of {clip.name} are {list(intervals)}; expected intervals that are not empty, in order "
+                "and without overlap, each a first frame from 0 and the frame after the last"
             )
-        earlier = end
-        if start < clip.frames:
-            kept.append((start, min(end, clip.frames)))
-    return tuple(kept)
+        scored.append(tuple((start, min(end, clip.frames)) for start, end in intervals if start < clip.frames))
+    return clips.attach("closures", scored)
+
+
+def _runs(row: Sequence[bool]) -> list[Interval]:
+    """Runs of true values as intervals."""
+    framed = [False, *row, False]
+    edges = [place for place in range(len(row) + 1) if framed[place] != framed[place + 1]]
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 mouth_opening_difference = functional(MouthOpeningDifference)

@@ -74,19 +74,9 @@ class Protocol:
     topology: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the options."""
-        if self.mve is not None:
-            check_option("reduction", self.mve, Reduction)
-        for sign in self.fdd:
-            check_option("sign", sign, Sign)
-        if len(set(self.fdd)) != len(self.fdd):
-            raise ValueError(f"protocol {self.name!r} names a sign of FDD twice: {self.fdd}")
-        check_option("pooling", self.pooling, Pooling)
-        check_option("length rule", self.length_rule, LengthRule)
+        """Check the topology, by which regions and motion of another mesh are refused."""
         if self.topology is not None:
             check_option("topology", self.topology, TOPOLOGIES)
-        if self.mve is None and not self.lve:
-            raise ValueError(f"protocol {self.name!r} has neither MVE nor LVE, by which frames are counted; add one")
 
     @property
     def of_parameters(self) -> bool:
@@ -332,9 +322,6 @@ class ProtocolMetrics(MetricCollection):
             template: neutral vertices (batch, vertices, 3) or (vertices, 3) if the motion is absolute; None
                 if prediction and truth are offsets from the template already.
             **batch: ``lengths``, ``prediction_lengths`` and ``clip_names`` as for :meth:`SequenceMetric.update`.
-
-        Raises:
-            ValueError: as :meth:`SequenceMetric.update`; no metric has changed then.
         """
         self._check(prediction, truth, template, batch)
         super().update(prediction, truth, template=template, **batch)

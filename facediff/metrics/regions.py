@@ -7,17 +7,71 @@ A :class:`Region` is a set of vertices, :class:`LipPairs` are pairs of an upper 
 from __future__ import annotations
 
 import hashlib
-import math
 import operator
-import re
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, SupportsIndex
 
 import torch
 from torch import Tensor
+
+
+class Vertices(ABC):
+    """Named vertices of a mesh, or pairs of them: what regions and pairs have in common.
+
+    Attributes:
+        name: what they are called next to a score.
+        duplicates: how many repeated entries the source held.
+    """
+
+    name: str
+    duplicates: int
+    entries_in_words: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def entries(self) -> tuple[Any, ...]:
+        """Indices, or pairs of them, strictly increasing."""
+
+    def __str__(self) -> str:
+        """Name, number of entries and hash, as printed next to a score."""
+        return f"{self.name} ({self.count} {self.entries_in_words}, {self.hash})"
+
+    @property
+    @abstractmethod
+    def bounds(self) -> tuple[int, int]:
+        """The smallest and the largest index."""
+
+    @property
+    def count(self) -> int:
+        """How many distinct entries there are."""
+        return len(self.entries)
+
+    @property
+    @abstractmethod
+    def hash(self) -> str:
+        """First 8 hexadecimal digits of the SHA-256 of the entries."""
+
+    def tensor(self) -> Tensor:
+        """The entries as an int64 tensor of shape (count,), or (count, 2)."""
+        return torch.tensor(self.entries, dtype=torch.int64)
+
+    def as_dict(self) -> dict[str, str | int]:
+        """Name, number of entries, hash and repeated entries, as plain data for reports."""
+        return {"name": self.name, "count": self.count, "hash": self.hash, "duplicates": self.duplicates}
+
+    def check(self, n_vertices: int) -> None:
+        """Refuse a mesh that they cannot belong to."""
+        lowest, highest = self.bounds
+        if lowest < 0 or highest >= n_vertices:
+            raise ValueError(
+                f"{self} hold the index {lowest if lowest < 0 else highest}, a mesh of {n_vertices} vertices ends at "
+                f"{n_vertices - 1}; use the vertices of the motion's own topology"
+            )
 
 
 def _short_hash(parts: Iterable[str]) -> str:
@@ -25,7 +79,7 @@ def _short_hash(parts: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True)
-class Region:
+class Region(Vertices):
     """A named set of vertex indices, sorted and distinct.
 
     Make one with :meth:`Region.from_indices`, :meth:`Region.from_file` or :meth:`Region.from_weights`, which sort and
@@ -37,38 +91,37 @@ class Region:
         indices: vertex indices from 0, strictly increasing.
         n_vertices: vertices of the mesh that the region belongs to, if known; it is then refused on others.
         duplicates: how many repeated indices the source held.
-
-    Raises:
-        ValueError: if there is no index, one is negative or not below ``n_vertices``, or they do not
-            increase.
     """
 
     name: str
     indices: tuple[int, ...] = field(repr=False)
     n_vertices: int | None = None
     duplicates: int = field(default=0, compare=False)
+    entries_in_words = "vertices"
 
     def __post_init__(self) -> None:
         """Check the indices."""
-        if not self.indices:
-            raise ValueError(f"region {self.name!r} holds no vertex index; give at least one")
-        if any(later <= earlier for earlier, later in zip(self.indices, self.indices[1:], strict=False)):
+        increasing = all(later > earlier for earlier, later in zip(self.indices, self.indices[1:], strict=False))
+        if not self.indices or self.indices[0] < 0 or not increasing:
             raise ValueError(
-                f"the indices of region {self.name!r} are not sorted and distinct; use Region.from_indices"
+                f"region {self.name!r} needs indices from 0 upwards, sorted and distinct; use Region.from_indices"
             )
-        if self.indices[0] < 0:
-            raise ValueError(f"region {self.name!r} holds the index {self.indices[0]}; indices count from 0 upwards")
         if self.n_vertices is not None:
-            self._check_range(self.n_vertices)
+            super().check(self.n_vertices)
 
     def __str__(self) -> str:
         """Name, vertex count and hash, as printed next to a score."""
-        return f"{self.name} ({self.count} vertices, {self.hash})"
+        return super().__str__()
 
     @property
-    def count(self) -> int:
-        """How many distinct vertices the region has."""
-        return len(self.indices)
+    def entries(self) -> tuple[int, ...]:
+        """The indices."""
+        return self.indices
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """The first and the last index."""
+        return self.indices[0], self.indices[-1]
 
     @property
     def hash(self) -> str:
@@ -82,33 +135,14 @@ class Region:
         """
         return _short_hash(map(str, self.indices))
 
-    def tensor(self) -> Tensor:
-        """The indices as an int64 tensor of shape (count,)."""
-        return torch.tensor(self.indices, dtype=torch.int64)
-
-    def as_dict(self) -> dict[str, str | int]:
-        """Name, vertex count, hash and repeated indices, as plain data for reports."""
-        return {"name": self.name, "count": self.count, "hash": self.hash, "duplicates": self.duplicates}
-
     def check(self, n_vertices: int) -> None:
-        """Refuse a mesh that this region cannot belong to.
-
-        Raises:
-            ValueError: if the mesh has fewer vertices than an index needs, or is known to be another mesh.
-        """
+        """Refuse a mesh that this region cannot belong to, or that is known to be another mesh."""
         if self.n_vertices is not None and n_vertices != self.n_vertices:
             raise ValueError(
                 f"region {self} belongs to a mesh of {self.n_vertices} vertices, the motion has "
                 f"{n_vertices}; use the region of the motion's own topology"
             )
-        self._check_range(n_vertices)
-
-    def _check_range(self, n_vertices: int) -> None:
-        if self.indices[-1] >= n_vertices:
-            raise ValueError(
-                f"region {self} holds the index {self.indices[-1]}, a mesh of {n_vertices} vertices ends at "
-                f"{n_vertices - 1}; use the region of the motion's own topology"
-            )
+        super().check(n_vertices)
 
     @classmethod
     def from_indices(cls, name: str, indices: Iterable[int] | Tensor, *, n_vertices: int | None = None) -> Region:
@@ -126,15 +160,12 @@ class Region:
         lips (3 vertices, 8a6ae151)
         """
         to_list = getattr(indices, "tolist", None)  # tensors and arrays: plain integers are faster to check
-        try:
-            values = list(to_list() if to_list is not None else indices)
-            integers = [operator.index(value) for value in values]
-        except TypeError:
-            raise ValueError(f"the indices of region {name!r} must be a flat list of integers") from None
-        if any(isinstance(value, bool) for value in values):  # would pass as the indices 0 and 1
-            raise ValueError(f"region {name!r} was given a mask of booleans; give indices (mask.nonzero().flatten())")
-        distinct = tuple(sorted(set(integers)))
-        return cls(name, distinct, n_vertices, duplicates=len(integers) - len(distinct))
+        values = list(to_list() if to_list is not None else indices)
+        # Booleans would pass as the indices 0 and 1.
+        if not all(isinstance(value, SupportsIndex) and not isinstance(value, bool) for value in values):
+            raise ValueError(f"region {name!r} needs a flat list of whole numbers; of a mask, mask.nonzero().flatten()")
+        distinct = tuple(sorted(set(map(operator.index, values))))
+        return cls(name, distinct, n_vertices, duplicates=len(values) - len(distinct))
 
     @classmethod
     def from_file(cls, path: str | PathLike[str], *, name: str | None = None, n_vertices: int | None = None) -> Region:
@@ -147,10 +178,8 @@ class Region:
         """
         path = Path(path)
         indices = read_indices(path)
-        try:
+        with errors_of(path):
             return cls.from_indices(name or path.stem, indices, n_vertices=n_vertices)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
 
     @classmethod
     def from_weights(
@@ -171,17 +200,17 @@ class Region:
         >>> print(Region.from_weights(torch.tensor([0.0, 0.9, 0.1, 0.4]), 0.1))
         weights > 0.1 (2 vertices, ef96f1f6)
         """
-        if isinstance(weights, Tensor):
-            title, values = "weights", weights
-        else:
-            title = Path(weights).stem
-            values = torch.tensor(_read_weights(Path(weights)), dtype=torch.float64)
+        title, values = "weights", weights
+        if not isinstance(values, Tensor):
+            title, path = Path(values).stem, Path(values)
+            with errors_of(path, "one finite weight per line"):
+                values = torch.tensor(list(map(float, read_text(path).split())), dtype=torch.float64)
         name = name or f"{title} > {threshold:g}"
-        if values.ndim != 1 or not values.is_floating_point() or not bool(values.isfinite().all()):
-            raise ValueError(f"the weights of region {name!r} must be a flat tensor of finite floating-point numbers")
         chosen = (values > threshold).nonzero().flatten()
-        if not len(chosen):
-            raise ValueError(f"region {name!r}: none of the {len(values)} weights is above {threshold:g}; lower it")
+        if values.ndim != 1 or not bool(values.isfinite().all()) or not len(chosen):
+            raise ValueError(
+                f"region {name!r} needs finite weights, one for each vertex, some of them above {threshold:g}"
+            )
         return cls.from_indices(name, chosen, n_vertices=len(values))
 
     def union(self, *others: Region, name: str | None = None) -> Region:
@@ -190,9 +219,6 @@ class Region:
         Args:
             *others: regions of the same mesh.
             name: what to call the union; the names joined by " + " by default.
-
-        Raises:
-            ValueError: if the regions are known to belong to different meshes.
 
         >>> print(Region("forehead", (1, 2)).union(Region("eyes", (2, 3))))
         forehead + eyes (3 vertices, 8a6ae151)
@@ -220,7 +246,7 @@ def as_region(region: RegionLike, name: str) -> Region:
 
 
 @dataclass(frozen=True)
-class LipPairs:
+class LipPairs(Vertices):
     """Named pairs of an upper and a lower vertex of the inner lips, sorted and distinct.
 
     The distance of a pair shows how far the mouth is open. Make them with :meth:`LipPairs.from_pairs` or
@@ -238,28 +264,30 @@ class LipPairs:
     name: str
     pairs: tuple[tuple[int, int], ...] = field(repr=False)
     duplicates: int = field(default=0, compare=False)
+    entries_in_words = "pairs"
 
     def __post_init__(self) -> None:
         """Check the pairs."""
-        if not self.pairs:
-            raise ValueError(f"{self.what} {self.name!r} are empty; give at least one pair of vertices")
-        for first, second in self.pairs:
-            if first < 0:
-                raise ValueError(f"{self.what} {self.name!r} hold the index {first}; indices count from 0 upwards")
-            if first == second:
-                raise ValueError(f"{self.what} {self.name!r} pair vertex {first} with itself")
-        if list(self.pairs) != sorted({(min(pair), max(pair)) for pair in self.pairs}):
-            name = type(self).__name__
-            raise ValueError(f"{self.what} {self.name!r} are not sorted and distinct; use {name}.from_pairs")
+        distinct = sorted({(min(pair), max(pair)) for pair in self.pairs})
+        if not self.pairs or list(self.pairs) != distinct or any(first == second for first, second in self.pairs):
+            raise ValueError(
+                f"{self.what} {self.name!r} need pairs of two different vertices, sorted and distinct; use "
+                f"{type(self).__name__}.from_pairs"
+            )
 
     def __str__(self) -> str:
         """Name, number of pairs and hash, as printed next to a score."""
-        return f"{self.name} ({self.count} pairs, {self.hash})"
+        return super().__str__()
 
     @property
-    def count(self) -> int:
-        """How many distinct pairs there are."""
-        return len(self.pairs)
+    def entries(self) -> tuple[tuple[int, int], ...]:
+        """The pairs."""
+        return self.pairs
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """The smallest and the largest index."""
+        return self.pairs[0][0], max(second for _, second in self.pairs)
 
     @property
     def hash(self) -> str:
@@ -268,23 +296,6 @@ class LipPairs:
         Written like ``3504-3531`` with the smaller index first, sorted by number, joined by commas.
         """
         return _short_hash(f"{first}-{second}" for first, second in self.pairs)
-
-    def tensor(self) -> Tensor:
-        """The pairs as an int64 tensor of shape (count, 2)."""
-        return torch.tensor(self.pairs, dtype=torch.int64)
-
-    def as_dict(self) -> dict[str, str | int]:
-        """Name, number of pairs, hash and repeated pairs, as plain data for reports."""
-        return {"name": self.name, "count": self.count, "hash": self.hash, "duplicates": self.duplicates}
-
-    def check(self, n_vertices: int) -> None:
-        """Refuse a mesh that these pairs cannot belong to."""
-        largest = max(second for _, second in self.pairs)
-        if largest >= n_vertices:
-            raise ValueError(
-                f"{self.what} {self} hold the index {largest}, a mesh of {n_vertices} vertices ends at "
-                f"{n_vertices - 1}; use the pairs of the motion's own topology"
-            )
 
     @classmethod
     def from_pairs(cls, name: str, pairs: Iterable[Iterable[int]] | Tensor) -> Self:
@@ -297,14 +308,8 @@ class LipPairs:
         >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
         middle (1 pairs, de4cd82d)
         """
-        try:
-            rows = getattr(pairs, "tolist", lambda: pairs)()  # of a tensor or an array
-            listed = [[whole(index) for index in pair] for pair in rows]
-            fit = all(len(pair) == 2 for pair in listed)
-        except TypeError:
-            fit = False
-        if not fit:
-            raise ValueError(f"{cls.what} {name!r} must be pairs of two whole numbers, vertex indices")
+        rows = getattr(pairs, "tolist", lambda: pairs)()  # of a tensor or an array
+        listed = [(operator.index(first), operator.index(second)) for first, second in rows]
         distinct = sorted({(min(pair), max(pair)) for pair in listed})
         return cls(name, tuple(distinct), duplicates=len(listed) - len(distinct))
 
@@ -318,23 +323,8 @@ class LipPairs:
         """
         path = Path(path)
         indices = read_indices(path)
-        if len(indices) % 2:
-            raise ValueError(f"{path}: holds {len(indices)} indices, an odd number; expected two for each pair")
-        try:
+        with errors_of(path, "two indices for each pair"):
             return cls.from_pairs(name or path.stem, zip(indices[::2], indices[1::2], strict=True))
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-
-def whole(value: object) -> int:
-    """A whole number of Python, NumPy or torch as Python's.
-
-    Raises:
-        TypeError: if it is none; a boolean is none.
-    """
-    if isinstance(value, bool):
-        raise TypeError
-    return operator.index(value)  # type: ignore[arg-type]  # whatever has no index is refused
 
 
 class EyelidPairs(LipPairs):
@@ -358,41 +348,27 @@ def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:
 # Files of indices and of weights.
 
 
+@contextmanager
+def errors_of(path: Path, expected: str = "") -> Iterator[None]:
+    """Name the file, and what it should hold, in errors of reading it."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(f"{path}: {reason}" + (f"; expected {expected}" if expected else "")) from error
+
+
 def read_indices(path: Path) -> list[int]:
     """Whole numbers of a text file, separated by commas, blanks or line ends; errors name the file."""
-    entries = [word for word in re.split(r"[,\s]+", _read_text(path, "vertex indices separated by commas")) if word]
-    for place, word in enumerate(entries, start=1):
-        if not (word.isascii() and word.isdigit()):
-            raise ValueError(
-                f"{path}: entry {place} is {word[:40]!r}; expected vertex indices (whole numbers from 0) "
-                "separated by commas, blanks or line ends"
-            )
-    return list(map(int, entries))
+    with errors_of(path, "vertex indices, separated by commas, blanks or line ends"):
+        return list(map(int, read_text(path).replace(",", " ").split()))
 
 
-def _read_weights(path: Path) -> list[float]:
-    weights = []
-    for place, word in enumerate(_read_text(path, "one weight per line").split(), start=1):
-        try:
-            value = float(word)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"{path}: entry {place} is {word[:40]!r}; expected one finite weight per line")
-        weights.append(value)
-    return weights
-
-
-def _read_text(path: Path, expected: str) -> str:
-    try:
-        if path.exists() and not path.is_file():
-            raise OSError("not a regular file")  # a device or a pipe may never end
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ValueError(f"cannot read the region file {path}: {reason}; check the path") from error
-    except UnicodeDecodeError:
-        raise ValueError(f"{path} is not text; expected {expected}") from None
+def read_text(path: Path) -> str:
+    """The text of a regular file: a device or a pipe may never end."""
+    if path.exists() and not path.is_file():
+        raise OSError("not a regular file")
+    return path.read_text(encoding="utf-8-sig")
 
 
 # How many vertices the usual regions of the usual meshes have, to tell a usual region from another. Counts are facts

@@ -26,6 +26,7 @@ from facediff.metrics.base import (
     UpdateOptions,
     align,
     check_option,
+    check_range,
     check_tensor,
     functional,
 )
@@ -48,15 +49,11 @@ def align_samples(
     ``truth`` only their number of frames counts, and ``n_samples`` is None where there may be any number.
     """
     check_tensor("samples", samples)
-    if samples.ndim not in (4, 5) or samples.shape[-4] == 0:
+    if samples.ndim not in (4, 5) or samples.shape[-4] != (n_samples or samples.shape[-4] or 1):
         raise ValueError(
-            f"samples have shape {tuple(samples.shape)}; expected (batch, samples, frames, vertices, 3) or "
-            "(samples, frames, vertices, 3)"
-        )
-    if n_samples is not None and samples.shape[-4] != n_samples:
-        raise ValueError(
-            f"{samples.shape[-4]} samples of each sequence; this metric is over {n_samples}, and over another "
-            "number it is another metric: set n_samples"
+            f"samples have shape {tuple(samples.shape)}; expected (batch, samples, frames, vertices, 3) or (samples, "
+            f"frames, vertices, 3) with {n_samples or 'some'} samples: over another number it is another metric, set "
+            f"n_samples"
         )
     first = samples.select(-4, 0)
     clips = align(first, first if truth is None else truth, rule=rule, **batch)
@@ -88,8 +85,7 @@ class OfSamples(SequenceMetric):
     inferred: ClassVar[Inferred] = SAMPLES_GIVEN
 
     def __init__(self, *, n_samples: int, **options: Any) -> None:  # noqa: ANN401 - whatever that takes
-        if n_samples < self.fewest:
-            raise ValueError(f"n_samples is {n_samples}; expected at least {self.fewest}")
+        check_range("n_samples", n_samples, self.fewest)
         super().__init__(**options)
         self.n_samples = n_samples
 
@@ -247,9 +243,6 @@ class SampleDiversity(Diversity):
         seed: of the order; not used with ``"all"``.
         pooling: ``"sequences"`` as in the script, or ``"frames"``.
 
-    Raises:
-        ValueError: if an option is unknown, or ``n_samples`` cannot be paired.
-
     >>> samples = torch.stack([torch.zeros(4, 2, 3), torch.ones(4, 2, 3)])
     >>> round(sample_diversity(samples).item(), 4)
     1.7321
@@ -269,10 +262,9 @@ class SampleDiversity(Diversity):
         **options: Unpack[FiniteOptions],
     ) -> None:
         check_option("pairing", pairing, Pairing)
-        if n_samples < 2 or (pairing == "shuffled" and n_samples % 2):
-            raise ValueError(
-                f"n_samples is {n_samples}; expected at least 2, and an even number to compare halves of them"
-            )
+        check_range("n_samples", n_samples, 2)
+        if pairing == "shuffled" and n_samples % 2:
+            raise ValueError(f"n_samples is {n_samples}; expected an even number, to compare halves")
         how = f"a random half with the other (seed {seed})" if pairing == "shuffled" else "all pairs"
         definition = f"of {n_samples} samples, {how}"
         super().__init__(region, definition=definition, pooling=pooling, **options)

@@ -23,7 +23,10 @@ from facediff.metrics.base import (
     Side,
     UpdateOptions,
     check_option,
+    check_range,
     functional,
+    of_side,
+    whole_numbers,
 )
 from facediff.metrics.mouth import correlation, speed
 from facediff.metrics.regions import RegionLike, as_region
@@ -55,8 +58,6 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
         )
     bounds[-1] = min(bounds[-1], len(waveform))
     power = waveform[: bounds[-1]].double().square()
-    if not bool(power.isfinite().all()):
-        raise ValueError("the speech holds NaN or infinity; repair or omit this clip")
     lengths = torch.tensor(bounds, device=waveform.device).diff()
     frame_of_sample = torch.repeat_interleave(torch.arange(frames, device=waveform.device), lengths)
     return (torch.zeros_like(lengths, dtype=torch.float64).index_add_(0, frame_of_sample, power) / lengths).sqrt()
@@ -87,10 +88,8 @@ class SpeechLipMetric(SequenceMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Side)
-        if (sample_rate is None) != (frames_per_second is None):
-            raise ValueError("sample_rate and frames_per_second belong together; give both, or none with intensities")
-        if sample_rate is not None and frames_per_second is not None and not 0 < frames_per_second <= sample_rate:
-            raise ValueError(f"{frames_per_second} frames a second do not fit {sample_rate} samples a second")
+        if sample_rate is not None:
+            check_range("frames_per_second", frames_per_second or 0.0, 1e-9, sample_rate)
         definition = (definition or self.words).replace("{side}", SIDE_WORDS[of])
         super().__init__(definition=definition, region=as_region(lips, "lips"), **options)
         self.of: Side = of
@@ -120,36 +119,21 @@ class SpeechLipMetric(SequenceMetric):
 
     def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
         """The sequences with the intensity of their speech; ``single`` for one sequence without batch axis."""
-        sound = intensity if waveform is None else waveform
-        if sound is None or (waveform is not None and intensity is not None):
-            raise ValueError("give the speech once: as waveform= or as intensity=")
-        name, read = ("intensity", self._cut) if waveform is None else ("waveform", self._intensity)
-        count = len(clips.clips)
-        fits = sound.ndim == 1 if single else sound.ndim == 2 and len(sound) == count
-        if not fits or not sound.is_floating_point():
-            raise ValueError(
-                f"{name} has shape {tuple(sound.shape)} and type {sound.dtype}; expected floating-point numbers, one "
-                f"row for each of {count} sequences"
-            )
-        rows = [sound.detach()] if single else list(sound.detach())
-        spoken = [read(clip, row).to(clip.truth.device) for clip, row in zip(clips.clips, rows, strict=True)]
-        return clips.attach("speech", spoken)
-
-    def _intensity(self, clip: Clip, waveform: Tensor) -> Tensor:
-        if self.sample_rate is None or self.frames_per_second is None:
-            raise ValueError("speech as a waveform needs sample_rate= and frames_per_second= of the metric")
-        try:
-            return speech_intensity(waveform, clip.frames, self.sample_rate, self.frames_per_second)
-        except ValueError as error:
-            raise ValueError(f"{clip.name}: {error}") from error
-
-    def _cut(self, clip: Clip, intensity: Tensor) -> Tensor:
-        if len(intensity) < clip.frames:
-            raise ValueError(f"{clip.name}: intensity of {len(intensity)} frames for {clip.frames} frames of motion")
-        scored = intensity[: clip.frames].double()
-        if not bool(scored.isfinite().all()):
-            raise ValueError(f"the intensity of {clip.name} holds NaN or infinity; repair or omit this clip")
-        return scored
+        if waveform is not None and (intensity is not None or self.sample_rate is None):
+            raise ValueError("give intensity=, or waveform= to a metric made with sample_rate= and frames_per_second=")
+        if waveform is not None:
+            rows = clips.rows("waveform", waveform, single=single, ndim=2)
+            rate = float(self.frames_per_second or 0)
+            spoken = [
+                speech_intensity(row, clip.frames, int(self.sample_rate or 0), rate)
+                for clip, row in zip(clips.clips, rows, strict=True)
+            ]
+        else:
+            rows = clips.rows("intensity", intensity, single=single, ndim=2)
+            spoken = [row[: clip.frames].double() for clip, row in zip(clips.clips, rows, strict=True)]
+            if any(len(speech) < clip.frames for clip, speech in zip(clips.clips, spoken, strict=True)):
+                raise ValueError("an intensity has fewer frames than its motion; cut the motion, or fill up with zeros")
+        return clips.attach("speech", [speech.to(self.counts.device) for speech in clips.finite("speech", spoken)])
 
 
 @metric.register("frame_speech_lip_correlation")
@@ -187,9 +171,7 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
         def follow(motion: Tensor) -> Tensor:
             return correlation(clip.speech[1:], speed(motion, self.indices))
 
-        if self.of == "gap":
-            return follow(clip.prediction) - follow(clip.truth)
-        return follow(clip.prediction if self.of == "prediction" else clip.truth)
+        return of_side(self.of, clip, follow)
 
 
 # Columns of the sums that are kept for each identity; for the lips the sum, sum of squares, and sum of products with
@@ -248,8 +230,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         frames_per_second: float | None = None,
         **options: Unpack[SequenceOptions],
     ) -> None:
-        if n_identities < 1:
-            raise ValueError(f"n_identities is {n_identities}; expected at least 1")
+        check_range("n_identities", n_identities, 1)
         definition = (
             "Pearson correlation over clips between the intensity of the speech and the root mean square "
             f"over frames of the mean speed of {{region}}, each standardised within {n_identities} identities, "
@@ -282,21 +263,10 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         """
         clips = self.align(prediction, truth, **batch)
         clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
-        self.add(clips.attach("identity", self._numbers(identities, len(clips.clips))))
-
-    def _numbers(self, identities: Tensor | Sequence[int] | None, count: int) -> list[int]:
+        count = len(clips.clips)
         if identities is None:
-            if self.n_identities > 1:
-                raise ValueError(f"identities= is missing; the metric was made for {self.n_identities}")
-            return [0] * count
-        values = torch.as_tensor(identities).reshape(-1)
-        if len(values) != count or values.is_floating_point() or values.dtype == torch.bool:
-            raise ValueError(f"identities must be {count} whole numbers, one per sequence")
-        numbers: list[int] = values.tolist()
-        wrong = [number for number in numbers if not 0 <= number < self.n_identities]
-        if wrong:
-            raise ValueError(f"identities hold {wrong[0]}; the metric was made for 0 to {self.n_identities - 1}")
-        return numbers
+            identities = [0] * count if self.n_identities == 1 else []
+        self.add(clips.attach("identity", whole_numbers("identities", identities, count, self.n_identities - 1)))
 
     def clip_value(self, clip: Clip) -> Tensor:
         """Intensities of speech, predicted lips and true lips, (3,) float64; NaN for a clip of one frame."""

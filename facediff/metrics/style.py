@@ -17,7 +17,9 @@ from facediff.metrics.base import (
     SequenceMetric,
     UpdateOptions,
     check_option,
+    check_range,
     functional,
+    whole_numbers,
 )
 from facediff.registry import metric
 
@@ -94,20 +96,15 @@ class StyleRetrievalAccuracy(ExactMetric):
             clip_names: one name per embedding, for messages.
 
         Raises:
-            ValueError: if shapes or types do not fit, or an embedding holds NaN or infinity, or is zero and
-                has no direction to compare by cosine. Nothing is added then.
+            ValueError: if shapes do not fit, or an embedding holds NaN or infinity, or is zero and has no direction to
+                compare by cosine. Nothing is added then.
         """
-        if embeddings.ndim != 2 or not embeddings.is_floating_point() or embeddings.shape[1] == 0:
-            raise ValueError(f"embeddings have shape {tuple(embeddings.shape)}; expected floating-point (batch, dim)")
+        if embeddings.ndim != 2 or int(self.width) not in (0, embeddings.shape[1]):
+            raise ValueError(
+                f"embeddings have shape {tuple(embeddings.shape)}; expected (batch, {int(self.width) or 'dim'})"
+            )
         count, width = embeddings.shape
-        numbers = torch.as_tensor(labels, device=self.width.device)
-        whole = not (numbers.is_floating_point() or numbers.dtype == torch.bool)
-        if numbers.shape != (count,) or (count and not whole):
-            raise ValueError(f"labels must be {count} whole numbers, one per embedding")
-        if clip_names is not None and len(clip_names) != count:
-            raise ValueError(f"{len(clip_names)} clip_names for {count} embeddings; give one each")
-        if int(self.width) not in (0, width):
-            raise ValueError(f"embeddings of {width} numbers after others of {int(self.width)} cannot be compared")
+        numbers = torch.tensor(whole_numbers("labels", labels, count, 2**62), device=self.width.device)
         wide = embeddings.detach().to(self.width.device, torch.float64)
         bad = ~wide.isfinite().all(1)
         if self.closeness == "cosine":
@@ -120,7 +117,7 @@ class StyleRetrievalAccuracy(ExactMetric):
             return
         self.width = torch.full_like(self.width, width)
         self.embeddings.append(wide.flatten())
-        self.labels.append(numbers.to(torch.int64))
+        self.labels.append(numbers)
 
     def queries(self) -> int:
         """How many embeddings are queries, over all processes."""
@@ -133,8 +130,7 @@ class StyleRetrievalAccuracy(ExactMetric):
         """The accuracy over all embeddings so far, a float64 scalar.
 
         Raises:
-            ValueError: if no label is carried by two embeddings, or processes hold embeddings of different
-                sizes.
+            ValueError: if no label is carried by two embeddings, or processes hold embeddings of different sizes.
         """
         flat, labels = self._gathered()
         queries = _is_query(labels)
@@ -181,23 +177,10 @@ class SpeakerGallery:
     Args:
         means: the mean over time of each recording's offsets from its speaker's template, (recordings, vertices, 3).
         speakers: the number of each recording's speaker.
-
-    Raises:
-        ValueError: if they do not fit, are not finite, or are of less than two speakers.
     """
 
     means: Tensor
     speakers: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        """Check the recordings."""
-        if self.means.ndim != 3 or self.means.shape[-1] != 3 or len(self.means) != len(self.speakers):
-            raise ValueError(
-                f"the gallery has means of shape {tuple(self.means.shape)} and {len(self.speakers)} speakers; expected "
-                "(recordings, vertices, 3) and one speaker for each recording"
-            )
-        if not bool(self.means.isfinite().all()) or len(set(self.speakers)) < 2:
-            raise ValueError("the gallery needs finite means of recordings of two speakers at least")
 
 
 @metric.register("nearest_speaker_accuracy")
@@ -244,8 +227,8 @@ class NearestSpeakerAccuracy(SequenceMetric):
         shrinkage: float = 0.1,
         **options: Unpack[FiniteOptions],
     ) -> None:
-        if components < 1 or not shrinkage > 0:
-            raise ValueError(f"components is {components} and shrinkage {shrinkage:g}; expected 1 or more, and above 0")
+        check_range("components", components, 1)
+        check_range("shrinkage", shrinkage, 1e-12)
         numbers, speaker = torch.unique(torch.tensor(gallery.speakers), return_inverse=True)
         definition = (
             f"share of motions whose mean over time is nearest to that of their own speaker among {len(numbers)}, by "
@@ -309,13 +292,9 @@ class NearestSpeakerAccuracy(SequenceMetric):
                 the template already.**
         """
         clips = self.align(prediction, prediction, **batch)
-        if clips.dims != 3:
-            raise ValueError(f"a point of the motion has {clips.dims} numbers; expected vertices, of 3")
         clips = clips.attach_templates(template)
-        numbers = torch.as_tensor(identities).reshape(-1)
-        if numbers.shape != (len(clips.clips),) or numbers.is_floating_point() or numbers.dtype == torch.bool:
-            raise ValueError(f"identities must be {len(clips.clips)} whole numbers, one per sequence")
-        self.add(clips.attach("identity", numbers.tolist()))
+        numbers = whole_numbers("identities", identities, len(clips.clips), 2**62)
+        self.add(clips.attach("identity", numbers))
 
 
 style_retrieval_accuracy = functional(StyleRetrievalAccuracy)

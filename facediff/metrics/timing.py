@@ -7,7 +7,7 @@ from typing import Literal, Unpack
 import torch
 from torch import Tensor
 
-from facediff.metrics.base import Clip, LipMetric, SequenceOptions, check_option, functional
+from facediff.metrics.base import Clip, LipMetric, SequenceOptions, check_option, check_range, functional
 from facediff.metrics.mouth import OpeningMetric
 from facediff.metrics.regions import LipPairsLike
 from facediff.registry import metric
@@ -234,10 +234,9 @@ class TemporalMisalignment(OpeningMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("at", at, Moments)
-        if not 0 <= smoothing < float("inf"):
-            raise ValueError(f"smoothing is {smoothing}; expected a number of frames, 0 for none")
-        if frames_per_second is not None and not 0 < frames_per_second < float("inf"):
-            raise ValueError(f"frames_per_second is {frames_per_second}; expected a positive number")
+        check_range("smoothing", smoothing, 0)
+        if frames_per_second is not None:
+            check_range("frames_per_second", frames_per_second, 1e-9)
         places = "pairs of like extrema" if at == "extrema" else "all its pairs"
         smoothed = f"smoothed over {smoothing:g} frames" if smoothing else "not smoothed"
         unit = "frames" if frames_per_second is None else "ms"

@@ -19,6 +19,7 @@ from facediff.metrics.base import (
     Sign,
     UpdateOptions,
     check_option,
+    check_range,
     functional,
 )
 from facediff.metrics.one_pass import ErrorOf, one_pass
@@ -38,12 +39,6 @@ def vertex_error_words(*, reduction: Reduction, squared: bool, root: bool = Fals
 def _unit_words(scale: float, *, squared: bool) -> str:
     unit = "unit²" if squared else "unit"
     return unit if scale == 1.0 else f"{unit} of lengths times {scale:g}"
-
-
-def check_scale(scale: float) -> None:
-    """Refuse a factor of lengths that is not positive and finite."""
-    if not 0 < scale < float("inf"):
-        raise ValueError(f"scale is {scale}; expected a positive factor of lengths, such as 1000 from metres to mm")
 
 
 class VertexError(SequenceMetric):
@@ -74,7 +69,7 @@ class VertexError(SequenceMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("reduction", reduction, Reduction)
-        check_scale(scale)
+        check_range("scale", scale, 1e-12)
         if root and not squared:
             raise ValueError("root is of squared distances; give squared too")
         definition = vertex_error_words(reduction=reduction, squared=squared, root=root, scale=scale)
@@ -237,7 +232,7 @@ class FaceDynamicsDeviation(SequenceMetric):
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("sign", sign, Sign)
-        check_scale(scale)
+        check_range("scale", scale, 1e-12)
         words = dynamics_words(sign=sign, scale=scale)
         super().__init__(definition=words, region=as_region(upper, "upper"), **options)
         self.sign: Sign = sign

@@ -246,7 +246,7 @@ def test_everything_that_is_not_scored_is_told(files: Files) -> None:
         ({"protocols": ["papers"]}, "unknown protocol 'papers'"),
         ({"templates": None}, "FDD needs .*--templates"),
         ({"upper_face": None}, "protocol paper: .* give the upper-face region"),
-        ({"lips": Region.from_indices("far", [99])}, "protocol paper: .* holds the index 99"),
+        ({"lips": Region.from_indices("far", [99])}, "protocol paper: .* hold the index 99"),
         ({"topology": "biwi"}, "protocol paper|23370"),
         ({"patterns": ["{subject}"]}, "{subject}: a pattern of file names has"),
         ({"patterns": ["{subject}_{sentence}_{style}"]}, "no other field"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,7 +11,6 @@ from facediff.errors import NotFiniteError
 from facediff.metrics import (
     Clip,
     Coverage,
-    EnergyScore,
     FaceDynamicsDeviation,
     LipVertexError,
     MeanVertexError,
@@ -93,46 +91,6 @@ def test_one_sequence_without_batch_axis() -> None:
     metric = MeanVertexError()
     metric.update(motion()[0], motion()[0], lengths=4, clip_names=["F2_e37"])
     assert metric.coverage().frames == 4
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"truth": motion(vertices=3)}, "must agree in batch and vertices"),
-        ({"truth": motion(batch=1)}, "must agree in batch and vertices"),
-        ({"truth": motion()[0]}, "prediction has shape"),
-        ({"truth": motion()[..., :2]}, "truth has shape"),
-        ({"prediction": motion().long()}, "must be floating point"),
-        ({"prediction": motion().tolist()}, "prediction is of type list; expected a tensor"),
-        ({"lengths": [5]}, "must hold 2 whole numbers"),
-        ({"lengths": [5, 6]}, "lengths holds 6"),
-        ({"lengths": torch.tensor([5.0, 2.0])}, "whole numbers"),
-        ({"lengths": [5, 0]}, "clip 1 of the batch has no frame to score"),
-        ({"truth": motion(frames=6), "lengths": [5, 5]}, "give `prediction_lengths` too"),
-        ({"lengths": [5, -1]}, "lengths holds -1"),
-        ({"lengths": [[5], [4]]}, "whole numbers"),
-        ({"lengths": torch.ones(2, 4, dtype=torch.bool)}, r"the mask lengths has shape \(2, 4\)"),
-        ({"prediction_lengths": [5, 6]}, "prediction_lengths holds 6"),
-        ({"prediction_lengths": [0, 5]}, "clip 0 of the batch has no frame to score"),
-        ({"clip_names": ["a"]}, "1 clip_names for 2 sequences"),
-        ({"clip_names": ["a", "b", "c"]}, "3 clip_names for 2 sequences"),
-        ({"prediction": motion()[:, :, :0], "truth": motion()[:, :, :0]}, "prediction has no vertex"),
-        ({"prediction": motion()[0, :, :0], "truth": motion()[0, :, :0]}, "prediction has no vertex"),
-        ({"truth": motion().long()}, "truth must be floating point"),
-        ({"prediction": motion()[None], "truth": motion()[None]}, "prediction has shape"),
-    ],
-)
-def test_misfits_are_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        mean_vertex_error(**({"prediction": motion(), "truth": motion()} | changes))
-
-
-def test_classes_name_what_is_no_tensor() -> None:
-    for options in ({"truth": motion().numpy()}, {"template": np.zeros((4, 3))}):
-        with pytest.raises(ValueError, match=f"{next(iter(options))} is of type ndarray; expected a tensor"):
-            FaceDynamicsDeviation([0]).update(**({"prediction": motion(), "truth": motion()} | options))
-    with pytest.raises(ValueError, match="samples is of type ndarray"):
-        EnergyScore().update(motion()[None].numpy(), motion())  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("value", [torch.ones(5, dtype=torch.float64), 1.0])

@@ -106,10 +106,9 @@ def test_what_is_missing_is_named() -> None:
         FrechetDistance()
     with pytest.raises(ValueError, match="partner"):
         FrechetDistance([0], with_partner=True).update(motion, motion)
-    with pytest.raises(ValueError, match="partner has shape"):
-        residual_partner_correlation(motion, motion, partner=motion[:, :1])
-    with pytest.raises(ValueError, match="frames"):
-        residual_partner_correlation(motion, motion, partner=motion[:2])
+    for partner in (motion[:, :1], motion[:2]):
+        with pytest.raises(ValueError, match="partner has the shape"):
+            residual_partner_correlation(motion, motion, partner=partner)
     metric = FrechetDistance([0, 1])
     with pytest.raises(ValueError, match="set dims"):
         metric.update(motion.expand(4, 2, 3), motion.expand(4, 2, 3))
@@ -120,5 +119,4 @@ def test_what_is_missing_is_named() -> None:
         index.update(motion[:, :1], motion[:, :1])
     assert index.coverage().frames == 4
     metric.update(motion[:1], motion[:1])
-    with pytest.raises(ValueError, match="covariance"):
-        metric.compute()
+    assert metric.compute().isnan(), "one frame has no covariance"

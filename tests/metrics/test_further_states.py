@@ -17,7 +17,6 @@ from facediff.metrics import (
     ClipSpeechLipCorrelation,
     Coverage,
     FaceDynamicsDeviation,
-    FrechetDistance,
     IdentityDiversity,
     LipOpeningCorrelation,
     LipSpeedCorrelation,
@@ -118,7 +117,6 @@ STILL = moving(40, truth=torch.zeros(1, 40, 5, 3))
         (partial(LipWarpingDistance, [0, 1]), {}, moving(40), "no sequence"),
         (partial(MotionLiveliness, [0, 1]), STILL, moving(40), "divide by zero"),
         (partial(SpectrumDistance, [0, 1]), STILL, moving(40), "divide by zero"),
-        (partial(FrechetDistance, [0, 1], dims=3), moving(1), moving(40), "one frame"),
         (partial(RealTimeFactor, "this machine"), {}, {"computing": 2.0, "speech": 3.0}, "no clip"),
         (
             StyleRetrievalAccuracy,

@@ -11,7 +11,6 @@ import torch
 from facediff.metrics import (
     ClipSpeechLipCorrelation,
     Coverage,
-    FrameSpeechLipCorrelation,
     LipOpeningCorrelation,
     clip_speech_lip_correlation,
     frame_speech_lip_correlation,
@@ -108,55 +107,3 @@ def test_intensity_of_frames_of_unequal_size() -> None:
     assert short[4].item() == pytest.approx(np.sqrt(np.mean(samples[66:70] ** 2)))
     with pytest.raises(ValueError, match="the speech has 66 samples, 5 frames reach to sample 82"):
         speech_intensity(torch.from_numpy(samples[:66]), 5, 410, 25)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({}, "give the speech once"),
-        (ADDED, "give the speech once"),
-        ({"waveform": torch.ones(2, 80)}, "needs sample_rate= and frames_per_second="),
-        ({"intensity": torch.ones(2, 5)}, "F2: intensity of 5 frames for 8 frames of motion"),
-        ({"intensity": torch.ones(3, 8)}, r"intensity has shape \(3, 8\).*each of 2 sequences"),
-        ({"intensity": torch.ones(8)}, r"intensity has shape \(8,\)"),
-        ({"intensity": torch.ones(2, 8, dtype=torch.int64)}, "expected floating-point"),
-        ({"intensity": torch.full((2, 8), float("nan"))}, "the intensity of F2 holds NaN"),
-    ],
-)
-def test_speech_that_does_not_fit_is_refused(given: dict[str, torch.Tensor], message: str) -> None:
-    for metric in (FrameSpeechLipCorrelation([0]), ClipSpeechLipCorrelation([0])):
-        with pytest.raises(ValueError, match=message):
-            metric.update(motion(0), motion(1), clip_names=["F2", "M3"], **given)
-        assert metric.coverage().left_out == 0
-
-
-def test_sound_that_does_not_fit_names_the_clip() -> None:
-    metric = FrameSpeechLipCorrelation([0], sample_rate=100, frames_per_second=10)
-    sound = torch.ones(2, 80)
-    sound[1, 79] = float("nan")
-    with pytest.raises(ValueError, match="M3: the speech holds NaN"):
-        metric.update(motion(0), motion(1), waveform=sound, clip_names=["F2", "M3"])
-    metric.update(motion(0), motion(1), waveform=sound, lengths=[8, 7])
-    with pytest.raises(ValueError, match="F2: the speech has 60 samples, 8 frames reach to sample 80"):
-        metric.update(motion(0), motion(1), waveform=sound[:, :60], clip_names=["F2", "M3"])
-
-
-def test_options_and_identities_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="sample_rate and frames_per_second belong together"):
-        FrameSpeechLipCorrelation([0], sample_rate=16000)
-    with pytest.raises(ValueError, match="25 frames a second do not fit 10 samples"):
-        FrameSpeechLipCorrelation([0], sample_rate=10, frames_per_second=25)
-    with pytest.raises(ValueError, match="unknown of"):
-        FrameSpeechLipCorrelation([0], of="x")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="n_identities is 0"):
-        ClipSpeechLipCorrelation([0], n_identities=0)
-    metric = ClipSpeechLipCorrelation([0], n_identities=2)
-    for numbers, message in (
-        (None, "identities= is missing"),
-        ([0], "must be 2 whole numbers"),
-        ([0.0, 1.0], "must be 2 whole numbers"),
-        ([0, 2], "identities hold 2; the metric was made for 0 to 1"),
-        ([1, -1], "identities hold -1; the metric was made for 0 to 1"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            metric.update(motion(0), motion(1), intensity=ADDED["intensity"], identities=numbers)  # type: ignore[arg-type]

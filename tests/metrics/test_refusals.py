@@ -1,0 +1,123 @@
+"""What would give a wrong score without a word is refused where it enters, and nothing of it is added."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from facediff import metrics as fm
+from facediff.metrics import Coverage, SequenceMetric
+
+
+def motion(batch: int = 2, frames: int = 5, vertices: int = 4) -> Tensor:
+    return torch.randn(batch, frames, vertices, 3, generator=torch.Generator().manual_seed(batch + frames + vertices))
+
+
+RIGHT: dict[str, dict[str, Any]] = {
+    "motion": {"prediction": motion(), "truth": motion()},
+    "speech": {"prediction": motion(), "truth": motion(), "intensity": torch.rand(2, 5)},
+    "closures": {"prediction": motion(), "truth": motion(), "closures": [[(0, 2)], [(1, 3), (3, 5)]]},
+    "samples": {"samples": torch.stack([motion()] * 3, 1), "truth": motion()},
+    "labels": {"embeddings": torch.eye(3)[:2] + 1, "labels": [0, 0], "clip_names": ["a", "b"]},
+}
+MAKE: dict[str, Callable[..., Any]] = {
+    "motion": partial(fm.FaceDynamicsDeviation, [0, 3]),
+    "speech": partial(fm.ClipSpeechLipCorrelation, [0], n_identities=1),
+    "closures": partial(fm.BilabialClosureRate, [(0, 1)]),
+    "samples": partial(fm.EnergyScore, n_samples=3),
+    "labels": fm.StyleRetrievalAccuracy,
+}
+NAN = float("nan")
+WRONG: list[tuple[str, dict[str, Any]]] = [
+    ("motion", {"truth": motion(vertices=3)}),
+    ("motion", {"truth": motion(batch=1)}),
+    ("motion", {"truth": motion()[0]}),
+    ("motion", {"truth": motion()[..., :2], "prediction": motion()[..., :2]}),
+    ("motion", {"prediction": motion()[None], "truth": motion()[None]}),
+    ("motion", {"prediction": motion()[:, :, :0], "truth": motion()[:, :, :0]}),
+    ("motion", {"prediction": motion(vertices=3), "truth": motion(vertices=3)}),
+    ("motion", {"prediction": motion().long()}),
+    ("motion", {"prediction": motion().tolist()}),
+    ("motion", {"truth": motion() * NAN}),
+    ("motion", {"template": torch.zeros(3, 3)}),
+    ("motion", {"template": torch.full((4, 3), NAN)}),
+    ("motion", {"lengths": [5]}),
+    ("motion", {"lengths": [5, 6]}),
+    ("motion", {"lengths": [5, -1]}),
+    ("motion", {"lengths": [5, 0]}),
+    ("motion", {"lengths": torch.tensor([5.0, 2.0])}),
+    ("motion", {"lengths": torch.ones(2, 4, dtype=torch.bool)}),
+    ("motion", {"lengths": torch.tensor([[True, False, True, True, True]] * 2)}),
+    ("motion", {"prediction_lengths": [5, 6]}),
+    ("motion", {"truth": motion(frames=6), "lengths": [5, 5]}),
+    ("motion", {"clip_names": ["a"]}),
+    ("speech", {"intensity": None}),
+    ("speech", {"waveform": torch.ones(2, 80), "intensity": None}),
+    ("speech", {"waveform": torch.ones(2, 80)}),
+    ("speech", {"intensity": torch.ones(2, 4)}),
+    ("speech", {"intensity": torch.ones(3, 5)}),
+    ("speech", {"intensity": torch.ones(5)}),
+    ("speech", {"intensity": torch.ones(2, 5, dtype=torch.int64)}),
+    ("speech", {"intensity": torch.full((2, 5), NAN)}),
+    ("speech", {"identities": [0]}),
+    ("speech", {"identities": [0, 1]}),
+    ("speech", {"identities": [0.0, 0.0]}),
+    ("closures", {"closures": [[(0, 2)]]}),
+    ("closures", {"closures": [[(0, 2)], [(3, 3)]]}),
+    ("closures", {"closures": [[(0, 2)], [(3, 5), (4, 6)]]}),
+    ("closures", {"closures": [[(-1, 2)], []]}),
+    ("closures", {"closures": [[(0, 1, 2)], []]}),
+    ("closures", {"closures": torch.ones(2, 5)}),
+    ("closures", {"closures": torch.ones(2, 4, dtype=torch.bool)}),
+    ("samples", {"samples": torch.stack([motion()] * 2, 1)}),
+    ("samples", {"samples": motion()[0]}),
+    ("samples", {"samples": torch.stack([motion()] * 3, 1)[:1]}),
+    ("labels", {"embeddings": torch.ones(3)}),
+    ("labels", {"embeddings": torch.ones(2, 4)}),
+    ("labels", {"labels": [0]}),
+    ("labels", {"labels": [0.5, 1.0]}),
+    ("labels", {"embeddings": torch.tensor([[1.0, 0, 0], [0, 0, 0]])}),
+    ("labels", {"embeddings": torch.tensor([[1.0, 0, NAN], [1, 0, 0]])}),
+]
+
+
+@pytest.mark.parametrize(("kind", "change"), WRONG, ids="".join)
+def test_misfits_are_refused_and_nothing_is_added(kind: str, change: dict[str, Any]) -> None:
+    metric = MAKE[kind]()
+    metric.update(**RIGHT[kind])
+    before = metric.coverage() if isinstance(metric, SequenceMetric) else metric.queries()
+    with pytest.raises((ValueError, TypeError)):
+        metric.update(**(RIGHT[kind] | change))
+    assert (metric.coverage() if isinstance(metric, SequenceMetric) else metric.queries()) == before
+    if isinstance(before, Coverage):
+        assert before.sequences == 2 or before.left_out
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(fm.BilabialClosureRate, [(0, 1)], threshold=1.5),
+        partial(fm.BlinkRateRatio, [(0, 1)], closed=0.3, reopened=0.4),
+        partial(fm.BlinkRate, [(0, 1)]),
+        partial(fm.FrameSpeechLipCorrelation, [0], sample_rate=10, frames_per_second=25),
+        partial(fm.FrameSpeechLipCorrelation, [0], sample_rate=16000),
+        partial(fm.SampleDiversity, n_samples=5),
+        partial(fm.EnergyScore, n_samples=1),
+        partial(fm.SpectrumDistance, octaves=0),
+        partial(fm.VertexError, scale=0.0),
+        partial(fm.VertexError, scale=NAN),
+        partial(fm.VertexError, root=True),
+        partial(fm.VertexError, reduction="meen"),
+        partial(fm.MouthOpeningDifference, [(0, 1)], pooling="frame"),
+        partial(fm.FrameSpeechLipCorrelation, [0], of="both"),
+    ],
+    ids=str,
+)
+def test_options_without_a_meaning_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match=r"expected|known are|squared"):
+        make()
