@@ -153,17 +153,16 @@ def rows_of(plan: BenchmarkPlan) -> list[Row]:
 
 def cells_of(plan: BenchmarkPlan) -> list[Cell]:
     """All cells, seed by seed, so that a plan that is stopped early has whole columns of few seeds."""
-    cells = [
-        cell
+    pairs = [
+        (row, corpus)
         for row in rows_of(plan)
         for name, corpus in plan.corpora.items()
         if row.method.corpora is None or name in row.method.corpora
-        for cell in _cells(plan, row, corpus)
     ]
-    if not cells:
-        raise FaceDiffError(f"{plan.file}: has no cell; expected one method at least that is run on one corpus")
-    if len(cells) > MOST_CELLS:
-        raise FaceDiffError(f"{plan.file}: has {len(cells)} cells; expected {MOST_CELLS} at most")
+    count = sum(len(row.method.seeds or plan.seeds) or 1 for row, _ in pairs)
+    if not 1 <= count <= MOST_CELLS:
+        raise FaceDiffError(f"{plan.file}: has {count} cells (methods × corpora × seeds); expected 1 to {MOST_CELLS}")
+    cells = [cell for row, corpus in pairs for cell in _cells(plan, row, corpus)]
     places: dict[tuple[str, str], int] = {}
 
     def turn(cell: Cell) -> int:
@@ -182,7 +181,8 @@ def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]
         "metrics": list(plan.metrics),
         "options": {**plan.test_options, **method.test_options},
     }
-    shared = {"corpus": {"data": _config_content(corpus.data), "manifest": _manifest(corpus.root)}}
+    data = None if corpus.data is None else config_content(corpus.data)
+    shared = {"corpus": {"data": data, "manifest": _manifest(corpus.root)}}
     if method.config is not None:
         for seed in seeds:
             trainings = tuple(_trainings(plan, row, corpus))
@@ -240,23 +240,20 @@ def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]
 
 def _trainings(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Training]:
     method = row.method
-    place = f"{plan.file}: methods: {method.name}: config"
     variant = {} if row.variant is None else row.variant.options
-    last = Before("fit", str(method.config), {**plan.options, **method.options, **variant})
-    for step in (*method.before, last):
+    last = Before(str(method.config), {**plan.options, **method.options, **variant})
+    for name, step in {**method.before, "fit": last}.items():
         options = {**corpus.options, **step.options}
-        config = find_config(step.config.replace("{corpus}", corpus.name), place, plan.file)
-        yield Training(step.name, config, options)
+        config = find_config(step.config.replace("{corpus}", corpus.name), f"methods.{method.name}.config", plan.file)
+        yield Training(name, config, options)
 
 
 def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:
     path = Path(text).expanduser()
     path = path if path.is_absolute() or path.exists() else plan.file.parent / path
     if kind == "predictions":
-        if not path.is_dir():
-            raise FaceDiffError(f"{text}: no such folder; expected a method's predictions, .npy files of vertices")
         if not any(path.rglob("*.npy")):
-            raise FaceDiffError(f"{text}: holds no predictions; expected .npy files of vertices")
+            raise FaceDiffError(f"{text}: holds no predictions; expected a folder of .npy files of vertices")
     elif not path.exists():  # a name of the hub, whose content may change, is none of a plan's
         raise FaceDiffError(
             f"{text}: no such checkpoint; expected a file of `facediff fit` or import-checkpoint, or a model folder"
@@ -278,19 +275,10 @@ def _manifest(root: Path | None) -> str:
     return sha256(path) if path is not None and path.is_file() else "none"
 
 
-def _config_content(path: Path | None) -> object:
-    return None if path is None else config_content(path)
-
-
-def config_content(path: Path) -> object:
+def config_content(path: Path, outer: tuple[Path, ...] = ()) -> object:
     """The plain data of a config, with those of the configs that it names in their place: comments do not count."""
-    return _expanded(path, ())
-
-
-def _expanded(path: Path, outer: tuple[Path, ...]) -> object:
     if path in outer or len(outer) > 20:
         raise FaceDiffError(f"{path}: names itself; expected a config that ends")
-    content = load_yaml(path, "expected a config such as configs/experiment/puppet.yaml")
 
     def expand(value: object) -> object:
         if isinstance(value, dict):
@@ -298,7 +286,7 @@ def _expanded(path: Path, outer: tuple[Path, ...]) -> object:
         if isinstance(value, list):
             return [expand(entry) for entry in value]
         if isinstance(value, str) and value.endswith((".yaml", ".yml")) and (path.parent / value).is_file():
-            return _expanded((path.parent / value).resolve(), (*outer, path))
+            return config_content((path.parent / value).resolve(), (*outer, path))
         return value
 
-    return expand(content)
+    return expand(load_yaml(path, "expected a config such as configs/experiment/puppet.yaml"))

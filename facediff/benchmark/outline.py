@@ -2,21 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from facediff.benchmark.cells import Cell, rows_of
 from facediff.benchmark.plan import BenchmarkPlan
 from facediff.benchmark.results import CELLS, Result, read_result
-from facediff.benchmark.tables import ReportOutline
-from facediff.errors import FaceDiffError
-from facediff.utils.limits import check_format, quoted
+from facediff.utils.limits import check_format
 from facediff.utils.plain_files import load_json, write_json
+from facediff.utils.records import Text, read_record
 
 FILE = "plan.json"
 FORMAT = 1
+FileName = Annotated[str, Text(r"(?!\.{0,2}$)[^/\\]+", "a file's name")]
+
+
+@dataclass(frozen=True)
+class ReportOutline:
+    """What a report needs of the plan, as plain data in the benchmark's folder.
+
+    Attributes:
+        name: of the plan.
+        title: of the tables.
+        description: what they are of.
+        protocol: by which all was scored.
+        columns: scores and :data:`~facediff.benchmark.plan.COSTS` that are shown; all scores if none is named, and all
+            costs.
+        baseline: the row that others are compared with; the first if empty.
+        references: rows that were not trained.
+        rows: label, and name in papers' tables, by row.
+        corpora: label by corpus.
+        published: names of papers' tables.
+        cells: files of results by row and corpus, in the order of the plan.
+        command: that made it.
+    """
+
+    name: FileName
+    title: str
+    description: str
+    protocol: str
+    columns: tuple[str, ...]
+    baseline: str
+    references: tuple[str, ...]
+    rows: Mapping[str, tuple[str, str]]
+    corpora: Mapping[str, str]
+    published: tuple[str, ...]
+    cells: tuple[FileName, ...]
+    command: str = ""
 
 
 def outline_of(plan: BenchmarkPlan, cells: Sequence[Cell], command: str) -> ReportOutline:
@@ -44,30 +78,10 @@ def write_outline(folder: Path, outline: ReportOutline) -> None:
 
 def read_outline(folder: Path) -> ReportOutline:
     """The outline of a benchmark's folder."""
-    path, remedy = folder / FILE, "expected a folder that `facediff benchmark` wrote; run it again"
-    if not path.is_file():
-        raise FaceDiffError(f"{folder}: holds no {FILE}; expected the folder of a benchmark, such as benchmarks/quick")
+    path, remedy = folder / FILE, "expected a folder that `facediff benchmark` wrote, such as benchmarks/quick"
     content = load_json(path, remedy=remedy)
-    if not isinstance(content, dict):
-        raise FaceDiffError(f"{path}: holds no JSON object; {remedy}")
-    check_format(path, content.get("format"), FORMAT)
-    fields: dict[str, Any] = {}
-    for key, field in ReportOutline.__dataclass_fields__.items():
-        value = content.get(key)
-        listed = str(field.type).startswith("tuple")
-        fits = isinstance(value, list) if listed else isinstance(value, dict if "Mapping" in str(field.type) else str)
-        if not fits or (listed and not all(isinstance(entry, str) for entry in value or ())):
-            raise FaceDiffError(f"{path}: {key} is {quoted(value)}; {remedy}")
-        fields[key] = tuple(value) if isinstance(value, list) else value
-    rows = fields["rows"]
-    for name, row in rows.items():
-        if not isinstance(row, list) or len(row) != 2 or not all(isinstance(text, str) for text in row):
-            raise FaceDiffError(f"{path}: rows: {name} is {quoted(row)}; {remedy}")
-    if not all(isinstance(label, str) for label in fields["corpora"].values()):
-        raise FaceDiffError(f"{path}: corpora is {quoted(fields['corpora'])}; {remedy}")
-    if any("/" in name or "\\" in name or name in ("", ".", "..") for name in (*fields["cells"], fields["name"])):
-        raise FaceDiffError(f"{path}: names a file elsewhere; {remedy}")
-    return ReportOutline(**{**fields, "rows": {name: (row[0], row[1]) for name, row in rows.items()}})
+    check_format(path, content.get("format") if isinstance(content, dict) else None, FORMAT)
+    return read_record(ReportOutline, content, path, remedy=remedy, strict=False)
 
 
 def read_results(folder: Path, outline: ReportOutline) -> tuple[list[Result], list[str]]:

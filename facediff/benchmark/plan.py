@@ -1,40 +1,21 @@
 """The plan of a benchmark: which methods on which corpora, with which seeds and options. Checked before anything runs.
 
-A plan is a YAML file of plain data; docs/benchmark.md lists its keys. It names experiment configs, checkpoints, and
-folders of predictions, none of which it holds.
+A plan is a YAML file of plain data; docs/benchmark.md lists its keys, which are the fields of :class:`BenchmarkPlan`.
+It names experiment configs, checkpoints, and folders of predictions, none of which it holds.
 """
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from facediff.errors import FaceDiffError, choices
 from facediff.utils.files import config_dir
-from facediff.utils.limits import quoted
+from facediff.utils.ranges import Range
+from facediff.utils.records import DERIVED, Items, Text, read_record
 from facediff.utils.yaml_files import load_yaml
-
-Weights = Literal["last", "best"]
-Options = Mapping[str, Any]
-
-KEYS = (
-    *("title", "description", "protocol", "metrics", "seeds", "baseline", "weights", "threads", "workers"),
-    *("options", "test_options", "references", "corpora", "methods", "variants", "published", "columns"),
-)
-METHOD_KEYS = (
-    *("label", "config", "checkpoint", "predictions", "options", "test_options", "before", "published"),
-    *("corpora", "seeds", "variants"),
-)
-SOURCES = ("config", "checkpoint", "predictions")
-CORPUS_KEYS = ("data", "root", "options", "label")
-BEFORE_KEYS = ("config", "options")
-VARIANT_KEYS = ("label", "options", "published")
-REFERENCES = ("still", "mean_face", "shuffled")
-"""Rows that a test scores next to the model: see :data:`facediff.models.evaluation.METHODS`."""
 
 COSTS = ("weights", "rtf", "training", "memory")
 """What a table can say of a method besides its scores."""
@@ -42,12 +23,24 @@ COSTS = ("weights", "rtf", "training", "memory")
 MEAN_SUFFIX = ".mean"
 """What follows a method's name in that of its further row, the mean of ``model.test_samples`` samples."""
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,60}")
-OPTION = re.compile(r"(model|data|trainer)(\.\w+)*|(seed_everything|name)")
-LARGEST_SEED = 2**32 - 1
 MOST_CELLS = 10_000
-LONGEST_NAME = 180
-"""Bytes of a file's name, with room for a corpus's in it; file systems have 255."""
+
+Name = Annotated[str, Text(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,60}", "a short name of letters and digits")]
+Line = Annotated[str, Text(r"(?s).*\S.*", "a text")]
+PATH = Text(r"(?=.)[^\0/]{0,180}(/[^\0/]{0,180}){0,99}", "the path of a file, with short names")
+FilePath = Annotated[str, PATH]
+Option = Annotated[
+    str,
+    Text(
+        r"(?!seed_everything$)[a-z][\w-]*(\.\w+)*",
+        "an option without dashes, such as trainer.max_epochs; the seeds of a plan are its key `seeds`",
+    ),
+]
+Options = Mapping[Option, Any]
+Lines = Annotated[tuple[Line, ...], Items()]
+Seeds = Annotated[tuple[Annotated[int, Range(0, 2**32 - 1)], ...], Items(1)]
+Reference = Literal["still", "mean_face", "shuffled"]
+Count = Annotated[int, Range(1, 1024)]
 
 
 @dataclass(frozen=True)
@@ -55,26 +48,25 @@ class CorpusEntry:
     """A corpus of the plan.
 
     Attributes:
-        name: by which the plan calls it.
         label: by which tables call it.
         data: config of its data module; None where experiment configs have their own.
         root: its folder; None for the place that the data module knows.
         options: of every training on it.
+        name: by which the plan calls it.
     """
 
-    name: str
-    label: str
-    data: Path | None = None
-    root: Path | None = None
+    label: Line = ""
+    data: Annotated[Path, PATH] | None = None
+    root: Annotated[Path, PATH] | None = None
     options: Options = field(default_factory=dict)
+    name: str = field(default="", metadata=DERIVED)
 
 
 @dataclass(frozen=True)
 class Before:
     """A training that has to come first, such as a codebook's: its checkpoint is ``{name}`` in the options."""
 
-    name: str
-    config: str
+    config: FilePath
     options: Options = field(default_factory=dict)
 
 
@@ -83,42 +75,42 @@ class MethodEntry:
     """A row of the table, or one for each variant.
 
     Attributes:
-        name: by which the plan calls it.
         label: by which tables call it.
         config: experiment config that trains it; ``{corpus}`` stands for the corpus's name.
         checkpoint: a trained model, one for each seed if it has ``{seed}``.
         predictions: a folder of predicted motion, with the same fields in its path.
         options: of the training, or of ``facediff evaluate`` for predictions.
         test_options: of the test.
-        before: trainings that come first.
+        before: trainings that come first, by name.
         published: its name in tables of papers.
         corpora: those that it is run on; all if None.
         seeds: instead of the plan's.
         variants: names of the plan's variants that it is run in; all if None.
+        name: by which the plan calls it.
     """
 
-    name: str
-    label: str
-    config: str | None = None
-    checkpoint: str | None = None
-    predictions: str | None = None
+    label: Line = ""
+    config: FilePath | None = None
+    checkpoint: FilePath | None = None
+    predictions: FilePath | None = None
     options: Options = field(default_factory=dict)
     test_options: Options = field(default_factory=dict)
-    before: tuple[Before, ...] = ()
-    published: str = ""
-    corpora: tuple[str, ...] | None = None
-    seeds: tuple[int, ...] | None = None
-    variants: tuple[str, ...] | None = None
+    before: Mapping[Name, Before] = field(default_factory=dict)
+    published: Line = ""
+    corpora: Lines | None = None
+    seeds: Seeds | None = None
+    variants: Lines | None = None
+    name: str = field(default="", metadata=DERIVED)
 
 
 @dataclass(frozen=True)
 class Variant:
     """Options that make another row of every method, such as one of an ablation."""
 
-    name: str
-    label: str
+    label: Line = ""
     options: Options = field(default_factory=dict)
-    published: str = ""
+    published: Line = ""
+    name: str = field(default="", metadata=DERIVED)
 
 
 @dataclass(frozen=True)
@@ -126,8 +118,9 @@ class BenchmarkPlan:
     """A benchmark.
 
     Attributes:
-        name: the file's name without its suffix.
-        file: the file.
+        corpora: by name.
+        methods: by name.
+        variants: by name.
         title: of the tables.
         description: what they are of.
         protocol: by which all is scored.
@@ -142,126 +135,30 @@ class BenchmarkPlan:
         options: of every training.
         test_options: of every test.
         references: rows that need no training.
-        corpora: by name.
-        methods: by name.
-        variants: by name.
         published: tables of papers that are shown next to it, by their name in :mod:`facediff.benchmark.published`.
+        name: the file's name without its suffix.
+        file: the file.
     """
 
-    name: str
-    file: Path
-    title: str
-    description: str
-    protocol: str
-    metrics: tuple[str, ...]
-    columns: tuple[str, ...]
-    seeds: tuple[int, ...]
-    baseline: str
-    weights: Weights
-    threads: int
-    workers: int | None
-    options: Options
-    test_options: Options
-    references: tuple[str, ...]
-    corpora: Mapping[str, CorpusEntry]
-    methods: Mapping[str, MethodEntry]
-    variants: Mapping[str, Variant]
-    published: tuple[str, ...]
-
-
-class Section:
-    """A mapping of the plan, whose values are read with what errors call them."""
-
-    def __init__(self, content: object, place: str, keys: Sequence[str] | None) -> None:
-        if not isinstance(content, dict):
-            raise FaceDiffError(f"{place}: is {quoted(content)}; expected keys with values")
-        for key in content:
-            if not isinstance(key, str) or (keys is not None and key not in keys):
-                raise FaceDiffError(f"{place}: there is no key {quoted(key)}: {choices(str(key), keys or ())}")
-        self.content, self.place = content, place
-
-    def text(self, key: str, default: str | None = None) -> str:
-        """A text."""
-        value = self.content.get(key, default)
-        if not isinstance(value, str) or not value.strip():
-            raise FaceDiffError(f"{self.place}: {key} is {quoted(value)}; expected a text")
-        return value
-
-    def optional(self, key: str) -> str | None:
-        """A text that may be missing."""
-        return None if self.content.get(key) is None else self.text(key)
-
-    def file(self, key: str) -> str | None:
-        """The path of a file or folder, which may be missing."""
-        text = self.optional(key)
-        names = [] if text is None else text.encode(errors="surrogatepass").split(b"/")
-        if "\0" in (text or "") or any(len(name) > LONGEST_NAME for name in names) or len(names) > LONGEST_NAME:
-            raise FaceDiffError(f"{self.place}: {key} is {quoted(text)}; expected the path of a file, with short names")
-        return text
-
-    def texts(self, key: str) -> tuple[str, ...]:
-        """A list of texts; empty if it is missing."""
-        value = self.content.get(key) or []
-        value = [value] if isinstance(value, str) else value
-        if not isinstance(value, list) or not all(isinstance(entry, str) and entry.strip() for entry in value):
-            raise FaceDiffError(f"{self.place}: {key} is {quoted(value)}; expected a list of texts")
-        if len({*value}) < len(value):
-            raise FaceDiffError(f"{self.place}: {key} names something twice; name each once")
-        return tuple(value)
-
-    def names(self, key: str, allowed: Sequence[str], what: str) -> tuple[str, ...] | None:
-        """A list of names that are known; None if it is missing."""
-        if self.content.get(key) is None:
-            return None
-        names = self.texts(key)
-        for name in names:
-            if name not in allowed:
-                raise FaceDiffError(f"{self.place}: {key}: there is no {what} {quoted(name)}: {choices(name, allowed)}")
-        return names
-
-    def number(self, key: str, default: int | None, most: int) -> int | None:
-        """A whole number from 1."""
-        value = self.content.get(key, default)
-        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most):
-            raise FaceDiffError(f"{self.place}: {key} is {quoted(value)}; expected a whole number from 1 to {most}")
-        return value
-
-    def seeds(self, key: str) -> tuple[int, ...] | None:
-        """Seeds of training runs; None if the key is missing."""
-        value = self.content.get(key)
-        if value is None:
-            return None
-        fits = isinstance(value, list) and all(
-            isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed <= LARGEST_SEED for seed in value
-        )
-        if not fits or not value or len({*value}) < len(value):
-            raise FaceDiffError(
-                f"{self.place}: {key} is {quoted(value)}; expected a list of different whole numbers, such as [0, 1, 2]"
-            )
-        return tuple(value)
-
-    def options(self, key: str, form: re.Pattern[str] = OPTION) -> dict[str, Any]:
-        """Options of a command by name, without dashes."""
-        content = self.content.get(key) or {}
-        section = Section(content, f"{self.place}: {key}", None)
-        for name in section.content:
-            if not form.fullmatch(name):
-                raise FaceDiffError(
-                    f"{section.place}: {quoted(name)} is no option; expected such as trainer.max_epochs, without dashes"
-                )
-        if "seed_everything" in section.content:
-            raise FaceDiffError(f"{section.place}: seed_everything; the seeds of a plan are its key `seeds`")
-        return dict(section.content)
-
-    def sections(self, key: str, keys: Sequence[str]) -> dict[str, Section]:
-        """Named mappings, in the order of the file."""
-        content = self.content.get(key) or {}
-        sections = {}
-        for name, value in Section(content, f"{self.place}: {key}", None).content.items():
-            if not NAME.fullmatch(name):
-                raise FaceDiffError(f"{self.place}: {key}: {quoted(name)}; expected a short name of letters and digits")
-            sections[name] = Section({} if value is None else value, f"{self.place}: {key}: {name}", keys)
-        return sections
+    corpora: Mapping[Name, CorpusEntry]
+    methods: Mapping[Name, MethodEntry]
+    variants: Mapping[Name, Variant] = field(default_factory=dict)
+    title: Line = ""
+    description: Line = ""
+    protocol: Line = "paper"
+    metrics: Lines = ()
+    columns: Lines = ()
+    seeds: Seeds = ()
+    baseline: Line = ""
+    weights: Literal["last", "best"] = "last"
+    threads: Count = 1
+    workers: Count | None = None
+    options: Options = field(default_factory=dict)
+    test_options: Options = field(default_factory=dict)
+    references: Annotated[tuple[Reference, ...], Items()] = ("still", "mean_face", "shuffled")
+    published: Lines = ()
+    name: str = field(default="", metadata=DERIVED)
+    file: Path = field(default=Path(), metadata=DERIVED)
 
 
 def find_plan(path: Path) -> Path:
@@ -272,8 +169,7 @@ def find_plan(path: Path) -> Path:
     bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / named
     if bundled.is_file():
         return bundled
-    bundled_plans = [f"configs/benchmark/{file.name}" for file in sorted((config_dir() / "benchmark").glob("*.yaml"))]
-    raise FaceDiffError(f"{path}: no such plan; {choices(str(path), bundled_plans)}")
+    raise FaceDiffError(f"{path}: no such plan; {choices(str(path), bundled_configs('benchmark'))}")
 
 
 def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkPlan:
@@ -283,64 +179,60 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
         path: a YAML file.
         roots: folders of corpora by the plan's names, which override the plan's.
     """
-    return plan_of(load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path, roots or {})
-
-
-def plan_of(content: object, path: Path, roots: Mapping[str, Path]) -> BenchmarkPlan:
-    """The plan in plain data; see :func:`read_plan`."""
-    top = Section(content, str(path), KEYS)
-    corpora = {
-        name: _corpus(name, section, roots, path) for name, section in top.sections("corpora", CORPUS_KEYS).items()
-    }
-    if not corpora:
-        raise FaceDiffError(f"{path}: names no corpus; expected `corpora:` with one at least, such as puppet: {{}}")
-    for name in roots:
-        if name not in corpora:
-            raise FaceDiffError(f"--root {name}: the plan has no such corpus: {choices(name, corpora)}")
-    variants = {
-        name: Variant(
-            name, section.text("label", name), section.options("options"), section.optional("published") or ""
-        )
-        for name, section in top.sections("variants", VARIANT_KEYS).items()
-    }
-    methods = {
-        name: _method(name, section, corpora, variants, path)
-        for name, section in top.sections("methods", METHOD_KEYS).items()
-    }
-    if not methods:
-        raise FaceDiffError(f"{path}: names no method; expected `methods:` with one at least")
-    seeds = top.seeds("seeds")
-    for method in methods.values():
-        if seeds is None and method.seeds is None and (method.config is not None or _per_seed(method)):
-            raise FaceDiffError(
-                f"{path}: methods: {method.name} is trained, and the plan has no seeds; add `seeds: [0, 1, 2]`, since "
-                f"one training run says nothing of the chance between runs"
-            )
-    weights = top.content.get("weights", "last")
-    if weights not in ("last", "best"):
-        raise FaceDiffError(f"{path}: weights is {quoted(weights)}; expected last or best")
-    references = top.names("references", REFERENCES, "reference")
-    return BenchmarkPlan(
+    plan = read_record(BenchmarkPlan, load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path)
+    _check_names("--root", "corpus", roots or {}, plan.corpora)
+    return replace(
+        plan,
         name=path.stem,
         file=path,
-        title=top.text("title", path.stem),
-        description=top.optional("description") or "",
-        protocol=top.text("protocol", "paper"),
-        metrics=top.texts("metrics"),
-        columns=top.texts("columns"),
-        seeds=seeds or (),
-        baseline=top.optional("baseline") or "",
-        weights=weights,
-        threads=top.number("threads", 1, 1024) or 1,
-        workers=top.number("workers", None, 1024),
-        options=top.options("options"),
-        test_options=top.options("test_options"),
-        references=REFERENCES if references is None else references,
-        corpora=corpora,
-        methods=methods,
-        variants=variants,
-        published=top.texts("published"),
+        title=plan.title or path.stem,
+        corpora={name: _corpus(name, corpus, (roots or {}).get(name), path) for name, corpus in plan.corpora.items()},
+        methods={name: _method(name, method, plan, path) for name, method in plan.methods.items()},
+        variants={
+            name: replace(variant, name=name, label=variant.label or name) for name, variant in plan.variants.items()
+        },
     )
+
+
+def _check_names(place: object, kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise FaceDiffError(f"{place}: there is no {kind} {name!r}: {choices(name, known)}")
+
+
+def _corpus(name: str, corpus: CorpusEntry, root: Path | None, path: Path) -> CorpusEntry:
+    """The corpus with its paths resolved."""
+    folder = root or (None if corpus.root is None else _beside(path, str(corpus.root)))
+    if folder is not None and not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; expected the corpus {name}, give it with --root {name}=FOLDER")
+    return replace(
+        corpus,
+        name=name,
+        label=corpus.label or name,
+        data=None if corpus.data is None else find_config(str(corpus.data), f"corpora.{name}.data", path),
+        root=folder,
+    )
+
+
+def _method(name: str, method: MethodEntry, plan: BenchmarkPlan, path: Path) -> MethodEntry:
+    """The method, once its files and the names in it are known to be there."""
+    place = f"{path}: methods.{name}"
+    if [method.config, method.checkpoint, method.predictions].count(None) != 2:
+        raise FaceDiffError(f"{place}: expected one of config, checkpoint and predictions")
+    if method.checkpoint is not None and method.options:
+        raise FaceDiffError(f"{place}: options are of training, and a checkpoint is trained; use test_options")
+    _check_names(f"{place}.corpora", "corpus", method.corpora or (), plan.corpora)
+    _check_names(f"{place}.variants", "variant", method.variants or (), plan.variants)
+    per_seed = "{seed}" in f"{method.checkpoint} {method.predictions}"
+    if not (plan.seeds or method.seeds) and (method.config is not None or per_seed):
+        raise FaceDiffError(
+            f"{place} is trained, and the plan has no seeds; add `seeds: [0, 1, 2]`, since one training run says "
+            f"nothing of the chance between runs"
+        )
+    for config in [method.config, *(step.config for step in method.before.values())]:
+        for corpus in (method.corpora or plan.corpora) if config else ():
+            find_config(str(config).replace("{corpus}", corpus), f"methods.{name}.config", path)
+    return replace(method, name=name, label=method.label or name)
 
 
 def check_scores(plan: BenchmarkPlan) -> None:
@@ -348,7 +240,7 @@ def check_scores(plan: BenchmarkPlan) -> None:
 
     Apart from :func:`read_plan`, since it imports PyTorch.
     """
-    from facediff.benchmark.published import find_published
+    from facediff.benchmark.published import published
     from facediff.evaluation.evaluator import find_protocols
     from facediff.metrics.by_name import parse_all
     from facediff.metrics.generation import SMOOTHNESS
@@ -356,91 +248,33 @@ def check_scores(plan: BenchmarkPlan) -> None:
     try:
         (protocol,) = find_protocols([plan.protocol])
         parse_all(plan.metrics)
-        find_published(plan.published)
     except FaceDiffError as error:
         raise FaceDiffError(f"{plan.file}: {error}") from error
+    _check_names(f"{plan.file}: published", "table", plan.published, published())
     scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *plan.metrics, *SMOOTHNESS, *COSTS]
-    for column in plan.columns:
-        # A metric of several scores gives each its own name behind.
-        if column not in scores and not column.startswith(tuple(f"{name}_" for name in plan.metrics)):
-            raise FaceDiffError(f"{plan.file}: columns: there is no score {column!r}: {choices(column, scores)}")
-
-
-def _corpus(name: str, section: Section, roots: Mapping[str, Path], path: Path) -> CorpusEntry:
-    data, root = section.optional("data"), section.file("root")
-    folder = roots.get(name) or (None if root is None else _beside(path, root))
-    if folder is not None and not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; expected the corpus {name}, give it with --root {name}=FOLDER")
-    file = None if data is None else find_config(data, f"{section.place}: data", path)
-    return CorpusEntry(name, section.text("label", name), file, folder, section.options("options"))
-
-
-def _method(
-    name: str,
-    section: Section,
-    corpora: Mapping[str, CorpusEntry],
-    variants: Mapping[str, Variant],
-    path: Path,
-) -> MethodEntry:
-    sources = [source for source in SOURCES if section.content.get(source) is not None]
-    if len(sources) != 1:
-        raise FaceDiffError(
-            f"{section.place}: has {' and '.join(sources) or 'no source'}; expected one of config, checkpoint and "
-            f"predictions"
-        )
-    chosen = section.names("corpora", list(corpora), "corpus")
-    before = tuple(
-        Before(step, options.file("config") or options.text("config"), options.options("options"))
-        for step, options in section.sections("before", BEFORE_KEYS).items()
-    )
-    for config in [section.file("config"), *(step.config for step in before)]:
-        for corpus in chosen or corpora if config else ():
-            find_config(str(config).replace("{corpus}", corpus), f"{section.place}: config", path)
-    form = OPTION if sources[0] == "config" else re.compile(r"[a-z][\w-]*")
-    if sources[0] == "checkpoint" and section.content.get("options"):
-        raise FaceDiffError(f"{section.place}: options are of training, and a checkpoint is trained; use test_options")
-    return MethodEntry(
-        name=name,
-        label=section.text("label", name),
-        config=section.file("config"),
-        checkpoint=section.file("checkpoint"),
-        predictions=section.file("predictions"),
-        options=section.options("options", form),
-        test_options=section.options("test_options"),
-        before=before,
-        published=section.optional("published") or "",
-        corpora=chosen,
-        seeds=section.seeds("seeds"),
-        variants=section.names("variants", list(variants), "variant"),
-    )
-
-
-def _per_seed(method: MethodEntry) -> bool:
-    return "{seed}" in f"{method.checkpoint} {method.predictions}"
+    # A metric of several scores gives each its own name behind.
+    several = tuple(f"{name}_" for name in plan.metrics)
+    columns = [column for column in plan.columns if not column.startswith(several)]
+    _check_names(f"{plan.file}: columns", "score", columns, scores)
 
 
 def _beside(plan: Path, text: str) -> Path:
     """A path of the plan: from the working folder, or else from the plan's own."""
     path = Path(text).expanduser()
-    return (
-        path
-        if path.is_absolute() or path.exists()
-        else next((candidate for candidate in [plan.parent / path] if candidate.exists()), path)
-    )
+    return path if path.is_absolute() or path.exists() or not (plan.parent / path).exists() else plan.parent / path
+
+
+def bundled_configs(folder: str) -> list[str]:
+    """Names of the configs of a folder that come with facediff."""
+    return [f"configs/{folder}/{file.name}" for file in sorted((config_dir() / folder).glob("*.yaml"))]
 
 
 def find_config(text: str, place: str, plan: Path) -> Path:
     """The file of a config: bundled ones begin with ``configs/``."""
-    bundled = config_dir() / text.removeprefix("configs/")
-    own = _beside(plan, text)
-    if own.is_file():
-        return own
-    if text.startswith("configs/") and bundled.is_file():
-        return bundled
-    folder = Path(text).parent.name
-    configs = [f"configs/{folder}/{file.name}" for file in sorted((config_dir() / folder).glob("*.yaml"))]
-    near = difflib.get_close_matches(text, configs, n=3, cutoff=0.3)
-    hint = (
-        f"the nearest are {', '.join(near)}" if near else "expected a YAML file such as configs/experiment/puppet.yaml"
-    )
-    raise FaceDiffError(f"{place} {text}: no such config; {hint}")
+    bundled, own = config_dir() / text.removeprefix("configs/"), _beside(plan, text)
+    if own.is_file() or not (text.startswith("configs/") and bundled.is_file()):
+        bundled = own
+    if not bundled.is_file():
+        hint = choices(text, bundled_configs(Path(text).parent.name or "experiment"))
+        raise FaceDiffError(f"{plan}: {place} {text}: no such config; {hint}")
+    return bundled

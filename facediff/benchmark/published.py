@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from facediff.errors import FaceDiffError, choices
 from facediff.utils.yaml_files import load_yaml
 
 FILE = Path(__file__).with_name("published.yaml")
@@ -73,14 +72,6 @@ def published() -> dict[str, Published]:
     return tables
 
 
-def find_published(names: Sequence[str]) -> list[Published]:
-    """Tables by their names."""
-    for name in names:
-        if name not in published():
-            raise FaceDiffError(f"published: there is no table {name!r}: {choices(name, published())}")
-    return [published()[name] for name in names]
-
-
 def shown_tables(
     names: Sequence[str],
     *,
@@ -128,7 +119,7 @@ def shown_tables(
 
     scores: dict[str, dict[str, float]] = {}
     sources, reasons = [], []
-    for table in find_published(names):
+    for table in (published()[name] for name in names if name in published()):
         if reason := disagreement(table):
             reasons.append(f"{table.source}: not shown, since {reason}")
             continue

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from facediff.benchmark.cells import Cell, hash_of
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import load_json, read_rows, write_json
 from facediff.utils.provenance import Provenance, provenance_of, read_provenance
+from facediff.utils.records import read_record
 from facediff.version import __version__
 
 CELLS = "cells"
@@ -24,6 +24,22 @@ FORMAT = 1
 REMEDY = "remove the file, and run the benchmark again"
 CURVES = ("val/lve", "val/energy", "val/mve")
 """Scores of validation that are kept over the steps of training."""
+
+
+class Rows:
+    """Rows of scores: all have a split, a method and a number of frames, and those of sentences a clip."""
+
+    def __init__(self, *keys: str) -> None:
+        self.keys = keys
+
+    def __contains__(self, rows: Sequence[Mapping[str, Any]]) -> bool:
+        return all(
+            isinstance(row.get("frames"), int) and all(isinstance(row.get(key), str) for key in self.keys)
+            for row in rows
+        )
+
+    def __str__(self) -> str:
+        return f"rows with frames, {', '.join(self.keys)}"
 
 
 @dataclass(frozen=True)
@@ -69,8 +85,8 @@ class Result:
     machine: Mapping[str, Any] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
-    scores: Sequence[Mapping[str, Any]] = ()
-    sequences: Sequence[Mapping[str, Any]] = ()
+    scores: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method")] = ()
+    sequences: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method", "clip")] = ()
     curve: Mapping[str, Sequence[float | None]] = field(default_factory=dict)
     name: str = ""
 
@@ -132,52 +148,15 @@ def read_result(path: Path) -> Result | None:
     if not path.is_file():
         return None
     content = load_json(path, remedy=REMEDY)
-    if not isinstance(content, dict):
-        raise FaceDiffError(f"{path}: holds no JSON object; {REMEDY}")
-    check_format(path, content.get("format"), FORMAT)
-    fields = {key: content[key] for key in Result.__dataclass_fields__ if key in content}
-    for key, kind in _KINDS.items():
-        if not isinstance(fields.get(key), kind) or isinstance(fields.get(key), bool) != (kind is bool):
-            raise FaceDiffError(f"{path}: {key} is {quoted(fields.get(key))}; {REMEDY}")
-    for key in ("scores", "sequences"):
-        for row in fields[key]:
-            if not isinstance(row, dict) or not {"split", "method", "frames"} <= row.keys():
-                raise FaceDiffError(f"{path}: a row of {key} is {quoted(row)}; {REMEDY}")
-            if not _is_number(row["frames"]) or not isinstance(row["split"], str) or not isinstance(row["method"], str):
-                raise FaceDiffError(f"{path}: a row of {key} is {quoted(row)}; {REMEDY}")
-            for column in fields["columns"]:
-                if row.get(column) is not None and not _is_number(row[column]):
-                    raise FaceDiffError(f"{path}: {column} in {key} is {quoted(row[column])}; {REMEDY}")
-        if key == "sequences" and any(not isinstance(row.get("clip"), str) for row in fields[key]):
-            raise FaceDiffError(f"{path}: a row of {key} names no clip; {REMEDY}")
-    for name, columns in (("columns", fields["columns"]), ("measured", fields["measured"])):
-        if not all(isinstance(entry, dict) for entry in columns.values()):
-            raise FaceDiffError(f"{path}: {name} is {quoted(columns)}; {REMEDY}")
-    for step in fields["measured"].values():
-        if not all(value is None or _is_number(value) for value in step.values()):
-            raise FaceDiffError(f"{path}: measured is {quoted(step)}; {REMEDY}")
-    for values in fields["curve"].values():
-        if not isinstance(values, list) or not all(value is None or _is_number(value) for value in values):
-            raise FaceDiffError(f"{path}: curve is {quoted(values)}; {REMEDY}")
-    if fields["provenance"]:
-        provenance_of(fields["provenance"], path)
-    if fields.get("seed") is not None and not isinstance(fields["seed"], int):
-        raise FaceDiffError(f"{path}: seed is {quoted(fields['seed'])}; {REMEDY}")
-    return Result(**fields)
-
-
-_KINDS: dict[str, type] = {
-    **dict.fromkeys(
-        ("row", "corpus", "kind", "key", "config", "problem", "source", "protocol", "definition", "name"), str
-    ),
-    **dict.fromkeys(("code", "provenance", "machine", "measured", "columns", "curve"), dict),
-    **dict.fromkeys(("scores", "sequences"), list),
-    "synthetic": bool,
-}
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    check_format(path, content.get("format") if isinstance(content, dict) else None, FORMAT)
+    result = read_record(Result, content, path, remedy=REMEDY, strict=False)
+    for row in (*result.scores, *result.sequences):
+        for column in result.columns:
+            if row.get(column) is not None and not isinstance(row[column], int | float):
+                raise FaceDiffError(f"{path}: {column} is {quoted(row[column])}; {REMEDY}")
+    if result.provenance:
+        provenance_of(result.provenance, path)
+    return result
 
 
 def _of(cell: Cell) -> dict[str, Any]:

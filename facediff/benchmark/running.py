@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from facediff.benchmark.results import CELLS, Result, cell_file, curve_of, model
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
-from facediff.utils.files import cache_dir, discard
+from facediff.utils.files import discard
 from facediff.utils.plain_files import load_json, read_json, write_json
 from facediff.utils.workers import THREAD_VARIABLES
 
@@ -73,12 +73,8 @@ class Setting:
 
 def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[Cell]:
     """The cells that have no result yet; those that failed are tried again only if asked."""
-    left = []
-    for cell in cells:
-        result = read_result(cell_file(folder, cell))
-        if result is None or (result.problem and retry_failed):
-            left.append(cell)
-    return left
+    results = [(cell, read_result(cell_file(folder, cell))) for cell in cells]
+    return [cell for cell, result in results if result is None or (result.problem and retry_failed)]
 
 
 def run_cells(
@@ -92,26 +88,19 @@ def run_cells(
         workers: cells at a time; if None, as many as processors, or workers of a cluster.
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
 
-    Yields:
+    Returns:
         a cell and what became of it, as soon as it is done.
-
-    Raises:
-        FaceDiffError: if all others would fail for the same reason, such as a full disk.
     """
-    work = partial(run_cell, setting)
-    record = partial(record_failure, setting.folder)
-    outcomes = run_batch(
-        work,
+    return run_batch(
+        partial(run_cell, setting),
         cells,
         workers=workers,
         scheduler=scheduler,
         writes=setting.folder,
         reads=dict.fromkeys(path for cell in cells for path in files_of(cell)),
-        record=record,
+        record=partial(record_failure, setting.folder),
         survive_bugs=True,
     )
-    with closing(outcomes):
-        yield from outcomes
 
 
 def files_of(cell: Cell) -> list[Path]:
@@ -192,18 +181,12 @@ class Runner:
         place = self.folder / training.name
         state = read_json(place / STATE) or {}
         last, best = place / LAST, place / BEST
-
-        def written() -> bool:
-            return last.is_file() or (self.setting.weights == "best" and best.is_file())
-
-        if state.get("done") and state.get("written", True) and not written():
-            state = {}  # somebody deleted what it wrote: train again
-        if not state.get("done"):
+        if not state.get("done") or not (last.is_file() or best.is_file()):
             refuse_changed(training, cell)
             arguments = ["fit", "--config", str(training.config)]
             options = fit_options(training, checkpoints, cell)
             # A training that was killed continues with the time that its last saved state had taken.
-            before = float(state.get("seconds", 0.0))
+            before = 0.0 if state.get("done") else float(state.get("seconds", 0.0))
             if last.is_file() and "started" in state:
                 before += max(0.0, last.stat().st_mtime - float(state["started"]))
                 arguments += ["--ckpt_path", str(last)]
@@ -214,21 +197,16 @@ class Runner:
             self.run(training.name, [*arguments, *logger_words(place), *option_words(options), *progress_words()])
             took = self.measured[training.name]
             took["seconds"] = before + (took["seconds"] or 0.0)
-            write_json(place / STATE, {"done": True, "written": written(), **took})
+            write_json(place / STATE, {"done": True, **took})
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
         checkpoint = best if self.setting.weights == "best" else last
         if not checkpoint.is_file() and training != cell.trainings[-1]:  # only what is scored has to have a best one
             checkpoint = last
         if not checkpoint.is_file():
-            if last.is_file():
-                raise FaceDiffError(
-                    f"{cell}: {training.config} wrote no {BEST.name}; let it validate, with a ModelCheckpoint that has "
-                    f"filename=best, or write weights: last into the plan"
-                )
             raise FaceDiffError(
-                f"{cell}: {training.config} was trained and wrote no {checkpoint.name}; let it write checkpoints "
-                f"(trainer.enable_checkpointing), and look at the log {self._log}"
+                f"{cell}: {training.config} wrote no {checkpoint.name}; let it write checkpoints, best.ckpt by a "
+                f"ModelCheckpoint with filename=best, or write weights: last into the plan (log: {self._log})"
             )
         return checkpoint
 
@@ -361,44 +339,10 @@ def machine_of(threads: int) -> dict[str, Any]:
 
 
 def estimate(cells: Sequence[Cell], folder: Path) -> dict[Cell, float | None]:
-    """Seconds that each cell will take: as long as the latest of its row on its corpus; None where there was none.
-
-    Timings of all benchmarks of this machine are remembered in the cache folder, by what is trained and for how long.
-    """
-    latest: dict[tuple[str, str], tuple[float, float]] = {}
-    for path in (folder / CELLS).glob("*.json"):
+    """Seconds that each cell will take: as long as the latest of its row on its corpus; None where there was none."""
+    latest: dict[tuple[str, str], float | None] = {}
+    for path in sorted((folder / CELLS).glob("*.json"), key=lambda path: path.stat().st_mtime):
         result = read_result(path)
-        if result is not None and not result.problem and (seconds := result.total_seconds) is not None:
-            key, when = (result.row, result.corpus), path.stat().st_mtime
-            if when > latest.get(key, (0.0, 0.0))[0]:
-                latest[key] = (when, seconds)
-    remembered = read_json(timings_file()) or {}
-    estimates: dict[Cell, float | None] = {}
-    for cell in cells:
-        if (cell.row, cell.corpus) in latest:
-            estimates[cell] = latest[cell.row, cell.corpus][1]
-        else:
-            value = remembered.get(timing_key(cell))
-            estimates[cell] = float(value) if isinstance(value, int | float) else None
-    return estimates
-
-
-def timings_file() -> Path:
-    """Seconds by :func:`timing_key`, of all benchmarks of this machine."""
-    return cache_dir() / "benchmark_timings.json"
-
-
-def timing_key(cell: Cell) -> str:
-    """What decides how long a cell takes: its recipe but for the seed."""
-    recipe = dict(cell.recipe)
-    if "trained" in recipe:
-        recipe["trained"] = {name: value for name, value in recipe["trained"].items() if name != "seed"}
-    return hash_of(recipe)[:24]
-
-
-def remember(cell: Cell, result: Result) -> None:
-    """Keep how long a cell took, for the estimates of later runs; called by one process only."""
-    if result.total_seconds is not None:
-        timings = read_json(timings_file()) or {}
-        with suppress(FaceDiffError):  # a cache that cannot be written does not matter
-            write_json(timings_file(), {**timings, timing_key(cell): round(result.total_seconds, 1)})
+        if result is not None and not result.problem:
+            latest[result.row, result.corpus] = result.total_seconds
+    return {cell: latest.get((cell.row, cell.corpus)) for cell in cells}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from facediff.benchmark.outline import ReportOutline
 from facediff.benchmark.plan import COSTS, MEAN_SUFFIX
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
@@ -25,40 +26,6 @@ SPLIT_LABELS = {
     "test_b": "test B, unseen speakers",
     "test_c": "test C, unseen voices",
 }
-
-
-@dataclass(frozen=True)
-class ReportOutline:
-    """What a report needs of the plan, as plain data in the benchmark's folder.
-
-    Attributes:
-        name: of the plan.
-        title: of the tables.
-        description: what they are of.
-        protocol: by which all was scored.
-        columns: scores and :data:`~facediff.benchmark.plan.COSTS` that are shown; all scores if none is named, and all
-            costs.
-        baseline: the row that others are compared with; the first if empty.
-        references: rows that were not trained.
-        rows: label, and name in papers' tables, by row.
-        corpora: label by corpus.
-        published: names of papers' tables.
-        cells: files of results by row and corpus, in the order of the plan.
-        command: that made it.
-    """
-
-    name: str
-    title: str
-    description: str
-    protocol: str
-    columns: tuple[str, ...]
-    baseline: str
-    references: tuple[str, ...]
-    rows: Mapping[str, tuple[str, str]]
-    corpora: Mapping[str, str]
-    published: tuple[str, ...]
-    cells: tuple[str, ...]
-    command: str = ""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def benchmark(
     definition = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline
-    from facediff.benchmark.running import estimate, pending, remember, run_cells
+    from facediff.benchmark.running import estimate, pending, run_cells
     from facediff.utils.files import locked
 
     check_scores(definition)
@@ -87,8 +87,6 @@ def benchmark(
                 failed += bool(outcome.problem)
                 what = outcome.problem or f"{cell}: {outcome.seconds:.0f} s"
                 tell(f"[{number}/{len(left)}] {what}")
-                if outcome.result is not None:
-                    remember(cell, outcome.result)
         results, _ = read_results(folder, outline)
         old = sum(1 for result in results if result.problem) - failed
         if old:

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import FrameRate, OutputFolder, named_folders
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import BUNDLED, check_animating_source, model_or_bundled
-from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
     from facediff.synthetic.spoken_set import SpokenClip
 
 PLANS = (".yaml", ".yml")
-KEYS = ("model", "motion", "layout", "frame_rate", "identity", "style", "licence", "commercial_use")
-COMMERCIAL = ("allowed", "forbidden", "unknown")
 
 
 def referee(
@@ -149,41 +146,23 @@ def candidates_of(
 
 
 def read_models(path: Path) -> list[Candidate]:
-    """The models of a plan: names with paths, or with the keys of :data:`KEYS`."""
-    from facediff.benchmark.plan import Section
+    """The models of a plan: names with paths, or with the fields of a candidate."""
     from facediff.pipelines.candidates import Candidate
+    from facediff.utils.records import read_record
     from facediff.utils.yaml_files import load_yaml
 
     expected = "expected models: with a name and a path each"
-    top = Section(load_yaml(path, expected), str(path), ("models",))
+    models = load_yaml(path, expected).get("models")
     candidates = []
-    content = Section(top.content.get("models") or {}, f"{path}: models", None).content
-    whole = {"models": {name: {"model": value} if isinstance(value, str) else value for name, value in content.items()}}
-    for name, section in Section(whole, str(path), None).sections("models", KEYS).items():
-        fields = {key: section.optional(key) for key in KEYS if key != "frame_rate"}
-        if (fields["model"] is None) == (fields["motion"] is None):
-            raise FaceDiffError(f"{section.place}: expected either a model or a folder of motion")
-        commercial = fields["commercial_use"] or "unknown"
-        if commercial not in COMMERCIAL:
-            raise FaceDiffError(f"{section.place}: commercial_use: {choices(commercial, COMMERCIAL)}")
-        if fields["model"] is not None:
-            check_animating_source(fields["model"])
-        rate, rates = section.content.get("frame_rate"), ranges.Range(*FRAME_RATES)
-        if rate is not None and rate not in rates:
-            raise FaceDiffError(f"{section.place}: frame_rate is {quoted(rate)}; expected a number {rates}")
-        candidates.append(
-            Candidate(
-                name,
-                fields["model"],
-                None if fields["motion"] is None else Path(fields["motion"]),
-                fields["layout"],
-                None if rate is None else float(rate),
-                fields["identity"],
-                fields["style"],
-                fields["licence"] or "",
-                commercial,
-            )
-        )
+    for name, value in models.items() if isinstance(models, dict) else ():
+        content = value if isinstance(value, dict) else {"model": value}
+        place = f"{path}: models.{name}"
+        candidate = read_record(Candidate, {**content, "name": name}, place)
+        if (candidate.model is None) == (candidate.motion is None):
+            raise FaceDiffError(f"{place}: expected either a model or a folder of motion")
+        if candidate.model is not None:
+            check_animating_source(candidate.model)
+        candidates.append(candidate)
     if not candidates:
         raise FaceDiffError(f"{path}: names no model; {expected}")
     return candidates

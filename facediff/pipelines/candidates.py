@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ from facediff.spaces.rigs import decode_flame
 from facediff.spaces.rotations import convert
 from facediff.synthetic.known_faces import edition_of_mesh
 from facediff.synthetic.spoken_set import SPEAKER, OpenFace, SpokenClip, SpokenMotion, open_face
-from facediff.utils import SAMPLE_RATE
+from facediff.utils import SAMPLE_RATE, ranges
 
 if TYPE_CHECKING:
     from facediff.animation.options import RecordingKeywords
@@ -60,11 +60,11 @@ class Candidate:
     model: str | None = None
     motion: Path | None = None
     layout: str | None = None
-    frame_rate: float | None = None
+    frame_rate: ranges.FrameRate | None = None
     identity: str | None = None
     style: str | None = None
     licence: str = ""
-    commercial_use: str = "unknown"
+    commercial_use: Literal["allowed", "forbidden", "unknown"] = "unknown"
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from facediff.errors import FaceDiffError
-from facediff.utils.limits import check_format, quoted
+from facediff.utils.limits import check_format
 from facediff.utils.plain_files import load_json, write_json
+from facediff.utils.records import read_record
 
 FILE = "provenance.json"
 FORMAT = 1
@@ -102,27 +102,7 @@ def read_provenance(folder: Path) -> Provenance | None:
 
 
 def provenance_of(content: object, name: object) -> Provenance:
-    """Provenance from plain data, which errors call ``name``.
-
-    Raises:
-        FaceDiffError: if a field is not of its type.
-    """
-    if not isinstance(content, dict):
-        raise FaceDiffError(f"{name}: holds no JSON object; {REMEDY}")
-    check_format(name, content.get("format", FORMAT), FORMAT)
-    kept: dict[str, Any] = {}
-    kinds: dict[str, type] = {"components": dict, "versions": dict, "seed": int, "steps": int, "parameters": int}
-    for key in Provenance.__dataclass_fields__:
-        value = content.get(key)
-        if value is None:
-            continue
-        kind = kinds.get(key, str)
-        fits = isinstance(value, kind) and not isinstance(value, bool)
-        if kind is dict and fits:
-            fits = all(isinstance(text, str) for item in value.items() for text in item)
-        if not fits:
-            raise FaceDiffError(f"{name}: {key} is {quoted(value)}; {REMEDY}")
-        kept[key] = value
-    if "model" not in kept:
-        raise FaceDiffError(f"{name}: names no model; {REMEDY}")
-    return Provenance(**kept)
+    """Provenance from plain data, which errors call ``name``."""
+    stated = content.get("format", FORMAT) if isinstance(content, dict) else None
+    check_format(name, stated, FORMAT)
+    return read_record(Provenance, content, name, remedy=REMEDY, strict=False)
