@@ -7,32 +7,32 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError
 from facediff.study.design import TRUTH, Kind
 from facediff.utils import ranges
-from facediff.utils.limits import check_format, check_number, quoted
+from facediff.utils.limits import check_format
 from facediff.utils.plain_files import load_json, parse_json, write_json
 from facediff.utils.ranges import Range
+from facediff.utils.records import Items, Text, read_record
 
 FORMAT = "facediff study 1"
 STUDY_FILE, PAGE_FOLDER, VIDEO_FOLDER, DATABASE = "study.json", "page", "videos", "answers.sqlite"
 """What is in the folder of a study."""
 
-NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
-TOKEN = re.compile(r"[0-9a-f]{16}")
-LANGUAGE = re.compile(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})?")
-LONGEST_TEXT = 20_000
+Name = Annotated[str, Text(r"[a-z][a-z0-9_]{0,39}", "small letters, digits and underscores")]
+Language = Annotated[str, Text(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})?", "a code such as en")]
+Line = Annotated[str, Text()]
+Video = Annotated[str, Text(r"[0-9a-f]{16}\.(mp4|webm)", "the name of a video")]
 LEFT, RIGHT, SAME = "left", "right", "same"
 """Answers to a question of the kind ``choice``; the last one only where it allows no difference."""
 
-Texts = Mapping[str, str]
+Texts = Mapping[Language, Line]
 """A text by language."""
 
 
@@ -48,9 +48,9 @@ class Question:
         no_difference: whether a third answer says that there is no difference.
     """
 
-    name: str
+    name: Name
     text: Texts
-    kind: str = "choice"
+    kind: Literal["choice", "text"] = "choice"
     reference: bool = False
     no_difference: bool = False
 
@@ -76,9 +76,6 @@ class Rule:
     most_on_one_side: Annotated[float, Range(0.5, 1)] = 0.9
     finished: bool = True
 
-    def __post_init__(self) -> None:
-        ranges.check_fields(self)
-
 
 @dataclass(frozen=True)
 class Trial:
@@ -94,13 +91,13 @@ class Trial:
         reference: name of the reference's video; None without one.
     """
 
-    id: str
+    id: Annotated[str, Text(r"[0-9a-f]{16}", "16 hexadecimal digits")]
     kind: Kind
-    clip: str
-    left: str
-    right: str
-    video: str
-    reference: str | None = None
+    clip: Line
+    left: Line
+    right: Line
+    video: Video
+    reference: Video | None = None
 
     def chosen(self, answer: str) -> str | None:
         """The condition that an answer names; None for no difference."""
@@ -128,16 +125,16 @@ class Study:
 
     title: Texts
     consent: Texts
-    languages: tuple[str, ...]
-    methods: tuple[str, ...]
+    languages: Annotated[tuple[Language, ...], Items(1)]
+    methods: Annotated[tuple[Line, ...], Items(1)]
     questions: tuple[Question, ...]
     rule: Rule
     trials: tuple[Trial, ...]
-    schedules: tuple[tuple[int, ...], ...]
-    seed: int = 0
-    remark: str = ""
+    schedules: tuple[tuple[Annotated[int, Range(0)], ...], ...]
+    seed: ranges.Seed = 0
+    remark: Line = ""
     details: Mapping[str, Any] = field(default_factory=dict)
-    version: str = ""
+    version: Line = ""
 
     @cached_property
     def id(self) -> str:
@@ -189,134 +186,15 @@ def read_study(folder: Path) -> Study:
     """Read the study of a folder that ``facediff study make`` has finished."""
     path = folder / STUDY_FILE
     remedy = "expected a folder that `facediff study make` has finished"
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; {remedy}")
     content = load_json(path, remedy=remedy)
-    if not isinstance(content, dict):
-        raise FaceDiffError(f"{path}: holds no object; {remedy}")
-    check_format(path, content.get("format"), FORMAT)
-    read = _Reader(path)
-    questions = [
-        Question(
-            read.text(entry, "name", NAME),
-            read.texts(entry.get("text"), "text"),
-            read.one_of(entry, "kind", ("choice", "text")),
-            entry.get("reference") is True,
-            entry.get("no_difference") is True,
-        )
-        for entry in read.objects(content, "questions")
-    ]
-    trials = [
-        Trial(
-            read.text(entry, "id", TOKEN),
-            read.one_of(entry, "kind", get_args(Kind)),  # type: ignore[arg-type]
-            read.text(entry, "clip"),
-            read.text(entry, "left"),
-            read.text(entry, "right"),
-            read.video(entry, "video"),
-            None if entry.get("reference") is None else read.video(entry, "reference"),
-        )
-        for entry in read.objects(content, "trials")
-    ]
-    schedules = content.get("schedules")
-    if not isinstance(schedules, list) or not all(isinstance(row, list) and row for row in schedules) or not schedules:
-        raise FaceDiffError(f"{path}: schedules are no lists of numbers of trials; {remedy}")
-    rows = [
-        tuple(
-            int(check_number(path, "schedules", number, 0, len(trials) - 1, whole=True, remedy=remedy))
-            for number in row
-        )
-        for row in schedules
-    ]
-    if len({trial.id for trial in trials}) < len(trials) or len({question.name for question in questions}) < len(
-        questions
-    ):
-        raise FaceDiffError(f"{path}: names a trial or a question twice; {remedy}")
-    if not any(question.kind == "choice" for question in questions):
-        raise FaceDiffError(f"{path}: questions ask for no choice; {remedy}")
-    study = Study(
-        title=read.texts(content.get("title"), "title"),
-        consent=read.texts(content.get("consent"), "consent"),
-        languages=tuple(read.names(content, "languages", LANGUAGE)),
-        methods=tuple(read.names(content, "methods")),
-        questions=tuple(questions),
-        rule=make_rule(content.get("rule"), path),
-        trials=tuple(trials),
-        schedules=tuple(rows),
-        seed=int(check_number(path, "seed", content.get("seed"), 0, 2**62, whole=True, remedy=remedy)),
-        remark=read.text(content, "remark"),
-        details=content["details"] if isinstance(content.get("details"), dict) else {},
-        version=read.text(content, "version"),
-    )
+    check_format(path, content.get("format") if isinstance(content, dict) else None, FORMAT)
+    study = read_record(Study, content, path, remedy=remedy, strict=False)
+    last = len(study.trials) - 1
+    if not study.choices or not study.schedules or not all(row and max(row) <= last for row in study.schedules):
+        raise FaceDiffError(f"{path}: asks for no choice, or for trials that it does not have; {remedy}")
     if content.get("id") != study.id:
         raise FaceDiffError(
             f"{path}: has been changed since the study was made, so that answers may not belong to it; make the "
             f"study again in a new folder"
         )
     return study
-
-
-def make_rule(content: object, source: object) -> Rule:
-    """The rule that a file states; fields that it omits have their defaults."""
-    if content is None:
-        return Rule()
-    if not isinstance(content, dict):
-        raise FaceDiffError(f"{source}: rule is {quoted(content)}; expected fields such as least_right: 0.8")
-    defaults = asdict(Rule())
-    values: dict[str, Any] = {}
-    for name, value in content.items():
-        if name not in defaults:
-            raise FaceDiffError(f'{source}: rule has no field "{name}": {choices(str(name), defaults)}')
-        if name == "finished":
-            if not isinstance(value, bool):
-                raise FaceDiffError(f"{source}: rule.finished is {quoted(value)}; expected true or false")
-            values[name] = value
-        else:
-            low = 0.5 if name == "most_on_one_side" else 0.0
-            values[name] = check_number(source, f"rule.{name}", value, low, 1.0)
-    return replace(Rule(), **values)
-
-
-class _Reader:
-    """Reads the fields of a study's file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def refuse(self, name: str, value: object, expected: str) -> FaceDiffError:
-        return FaceDiffError(f"{self.path}: {name} is {quoted(value)}; expected {expected}; make the study again")
-
-    def objects(self, content: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-        value = content.get(name)
-        if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
-            raise self.refuse(name, value, "a list of objects")
-        return value
-
-    def text(self, content: Mapping[str, Any], name: str, pattern: re.Pattern[str] | None = None) -> str:
-        value = content.get(name)
-        if not isinstance(value, str) or len(value) > LONGEST_TEXT or (pattern and not pattern.fullmatch(value)):
-            raise self.refuse(name, value, "a text" if pattern is None else f"a text like {pattern.pattern}")
-        return value
-
-    def video(self, content: Mapping[str, Any], name: str) -> str:
-        return self.text(content, name, re.compile(r"[0-9a-f]{16}\.(mp4|webm)"))
-
-    def one_of(self, content: Mapping[str, Any], name: str, allowed: Sequence[str]) -> str:
-        value = content.get(name)
-        if value not in allowed:
-            raise self.refuse(name, value, f"one of {', '.join(allowed)}")
-        return str(value)
-
-    def names(self, content: Mapping[str, Any], name: str, pattern: re.Pattern[str] | None = None) -> list[str]:
-        value = content.get(name)
-        if not isinstance(value, list) or not value:
-            raise self.refuse(name, value, "a list of names")
-        return [self.text({name: entry}, name, pattern) for entry in value]
-
-    def texts(self, value: object, name: str) -> dict[str, str]:
-        if not isinstance(value, dict) or not value:
-            raise self.refuse(name, value, "a text by language")
-        for language in value:
-            if not LANGUAGE.fullmatch(language):
-                raise self.refuse(name, language, "codes of languages")
-        return {language: self.text(value, language) for language in value}

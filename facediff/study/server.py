@@ -14,18 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError, OptionError
 from facediff.study.answers import (
-    LONGEST_CODE,
     MOST_RATERS,
+    Answer,
+    Finish,
+    Registration,
     check_answer,
     check_comments,
-    check_language,
     check_study,
-    check_token,
     clean,
 )
 from facediff.study.definition import DATABASE, PAGE_FOLDER, VIDEO_FOLDER, Study, read_study
 from facediff.study.page import PAGE
 from facediff.study.store import AnswerStore, FullError
+from facediff.utils.records import read_record
 from facediff.utils.server import (
     LOOPBACK,
     RefusedError,
@@ -84,26 +85,24 @@ def make_app(
         return JSONResponse({"id": study.id}, headers={"Cache-Control": "no-store"})
 
     def register(content: dict[str, Any]) -> dict[str, Any]:
-        token, language = check_token(content, "request"), check_language(content, "request")
-        if content.get("agreed") is not True:
-            raise FaceDiffError("request: agreed is not true; expected a rater who has agreed to take part")
-        code = clean(content.get("code", ""), "code", "request", LONGEST_CODE)
-        return {"number": store.register(token, language, code)}
+        rater = read_record(Registration, content, "request", strict=False)
+        return {"number": store.register(rater.rater, rater.language, clean(rater.code))}
 
-    def known(content: dict[str, Any]) -> tuple[str, int]:
-        token = check_token(content, "request")
-        number = store.number(token)
+    def number_of(token: object) -> int:
+        number = store.number(str(token))
         if number is None:
             raise RefusedError(404, "there is no such rater; begin again")
-        return token, number
+        return number
 
     def answer(content: dict[str, Any]) -> dict[str, Any]:
-        token, number = known(content)
-        return {"new": store.save(token, check_answer(content, study, number, "request"))}
+        given = read_record(Answer, content, "request", strict=False)
+        check_answer(given, study, number_of(content.get("rater")), "request")
+        return {"new": store.save(content["rater"], given)}
 
     def finish(content: dict[str, Any]) -> dict[str, Any]:
-        token, _ = known(content)
-        if not store.finish(token, check_comments(content.get("comments", {}), study, "request")):
+        end = read_record(Finish, content, "request", strict=False)
+        number_of(end.rater)
+        if not store.finish(end.rater, check_comments(end.comments, study, "request")):
             raise RefusedError(409, "answers are missing; send them first")
         return {"finished": True}
 
@@ -154,10 +153,6 @@ def serve(
         name: of the host as which a web server in front offers the page; requests under any other are refused.
         most_raters: raters that the study takes; no limit if None.
         ready: called with the page's address as soon as it can be opened.
-
-    Raises:
-        FaceDiffError: if the study is not complete, or the address or the name cannot be used.
-        MissingExtraError: if the server's packages are not installed.
     """
     if name is not None and not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?", name):
         raise OptionError("name", "is no name of a host; expected one such as study.lab.example", name)

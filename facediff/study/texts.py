@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from facediff.errors import FaceDiffError, choices
-from facediff.study.definition import LANGUAGE, LONGEST_TEXT, NAME, Question, Rule, Texts, make_rule
-from facediff.utils.limits import quoted
+from facediff.study.definition import Name, Question, Rule, Texts
 from facediff.utils.plain_files import parse_json
+from facediff.utils.records import read_record
 
 PAPER_QUESTIONS = ("realism", "lip_sync", "style")
 """The questions that are asked by default; the last one needs references."""
@@ -23,7 +24,6 @@ BUNDLED = {
 }
 """Questions whose texts are bundled, under ``questions`` in ``assets/texts/*.json``."""
 REMEDY = "see docs/user_study.md for what a file of questions holds"
-MOST_QUESTIONS = 20
 
 
 @cache
@@ -54,11 +54,30 @@ def standard(name: str, languages: Sequence[str]) -> dict[str, str]:
 
 def bundled_question(name: str, languages: Sequence[str]) -> Question:
     """A question whose text is bundled."""
-    if name not in BUNDLED:
-        raise FaceDiffError(f'there is no bundled question "{name}": {choices(name, BUNDLED)}')
     question = BUNDLED[name]
     text = {language: bundled_texts()[language]["questions"][name] for language in languages}
     return Question(name, text, question.kind, question.reference, question.no_difference)
+
+
+@dataclass(frozen=True)
+class QuestionEntry:
+    """A question of a file: the name of a bundled one, or one of the user's; see :class:`Question`."""
+
+    name: Name
+    text: Any = None
+    kind: Literal["choice", "text"] | None = None
+    reference: bool | None = None
+    no_difference: bool | None = None
+
+
+@dataclass(frozen=True)
+class QuestionFile:
+    """A file of questions; texts are one for all languages, or one by language."""
+
+    questions: tuple[Any, ...] | None = None
+    title: Any = None
+    consent: Any = None
+    rule: Rule = Rule()
 
 
 class Questionnaire:
@@ -78,27 +97,16 @@ class Questionnaire:
     """
 
     def __init__(self, path: Path | None, languages: Sequence[str]) -> None:
-        self.languages = languages
-        self.source: object = path
-        content: dict[str, Any] = {}
-        if path is not None:
-            from facediff.utils.yaml_files import load_yaml
+        from facediff.utils.yaml_files import load_yaml
 
-            content = load_yaml(path, REMEDY)
-        for key in content:
-            if key not in ("questions", "title", "consent", "rule"):
-                advice = choices(key, ("questions", "title", "consent", "rule"))
-                raise FaceDiffError(f'{path}: has the unknown field "{key}": {advice}')
-        self.title = self._texts(content.get("title"), "title", standard("title", languages))
-        self.consent = self._texts(content.get("consent"), "consent", standard("consent", languages))
-        self.rule: Rule = make_rule(content.get("rule"), path)
-        listed = content.get("questions")
-        self.chosen = listed is not None
-        if listed is None:
-            listed = [*PAPER_QUESTIONS, "comments"]
-        if not isinstance(listed, list) or not 1 <= len(listed) <= MOST_QUESTIONS:
-            raise FaceDiffError(f"{path}: questions are no list of 1 to {MOST_QUESTIONS}; {REMEDY}")
-        self.questions = [self._question(entry, f"questions[{i}]") for i, entry in enumerate(listed)]
+        self.languages, self.source = languages, path
+        content = read_record(QuestionFile, {} if path is None else load_yaml(path, REMEDY), path, remedy=REMEDY)
+        self.title = self._texts(content.title, "title", standard("title", languages))
+        self.consent = self._texts(content.consent, "consent", standard("consent", languages))
+        self.rule = content.rule
+        self.chosen = content.questions is not None
+        entries = (*PAPER_QUESTIONS, "comments") if content.questions is None else content.questions
+        self.questions = [self._question(entry, f"questions[{i}]") for i, entry in enumerate(entries)]
         names = [question.name for question in self.questions]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
@@ -107,53 +115,30 @@ class Questionnaire:
             raise FaceDiffError(f"{path}: questions ask for no choice between two videos; {REMEDY}")
 
     def _question(self, content: object, place: str) -> Question:
-        if isinstance(content, str):
-            try:
-                return bundled_question(content, self.languages)
-            except FaceDiffError as error:
-                raise FaceDiffError(f"{self.source}: {place}: {error}") from error
-        if not isinstance(content, dict):
-            raise FaceDiffError(f"{self.source}: {place} is {quoted(content)}; {REMEDY}")
-        keys = ("name", "text", "kind", "reference", "no_difference")
-        wrong = next((key for key in content if key not in keys), None)
-        if wrong is not None:
-            raise FaceDiffError(f"{self.source}: {place} has the unknown field {quoted(wrong)}: {choices('', keys)}")
-        name = content.get("name")
-        if not isinstance(name, str) or not NAME.fullmatch(name):
-            raise FaceDiffError(
-                f"{self.source}: {place}.name is {quoted(name)}; expected small letters, digits and underscores"
-            )
-        flags = {}
-        for flag in ("reference", "no_difference"):
-            value = content.get(flag, getattr(BUNDLED.get(name), flag, False))
-            if not isinstance(value, bool):
-                raise FaceDiffError(f"{self.source}: {place}.{flag} is {quoted(value)}; expected true or false")
-            flags[flag] = value
-        kind = content.get("kind", BUNDLED[name].kind if name in BUNDLED else "choice")
-        if kind not in ("choice", "text"):
-            raise FaceDiffError(f"{self.source}: {place}.kind is {quoted(kind)}; expected choice or text")
-        if kind == "text" and any(flags.values()):
-            raise FaceDiffError(f"{self.source}: {place}: a text has no reference and no third answer; omit them")
-        standard_text = bundled_question(name, self.languages).text if name in BUNDLED else None
-        return Question(name, self._texts(content.get("text"), f"{place}.text", standard_text), kind, **flags)
+        content = {"name": content} if isinstance(content, str) else content
+        entry = read_record(QuestionEntry, content, self.source, remedy=REMEDY, name=place)
+        if entry.text is None and entry.name not in BUNDLED:
+            advice = f'there is no bundled question "{entry.name}": {choices(entry.name, BUNDLED)}'
+            raise FaceDiffError(f"{self.source}: {place} has no text, and {advice}")
+        usual = bundled_question(entry.name, self.languages) if entry.name in BUNDLED else Question(entry.name, {})
+        return Question(
+            entry.name,
+            self._texts(entry.text, f"{place}.text", usual.text),
+            entry.kind or usual.kind,
+            usual.reference if entry.reference is None else entry.reference,
+            usual.no_difference if entry.no_difference is None else entry.no_difference,
+        )
 
-    def _texts(self, content: object, place: str, default: Texts | None) -> dict[str, str]:
+    def _texts(self, content: Any, place: str, default: Texts) -> Texts:  # noqa: ANN401 - a text or a mapping
         """A text for every language: one for all, or one by language."""
-        if content is None and default is not None:
-            return dict(default)
-        texts = dict.fromkeys(self.languages, content) if isinstance(content, str) else content
-        if not isinstance(texts, dict):
-            raise FaceDiffError(f"{self.source}: {place} is {quoted(content)}; expected a text, or one by language")
-        for language in texts:
-            if not isinstance(language, str) or not LANGUAGE.fullmatch(language):
-                raise FaceDiffError(f"{self.source}: {place} has the language {quoted(language)}; expected en, de …")
-        for language in self.languages:
-            text = texts.get(language)
-            if not isinstance(text, str) or not text.strip() or len(text) > LONGEST_TEXT:
+        texts = dict.fromkeys(self.languages, content) if isinstance(content, str) else content or default
+        wanted = {language: texts.get(language) if isinstance(texts, dict) else None for language in self.languages}
+        for language, text in wanted.items():
+            if not isinstance(text, str) or not text.strip():
                 raise FaceDiffError(
                     f"{self.source}: {place} has no text in {language}; add one, or choose --languages without it"
                 )
-        return {language: str(texts[language]) for language in self.languages}
+        return wanted
 
 
 def page_texts(languages: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
