@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from facediff.errors import FaceDiffError
-from facediff.reporting.statistics import binomial_interval, binomial_p, holm, share_between_raters, wilson_interval
+from facediff.reporting.statistics import (
+    Array,
+    binomial_interval,
+    binomial_p,
+    holm,
+    share_between_raters,
+    wilson_interval,
+)
 from facediff.study.answers import Rater, merge, read_answers
-from facediff.study.definition import DATABASE, LEFT, RIGHT, SAME, Study, Trial, read_study
+from facediff.study.definition import DATABASE, LEFT, RIGHT, Study, Trial, read_study
 from facediff.study.design import TRUTH
 from facediff.study.statistics import alpha_interval, bradley_terry, krippendorff_alpha
 from facediff.study.store import AnswerStore
@@ -153,14 +161,8 @@ class StudyReport:
 
     def preference(self, question: str, first: str, second: str) -> Preference | None:
         """The preference of one pair."""
-        return next(
-            (
-                preference
-                for preference in self.preferences
-                if (preference.question, preference.first, preference.second) == (question, first, second)
-            ),
-            None,
-        )
+        wanted = (question, first, second)
+        return next((own for own in self.preferences if (own.question, own.first, own.second) == wanted), None)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the raters, as plain data; numbers that are not finite become None."""
@@ -225,42 +227,34 @@ def answer_files(paths: Sequence[Path]) -> list[Path]:
     """Files, and the .json files of folders, each once."""
     files: dict[Path, Path] = {}
     for path in paths:
-        inside = sorted(path.glob("*.json")) if path.is_dir() else [path]
+        inside = sorted(path.glob("*.json")) if path.is_dir() else [path] if path.exists() else []
         if not inside:
-            raise FaceDiffError(f"--answers {path}: holds no .json file; expected answers that raters have downloaded")
-        if not path.exists():
-            raise FaceDiffError(f"--answers {path}: no such file; expected answers that a rater has downloaded")
-        for file in inside:
-            files.setdefault(file.resolve(), file)
+            raise FaceDiffError(f"--answers {path}: no .json file; expected answers that raters have downloaded")
+        files |= {file.resolve(): file for file in inside if file.resolve() not in files}
     return list(files.values())
 
 
 def check_rater(rater: Rater, study: Study) -> Checks:
     """What the controls say of a rater, and whether the study's rule counts them."""
     rule = study.rule
-    trials = study.by_id
     first: dict[tuple[str, frozenset[str], str], str | None] = {}
+    again: dict[tuple[str, frozenset[str], str], str | None] = {}
     right: list[bool] = []
-    consistent: list[bool] = []
     sides: Counter[str] = Counter()
-    for trial, question, answer in answers_of(rater, trials):
+    for trial, question, answer in answers_of(rater, study.by_id):
         sides[answer] += 1
+        unit = (trial.clip, frozenset((trial.left, trial.right)), question)
         if trial.kind == "still":
             right.append(trial.chosen(answer) == TRUTH)
         elif trial.kind == "pair":
-            first[trial.clip, frozenset((trial.left, trial.right)), question] = trial.chosen(answer)
-    for trial, question, answer in answers_of(rater, trials):
-        if trial.kind == "repeat":
-            before = (trial.clip, frozenset((trial.left, trial.right)), question)
-            if before in first:
-                consistent.append(first[before] == trial.chosen(answer))
+            first[unit] = trial.chosen(answer)
+        elif trial.kind == "repeat":
+            again[unit] = trial.chosen(answer)
+    share_right = _share(right)
+    share_consistent = _share([first[unit] == chosen for unit, chosen in again.items() if unit in first])
     named = sides[LEFT] + sides[RIGHT]
     one_side = max(sides[LEFT], sides[RIGHT]) / named if named else None
-    share_right = sum(right) / len(right) if right else None
-    share_consistent = sum(consistent) / len(consistent) if consistent else None
-    reasons = []
-    if rule.finished and rater.finished is None:
-        reasons.append("has not finished")
+    reasons = ["has not finished"] if rule.finished and rater.finished is None else []
     if share_right is not None and share_right < rule.least_right:
         reasons.append(f"named the truth in {share_right:.0%} of the controls, less than {rule.least_right:.0%}")
     if share_consistent is not None and share_consistent < rule.least_consistent:
@@ -272,6 +266,10 @@ def check_rater(rater: Rater, study: Study) -> Checks:
     return Checks(rater.token, len(rater.answers), share_right, share_consistent, one_side, tuple(reasons))
 
 
+def _share(values: Sequence[bool]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
 def answers_of(rater: Rater, trials: dict[str, Trial]) -> list[tuple[Trial, str, str]]:
     """Trial, question and answer, for every answer of a rater to a trial that the study has."""
     return [
@@ -280,6 +278,51 @@ def answers_of(rater: Rater, trials: dict[str, Trial]) -> list[tuple[Trial, str,
         if answer.trial in trials
         for question, choice in answer.answers.items()
     ]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """The counted answers to one question.
+
+    Attributes:
+        wins: (R, K, K): how often rater r preferred condition i to j.
+        ties: (R, K, K): how often rater r saw no difference between i and j, where i is before j.
+        judged: what each clip with a pair, whichever side its faces are on, was judged as; by two raters at least.
+        left: answers to the same animation on both sides that name the left.
+        same: all answers to these that name a side.
+    """
+
+    wins: Array
+    ties: Array
+    judged: list[list[str]]
+    left: int
+    same: int
+
+
+def answers_to(question: str, study: Study, raters: Sequence[Rater]) -> Answers:
+    """Count the answers to a question; controls and repeated pairs are no part of preferences."""
+    place = {condition: i for i, condition in enumerate(study.conditions)}
+    shape = (len(raters), len(place), len(place))
+    wins, ties = np.zeros(shape), np.zeros(shape)
+    units: dict[tuple[str, int, int], list[str]] = {}
+    sides: Counter[str] = Counter()
+    for row, rater in enumerate(raters):
+        for trial, asked, answer in answers_of(rater, study.by_id):
+            if asked != question:
+                continue
+            if trial.kind == "same":
+                sides[answer] += 1
+            if trial.kind == "pair":
+                chosen = trial.chosen(answer)
+                i, j = sorted((place[trial.left], place[trial.right]))
+                if chosen is None:
+                    ties[row, i, j] += 1
+                else:
+                    wins[row, place[chosen], i + j - place[chosen]] += 1
+                judgement = "same" if chosen is None else "first" if place[chosen] == i else "second"
+                units.setdefault((trial.clip, i, j), []).append(judgement)
+    judged = [unit for unit in units.values() if len(unit) > 1]
+    return Answers(wins, ties, judged, sides[LEFT], sides[LEFT] + sides[RIGHT])
 
 
 @ranges.checked
@@ -294,7 +337,7 @@ def analyse(
     seed: ranges.Seed = 0,
     notes: Sequence[str] = (),
 ) -> StudyReport:
-    """Analyse the answers to a study. Controls and repeated pairs are no part of preferences.
+    """Analyse the answers to a study.
 
     Args:
         study: what was asked.
@@ -306,130 +349,81 @@ def analyse(
         seed: of the resamples.
         notes: on what was set aside before.
     """
-    checks = [check_rater(rater, study) for rater in raters]
-    kept = [rater for rater, check in zip(raters, checks, strict=True) if not check.reasons]
-    conditions = study.conditions
-    place = {condition: i for i, condition in enumerate(conditions)}
-    questions = [question.name for question in study.choices]
-    # (rater, preferred, other) for every question; an answer without difference is half a win for both.
-    shape = (len(kept), len(conditions), len(conditions))
-    wins = {question: np.zeros(shape) for question in questions}
-    ties = {question: np.zeros(shape) for question in questions}
-    units: dict[str, dict[tuple[str, frozenset[str]], list[str]]] = {question: {} for question in questions}
-    sides: dict[str, Counter[str]] = {question: Counter() for question in questions}
-    for row, rater in enumerate(kept):
-        for trial, question, answer in answers_of(rater, study.by_id):
-            if trial.kind == "same":
-                sides[question][answer] += 1
-            if trial.kind != "pair":
-                continue
-            chosen = trial.chosen(answer)
-            i, j = sorted((place[trial.left], place[trial.right]))
-            if chosen is None:
-                ties[question][row, i, j] += 1
-            else:
-                won = place[chosen]
-                wins[question][row, won, i + j - won] += 1
-            # What is judged is a clip with a pair, whichever side its faces are on.
-            unit = units[question].setdefault((trial.clip, frozenset((trial.left, trial.right))), [])
-            unit.append(SAME if chosen is None else "first" if place[chosen] == i else "second")
-    preferences: list[Preference] = []
-    scores: list[StrengthScores] = []
-    agreement: list[Agreement] = []
-    for question in questions:
-        preferences += _preferences(
-            question, conditions, wins[question], ties[question], level, interval, resamples, seed
-        )
-        both = ties[question] + ties[question].transpose(0, 2, 1)
-        try:
-            strengths = bradley_terry(wins[question] + both / 2)
-        except FaceDiffError:
-            strengths = None  # nobody has answered, or conditions that nobody has compared
-        if strengths is not None:
-            ends = strengths.intervals(level)
-            scores.append(
-                StrengthScores(
-                    question,
-                    {condition: float(strengths.scores[i]) for condition, i in place.items()},
-                    {condition: (float(ends[i, 0]), float(ends[i, 1])) for condition, i in place.items()},
-                    strengths.robust,
-                    strengths.bounded,
-                )
-            )
-        judged = [unit for unit in units[question].values() if len(unit) > 1]
-        agreement.append(
-            Agreement(
-                question,
-                krippendorff_alpha(judged),
-                alpha_interval(judged, level, resamples=resamples, seed=seed),
-                len(judged),
-            )
-        )
-    left = {
-        question: (
-            counted[LEFT] / (counted[LEFT] + counted[RIGHT]),
-            wilson_interval(counted[LEFT], counted[LEFT] + counted[RIGHT], level),
-            counted[LEFT] + counted[RIGHT],
-        )
-        for question, counted in sides.items()
-        if counted[LEFT] + counted[RIGHT]
-    }
+    checks = tuple(check_rater(rater, study) for rater in raters)
+    counted = [rater for rater, check in zip(raters, checks, strict=True) if not check.reasons]
+    answers = {question.name: answers_to(question.name, study, counted) for question in study.choices}
+    conditions, options = study.conditions, {"resamples": resamples, "seed": seed}
     return StudyReport(
         name,
         study,
         tuple(raters),
-        tuple(checks),
-        tuple(preferences),
-        tuple(scores),
-        tuple(agreement),
-        left,
+        checks,
+        tuple(
+            preference
+            for question, given in answers.items()
+            for preference in _preferences(question, conditions, given, level, interval, **options)
+        ),
+        tuple(
+            scores for question, given in answers.items() for scores in _strengths(question, conditions, given, level)
+        ),
+        tuple(
+            Agreement(
+                question,
+                krippendorff_alpha(given.judged),
+                alpha_interval(given.judged, level, **options),
+                len(given.judged),
+            )
+            for question, given in answers.items()
+        ),
+        {
+            question: (given.left / given.same, wilson_interval(given.left, given.same, level), given.same)
+            for question, given in answers.items()
+            if given.same
+        },
         level,
         interval,
         tuple(notes),
     )
 
 
+def _strengths(question: str, conditions: Sequence[str], given: Answers, level: float) -> Iterator[StrengthScores]:
+    """Bradley-Terry scores; none where nobody has answered, or some conditions were never compared with others."""
+    try:
+        strengths = bradley_terry(given.wins + (given.ties + given.ties.transpose(0, 2, 1)) / 2)
+    except FaceDiffError:
+        return
+    ends = strengths.intervals(level).tolist()
+    scores = dict(zip(conditions, strengths.scores.tolist(), strict=True))
+    intervals = {condition: (low, high) for condition, (low, high) in zip(conditions, ends, strict=True)}
+    yield StrengthScores(question, scores, intervals, strengths.robust, strengths.bounded)
+
+
 def _preferences(
     question: str,
     conditions: Sequence[str],
-    wins: np.ndarray,
-    ties: np.ndarray,
+    given: Answers,
     level: float,
     interval: Interval,
-    resamples: int,
-    seed: int,
+    **options: int,
 ) -> list[Preference]:
     """The preferences of one question, the pairs in the order of the conditions."""
     of_answers = wilson_interval if interval == "wilson" else binomial_interval
     preferences = []
-    for i, first in enumerate(conditions):
-        for j in range(i + 1, len(conditions)):
-            won, lost, same = wins[:, i, j], wins[:, j, i], ties[:, i, j]
-            answers = won + lost + same
-            count = int(answers.sum())
-            if not count:
-                continue
-            better = won + same / 2
+    for i, j in combinations(range(len(conditions)), 2):
+        won, lost, same = given.wins[:, i, j], given.wins[:, j, i], given.ties[:, i, j]
+        answers, better = won + lost + same, won + same / 2
+        count, wins, losses = int(answers.sum()), int(won.sum()), int(lost.sum())
+        if count:
+            share = float(better.sum()) / count
+            ends = of_answers(float(better.sum()), count, level)
+            between = share_between_raters(better, answers, level, **options)
+            p = binomial_p(wins, wins + losses)
+            names = (conditions[i], conditions[j])
             preferences.append(
-                Preference(
-                    question,
-                    first,
-                    conditions[j],
-                    int(won.sum()),
-                    int(lost.sum()),
-                    int(same.sum()),
-                    float(better.sum()) / count,
-                    of_answers(float(better.sum()), count, level),
-                    share_between_raters(better, answers, level, resamples=resamples, seed=seed),
-                    binomial_p(int(won.sum()), int(won.sum() + lost.sum())),
-                    1.0,
-                )
+                Preference(question, *names, wins, losses, int(same.sum()), share, ends, between, p, 1.0)
             )
     corrected = holm([preference.p for preference in preferences])
-    return [
-        Preference(**{**vars(preference), "p_corrected": value})
-        for preference, value in zip(preferences, corrected, strict=True)
-    ]
+    return [replace(preference, p_corrected=p) for preference, p in zip(preferences, corrected, strict=True)]
 
 
 def analyse_folder(
@@ -448,9 +442,6 @@ def analyse_folder(
         name: of the data set, for tables; the folder's name if None.
         others: ids of other studies, whose files are passed over.
         options: as :func:`analyse` takes them.
-
-    Raises:
-        FaceDiffError: if the folder holds no study, or nobody has answered.
     """
     study = read_study(folder)
     raters, notes = gather_raters(folder, study, files, others)
