@@ -83,7 +83,6 @@ def check(
     root: Packed,
     *,
     corpus: Corpus = None,
-    split: Annotated[str | None, Option(metavar="NAME")] = None,
     quick: bool = False,
     json: bool = False,
     work: WorkOptions = USUAL_WORK,
@@ -96,7 +95,6 @@ def check(
         root: the corpus folder, or a packed corpus: its folder or its address
         corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, beat, live_link,
             flame_clips:LAYOUT, or package.module.Class
-        split: count the clips of one way to split the corpus only (3DMEAD: sentence, identity, both)
         quick: read headers only, and compare files by size
         json: machine-readable: one object
         work: where the work is done
@@ -113,7 +111,6 @@ def check(
     report = check_folder(
         root,
         corpus,
-        split=split,
         quick=quick,
         workers=work.workers,
         scheduler=work.scheduler,

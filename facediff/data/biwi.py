@@ -6,7 +6,7 @@ import re
 from typing import ClassVar
 
 from facediff import registry
-from facediff.data.corpus import Clip
+from facediff.data.corpus import Circulating, Clip
 from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.utils.licences import Commercial
 
@@ -46,6 +46,12 @@ class Biwi(SpeechMotionDataModule):
         "ETH Zurich distributed BIWI (B3D(AC)^2) on request; since 2024 its page is reported gone and no request is "
         "known to have succeeded, so only those who have a copy can use it. `facediff data prepare biwi RAW OUT` makes "
         "the corpus folder from the raw files."
+    )
+    circulating: ClassVar[Circulating] = Circulating(
+        counts=("test_a", 24, 3879),
+        templates={"606284c0": "FaceFormer and TalkingStyle", "d436309f": "FaceDiffuser and DiffSpeaker"},
+        regions={"regions/lve.txt": 4996, "regions/lip.txt": 4996, "BIWI_lip.pkl": 4996, "regions/fdd.txt": 7784},
+        unit_area=True,
     )
 
     @classmethod

@@ -60,6 +60,37 @@ FLAME_SOURCES: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
+class Circulating:
+    """Facts about the copies of a corpus that circulate, by which ``facediff data check`` compares a folder.
+
+    Attributes:
+        counts: split, clips and frames that published scoring scripts report.
+        templates: projects whose repositories hold a ``templates.pkl``, by the beginning of the file's git blob id.
+        regions: number of distinct vertices in the lists of regions.
+        unit_area: whether templates have a surface area of one.
+        incomplete: whether some clips were never recorded.
+    """
+
+    counts: tuple[str, int, int] | None = None
+    templates: Mapping[str, str] = field(default_factory=dict)
+    regions: Mapping[str, int] = field(default_factory=dict)
+    unit_area: bool = False
+    incomplete: bool = False
+
+
+FLAME_REGIONS = {
+    "regions/lve.txt": 428,
+    "regions/fdd.txt": 1501,
+    "FLAME_masks.pkl:lips": 250,
+    "regions/FLAME_masks.pkl:lips": 250,
+    "FLAME_masks.pkl:forehead+eye_region": 827,
+    "regions/FLAME_masks.pkl:forehead+eye_region": 827,
+    "regions/lip.txt": 648,
+}
+"""Vertices of the regions of FLAME's topology that circulate."""
+
+
+@dataclass(frozen=True)
 class Clip:
     """One recording.
 

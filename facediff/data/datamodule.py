@@ -22,7 +22,16 @@ from torch.utils.data import DataLoader
 
 from facediff.data.augmentation import Augmenter, read_augmentations
 from facediff.data.batch import Assets, Reference, Rig, Sample, collate
-from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Clip, Corpus, find_region, parse_name, read_manifest
+from facediff.data.corpus import (
+    EYELID_PAIRS,
+    LIP_PAIRS,
+    Circulating,
+    Clip,
+    Corpus,
+    find_region,
+    parse_name,
+    read_manifest,
+)
 from facediff.data.dataset import (
     Aligner,
     BatchDataset,
@@ -87,6 +96,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         commercial_use: whether these terms allow it: ``allowed``, ``forbidden`` or ``unknown``.
         licence_source: where the terms stand, without ``https://``.
         obtain: how to obtain the corpus.
+        circulating: facts about the copies that circulate.
         makes_itself: whether ``prepare_data`` makes the corpus where it is missing.
         languages: codes of the languages that are spoken in it.
         former_options: values of options that came later, for checkpoints that were trained before these.
@@ -154,6 +164,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     commercial_use: ClassVar[Commercial] = "unknown"
     licence_source: ClassVar[str] = ""
     obtain: ClassVar[str] = ""
+    circulating: ClassVar[Circulating] = Circulating()
     makes_itself: ClassVar[bool] = False
     languages: ClassVar[tuple[str, ...]] = ()
     former_options: ClassVar[dict[str, Any]] = {}

@@ -6,7 +6,7 @@ import re
 from typing import ClassVar
 
 from facediff import registry
-from facediff.data.corpus import FLAME_SOURCES, Clip
+from facediff.data.corpus import FLAME_REGIONS, FLAME_SOURCES, Circulating, Clip
 from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.utils.licences import Commercial
 
@@ -55,6 +55,9 @@ class Vocaset(SpeechMotionDataModule):
     obtain: ClassVar[str] = (
         "VOCASET is distributed after registration at voca.is.tue.mpg.de; `facediff data prepare vocaset RAW OUT` "
         "makes the corpus folder from its files."
+    )
+    circulating: ClassVar[Circulating] = Circulating(
+        templates={"2fc95570": "TalkingStyle and DiffSpeaker"}, regions=FLAME_REGIONS, incomplete=True
     )
 
     @classmethod

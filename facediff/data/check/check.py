@@ -17,7 +17,6 @@ from facediff.data.check.layouts import (
     STATE,
     CorpusFolder,
     CorpusView,
-    facexhubert_names,
     identify,
     is_rate,
     list_folder,
@@ -53,10 +52,6 @@ REFERENCES = "none"
 """The split of clips that give style references only."""
 
 
-CHECK_FIGURES = {"biwi": ("test_a", 24, 3879)}
-"""Split, clips and frames of BIWI that users of CodeTalker's scoring script report; every complete copy has them."""
-INCOMPLETE = {"vocaset"}
-"""Corpora of which some clips were never recorded."""
 NEVER_RECORDED = 0.05
 """Share of a split that may be missing of these without a warning; the true number is not published."""
 
@@ -65,7 +60,6 @@ def check(
     root: Path | str,
     corpus: str | None = None,
     *,
-    split: str | None = None,
     quick: bool = False,
     workers: int | None = None,
     scheduler: str | None = "",
@@ -76,7 +70,6 @@ def check(
     Args:
         root: the folder; or a packed corpus, its folder or its address.
         corpus: name of the corpus (``biwi``), or import path of its data module; found out if None.
-        split: only the totals of this way to split the corpus (3DMEAD: ``sentence``, ``identity``, ``both``).
         quick: read headers only: no NaN, no comparison with templates, no copies; files are compared by size.
         workers: clips at a time; if None, as many as processors where there is much to read, or all of a cluster.
         scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
@@ -106,7 +99,7 @@ def check(
         return report
     folder = list_folder(root, MOTION_FOLDERS) if packed is None else list_packed(packed)
     recorded = manifest.get("corpus", state.get("corpus") if packed is None else packed.record.corpus)
-    view = identify(report, folder, recorded, corpus, split, manifest)
+    view = identify(folder, recorded, corpus, manifest, report.findings)
     report.manifest = {
         "there": (root / MANIFEST).is_file(),
         "ended": check_ended(root, recorded if isinstance(recorded, str) else None, report.findings),
@@ -163,7 +156,7 @@ def _check_corpus(
     clips = _clips(opened, view, folder, findings)
     _check_names(view, folder, clips, findings)
     _check_both_files(view, folder, findings)
-    if not clips and not any(finding.kind == "facexhubert_names" for finding in findings):
+    if not clips:
         message = f"no clip of {view.corpus} with both wav/<clip>.wav and vertices_npy/<clip>.npy; put them there"
         findings.error("no_clip", "wav, vertices_npy", message)
 
@@ -247,15 +240,6 @@ def _examine_all(
 def _check_names(view: CorpusView, folder: CorpusFolder, clips: Mapping[str, Clip], findings: Findings) -> None:
     """Report names not of the corpus's form, subjects in no split, and files that are not read."""
     unknown = [name for name in folder.names if view.parse(name) is None]
-    hubert = facexhubert_names(unknown) if view.corpus == "biwi" else []
-    if hubert:
-        message = (
-            f"{counted(len(hubert), 'clip')} named as in FaceXHuBERT ({few(hubert)}): NN is a neutral sequence and "
-            f"NN + 40 the emotional eNN, and its vertices are scaled axis by axis. Renaming would not make them "
-            f"comparable; prepare the folder again from the raw files (`facediff data prepare biwi RAW OUT`)"
-        )
-        findings.error("facexhubert_names", "vertices_npy", message)
-        unknown = [name for name in unknown if name not in set(hubert)]
     if unknown:
         message = f"{counted(len(unknown), 'name')} not of {view.corpus}'s form, so not read: {few(unknown)}"
         findings.warning("unknown_name", "wav, vertices_npy", message)
@@ -269,10 +253,6 @@ def _check_names(view: CorpusView, folder: CorpusFolder, clips: Mapping[str, Cli
     if folder.leftovers:
         message = f"{counted(len(folder.leftovers), 'file')} half-written by a program that was stopped; remove them"
         findings.warning("leftover", folder.leftovers[0], message)
-    if folder.strays:
-        files = counted(len(folder.strays), "file")
-        message = f"{files} of other types, which are not read (expected .wav and .npy): {few(folder.strays)}"
-        findings.note("stray_file", folder.strays[0], message)
 
 
 def _without_split(view: CorpusView, clips: Mapping[str, Clip]) -> list[str]:
@@ -403,27 +383,28 @@ def _amount(view: CorpusView, names: Iterable[str], frames: Mapping[str, int]) -
 
 
 def _report_missing(view: CorpusView, clips: Mapping[str, Clip], findings: Findings) -> None:
-    incomplete = False
+    lacking = False
     for split, names in view.expected.items():
         missing = [name for name in names if name not in clips]
         if not missing:
             continue
         listed = f"{counted(len(missing), 'clip')} of {number(len(names))} not there: {few(missing)}"
         listed += " (--json lists all)" if len(missing) > FEW else ""
-        if view.corpus in INCOMPLETE and len(missing) <= NEVER_RECORDED * len(names):
+        incomplete = view.circulating is not None and view.circulating.incomplete
+        if incomplete and len(missing) <= NEVER_RECORDED * len(names):
             findings.note("clips_missing", f"split {split}", f"{listed}; some were never recorded")
         else:
-            incomplete = True
+            lacking = True
             message = f"{listed}; scores are comparable with published ones only if all are there"
             findings.warning("clips_missing", f"split {split}", message)
-    if incomplete and view.obtain:
+    if lacking and view.obtain:
         findings.note("obtain", view.corpus, view.obtain)
 
 
 def _compare_check_figure(view: CorpusView, rows: Iterable[Mapping[str, Any]], findings: Findings) -> None:
-    if view.corpus not in CHECK_FIGURES:
+    if view.circulating is None or view.circulating.counts is None:
         return
-    split, *figure = CHECK_FIGURES[view.corpus]
+    split, *figure = view.circulating.counts
 
     def words(clips: int, frames: int) -> str:
         return f"{counted(clips, 'sequence')} and {counted(frames, 'frame')}"

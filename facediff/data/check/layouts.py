@@ -1,20 +1,18 @@
-"""Recognising a folder: a corpus, a person's folder, a raw distribution, or none of these."""
+"""Recognising a folder: a corpus, a person's folder, or neither."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
 import os
-import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin, get_type_hints
 
-from facediff.data.check.report import CheckReport, Findings, few
+from facediff.data.check.report import Findings, few
 from facediff.data.manifest import load_manifest
 from facediff.data.storage import WEIGHTS_FOLDER, rig_path
 from facediff.errors import FaceDiffError, choices, lacking, number
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
 
     Module = type[SpeechMotionDataModule]
-    from facediff.data.corpus import Clip
+    from facediff.data.corpus import Circulating, Clip
     from facediff.data.packed.reader import PackedCorpus
 
 MANIFEST = "manifest.json"
@@ -33,34 +31,16 @@ STATE = "prepare.json"
 SPLITS = ("train", "val", "test_a", "test_b", "test_c")
 
 PROBED = 8  # files of motion whose header is read to find the topology
-HALF = 0.5  # share of the names that must be of a corpus's form to recognise it
-FACEXHUBERT = re.compile(r"[FM]\d_(\d\d)(_cut)?")
-"""BIWI's clips in FaceXHuBERT's preparation: NN for a neutral sequence, NN + 40 for an emotional one."""
-
-RAW_FILES = {
-    "biwi": ("faces/*/*/frame_*.vl",),
-    "vocaset": ("data_verts.npy", "subj_seq_to_idx.pkl"),
-    "mead3d": (
-        "*/front/*/*/*/shape_pose_cam.hdf5",
-        "*/*/front/*/*/*/shape_pose_cam.hdf5",
-        "param/*.npy",
-        "mead/param/*.npy",
-        "datasets/mead/param/*.npy",
-    ),
-}
-"""Files of raw distributions, by their name in ``facediff data prepare``."""
-BASES = 100  # folders in the raw folder that are searched: an archive may have been unpacked to one of them
 
 
 @dataclass(frozen=True)
 class CorpusFolder:
-    """Files of clips by name, files that a killed program left half-written, and files of other types."""
+    """Files of clips by name, and files that a killed program left half-written."""
 
     root: Path
     motions: dict[str, Path] = field(default_factory=dict)
     sounds: dict[str, Path] = field(default_factory=dict)
     leftovers: list[str] = field(default_factory=list)
-    strays: list[str] = field(default_factory=list)
     packed: PackedCorpus | None = None  # what the clips lie in, if they are no files
 
     @property
@@ -101,50 +81,32 @@ class CorpusView:
     region_help: str = ""  # where the files of the regions can be obtained
     obtain: str = ""  # how the corpus can be obtained
     unit: str = ""  # of length, where manifest.json has none
+    circulating: Circulating | None = None  # facts about the copies that circulate
 
 
 def identify(
-    report: CheckReport,
-    folder: CorpusFolder,
-    recorded: object,
-    corpus: str | None,
-    split: str | None,
-    manifest: dict[str, Any],
+    folder: CorpusFolder, recorded: object, corpus: str | None, manifest: dict[str, Any], findings: Findings
 ) -> CorpusView | None:
     """The corpus that a folder holds; None, with a finding, if it holds none or is not recognised.
 
-    ``recorded`` is the corpus that ``manifest.json`` or ``prepare.json`` names, ``corpus`` the one that the user names,
-    ``split`` the only one of the ways in which the corpus is split that is wanted.
+    ``recorded`` is the corpus that ``manifest.json`` or ``prepare.json`` names, ``corpus`` the one that the user names.
     """
-    root, n_vertices, findings = folder.root, folder.n_vertices(), report.findings
-    module = None if corpus is None else by_name(corpus, n_vertices)
-    if not folder.motions and (raw := _raw_distribution(root)) is not None:
-        report.raw, file = raw
-        command = f"facediff data prepare {report.raw} {root} OUT" + (" --flame MODEL" * (report.raw == "mead3d"))
-        message = f"this is the raw distribution of {report.raw} and not yet a corpus: run `{command}`"
-        findings.error("raw", file, message)
-        return None
-    if module is None and isinstance(manifest.get("person"), str):
-        view: CorpusView | None = None
+    root, n_vertices = folder.root, folder.n_vertices()
+    if corpus is None and isinstance(manifest.get("person"), str):
         with findings.guard("manifest_unreadable", root / MANIFEST, root):
-            view = _view_of_person(manifest, n_vertices)
-        return view
-    module = module or recognise(folder, recorded, n_vertices)
+            return _view_of_person(manifest, n_vertices)
+        return None
+    module = recognise(folder, recorded, n_vertices) if corpus is None else by_name(corpus, n_vertices)
     if module is not None:
-        return _view_of_module(module, root, split)
-    reasons = [
-        f"no {MANIFEST} names a corpus"
-        if recorded is None
-        else f"{MANIFEST} names {recorded!r}, which no data module reads"
-    ]
+        return _view_of_module(module, root)
+    contents = "there is no wav/*.wav or vertices_npy/*.npy"
     if folder.names:
         vertices = "unreadable motion" if n_vertices is None else f"{number(n_vertices)} vertices"
-        corpora = dict.fromkeys(module.corpus_name for module in _known())
-        reasons.append(f"there are clips {few(folder.names)} with {vertices}, which fit none of {few(corpora)}")
-    else:
-        patterns = ", ".join(pattern for patterns in RAW_FILES.values() for pattern in patterns)
-        reasons.append(f"there is no wav/*.wav or vertices_npy/*.npy, and nothing of a raw distribution ({patterns})")
-    message = f"not recognised: {'; '.join(reasons)}. Give the right folder, or name the corpus with --corpus"
+        contents = f"there are clips {few(folder.names)} with {vertices}"
+    message = (
+        f"not recognised: {contents}, and {MANIFEST} names no known corpus. Give the right folder, name the corpus "
+        f"with --corpus, or run `facediff data prepare` if this is a raw distribution"
+    )
     findings.error("unrecognised", str(root), message)
     return None
 
@@ -163,10 +125,10 @@ def view_of(root: Path, corpus: str | None) -> CorpusView:
         raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
     if (root / STATE).is_file() and not (root / MANIFEST).is_file():
         raise FaceDiffError(f"{root}: its preparation was interrupted; run the same `facediff data prepare` again")
-    manifest, report = read_manifest(root), CheckReport(root)
-    view = identify(report, list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, None, manifest)
+    manifest, findings = read_manifest(root), Findings()
+    view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)
     if view is None:
-        raise FaceDiffError(f"{root}: {report.findings[0].message}")
+        raise FaceDiffError(f"{root}: {findings[0].message}")
     return view
 
 
@@ -190,8 +152,6 @@ def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
                     folder.leftovers.append(f"{name}/{path.name}")
             elif path.suffix == suffix:
                 files.setdefault(path.stem, path)
-            else:
-                folder.strays.append(f"{name}/{path.name}")
     return folder
 
 
@@ -209,21 +169,6 @@ def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
         with findings.guard("manifest_unreadable", path, root):
             return load_manifest(path)
     return {}
-
-
-def _raw_distribution(root: Path) -> tuple[str, str] | None:
-    """The data set whose raw distribution a folder holds, and a file that shows it; None if it holds none."""
-    try:
-        inner = list(islice((path for path in sorted(root.iterdir()) if path.is_dir()), BASES))
-    except OSError:
-        inner = []
-    for base in [root, *inner]:
-        for corpus, patterns in RAW_FILES.items():
-            for pattern in patterns:
-                with suppress(OSError):
-                    for file in base.glob(pattern):
-                        return corpus, file.relative_to(root).as_posix()
-    return None
 
 
 # The data module that reads it.
@@ -247,29 +192,15 @@ def by_name(name: str, n_vertices: int | None, option: str = "--corpus") -> Modu
 
 
 def recognise(folder: CorpusFolder, recorded: object, n_vertices: int | None) -> Module | None:
-    """The data module that reads a folder; None if that cannot be found out.
-
-    ``manifest.json`` decides; else most of the clips' names together with the vertex count; else names of a form of
-    their own (so that wrong vertices are reported as such); else a vertex count that only one corpus has.
-    """
+    """The data module that ``manifest.json`` names, else the one of these vertices whose names most clips have."""
     modules = _known()
     if isinstance(recorded, str):
         named = [m for m in modules if m.corpus_name in (recorded, recorded.removeprefix("facediff-"))]
         if named:
             return next((module for module in named if module.n_vertices == n_vertices), named[0])
     fitting = [module for module in modules if module.n_vertices == n_vertices]
-    best = _most_names(fitting, folder.names) or _most_names([m for m in modules if _own_names(m)], folder.names)
-    if best is not None:
-        return best
-    if facexhubert_names(folder.names):
-        return by_name("biwi", n_vertices)
-    return fitting[0] if len({module.corpus_name for module in fitting}) == 1 else None
-
-
-def facexhubert_names(names: Sequence[str]) -> list[str]:
-    """Names as FaceXHuBERT forms them, if numbers above 40, which stand for emotional sequences, are among them."""
-    numbers = {name: int(match[1]) for name in names if (match := FACEXHUBERT.fullmatch(name))}
-    return list(numbers) if any(number > 40 for number in numbers.values()) else []
+    counts = {module: sum(module.parse_name(name) is not None for name in folder.names) for module in fitting}
+    return max(fitting, key=lambda module: counts[module]) if any(counts.values()) else None
 
 
 def _known() -> list[Module]:
@@ -305,42 +236,15 @@ def _import(path: str, option: str) -> Module:
     return module
 
 
-def _most_names(modules: Sequence[Module], names: Sequence[str]) -> Module | None:
-    """The data module that parses most of the names, and at least half of them."""
-
-    def knows(module: Module, name: str) -> bool:
-        clip = module.parse_name(name)
-        return clip is not None and (_own_names(module) or clip.identity in module.identities)
-
-    scores = {module: sum(knows(module, name) for name in names) for module in modules}
-    best = max(scores, key=lambda module: scores[module], default=None)
-    return best if best is not None and scores[best] and scores[best] >= HALF * len(names) else None
-
-
-def _own_names(module: Module) -> bool:
-    """Whether a data module has a form of names of its own."""
-    from facediff.data import SpeechMotionDataModule
-
-    return module.parse_name.__func__ is not SpeechMotionDataModule.parse_name.__func__  # type: ignore[attr-defined]
-
-
 # The facts that the check needs.
 
 
-def _view_of_module(module: Module, root: Path, split: str | None) -> CorpusView:
-    parameter = inspect.signature(module).parameters.get("split")
-    hint: Any = None if parameter is None else get_type_hints(module.__init__).get("split")
+def _view_of_module(module: Module, root: Path) -> CorpusView:
+    hint: Any = get_type_hints(module.__init__).get("split")
     ways: list[str | None] = list(get_args(hint)) if get_origin(hint) is Literal else [None]
-    if split is not None and split not in ways:
-        names = [way for way in ways if way is not None]
-        raise FaceDiffError(
-            f'--split: {module.corpus_name} has no split "{split}": {choices(split, names)}'
-            if names
-            else f"--split: {module.corpus_name} is split in one way only; omit the option"
-        )
-    ways = ways if split is None else [split]
     modules = {way: instance(module, root, way) for way in ways}
     first = modules[ways[0]]
+    facts = ("mesh_files", "region_sources", "region_help", "obtain", "unit", "circulating")
     return CorpusView(
         corpus=module.corpus_name,
         data_module=f"{module.__module__}.{module.__qualname__}",
@@ -351,11 +255,7 @@ def _view_of_module(module: Module, root: Path, split: str | None) -> CorpusView
         split_of={way: data.split_of for way, data in modules.items()},
         identities=list(first.identities),
         expected=module.expected_clips(),
-        mesh_files=module.mesh_files,
-        region_sources=dict(module.region_sources),
-        region_help=module.region_help,
-        obtain=module.obtain,
-        unit=module.unit,
+        **{name: getattr(module, name) for name in facts},
     )
 
 

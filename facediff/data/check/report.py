@@ -69,8 +69,6 @@ class CheckReport:
     corpus: str | None = None  # name of the corpus; None if it was not recognised
     # import path of the data module that reads it; None for a person's folder, or if unknown
     data_module: str | None = None
-    # name of the raw distribution that the folder holds instead of a corpus; None if it does not
-    raw: str | None = None
     frame_rate: float | None = None  # motion frames a second that models see; None if unknown, as the next two
     stored_frame_rate: float | None = None  # motion frames a second on disk
     n_vertices: int | None = None
@@ -148,7 +146,7 @@ def text(report: CheckReport) -> str:
 
 def _heading(report: CheckReport) -> str:
     if report.corpus is None:
-        return f"{report.root}: {f'raw distribution of {report.raw}' if report.raw else 'not recognised'}"
+        return f"{report.root}: not recognised"
     module = f", data module {report.data_module}" if report.data_module else ""
     rate = f"{report.frame_rate:g} frames a second"
     if report.stored_frame_rate not in (None, report.frame_rate):

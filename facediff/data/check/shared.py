@@ -20,31 +20,7 @@ from facediff.utils.checksums import sha256
 if TYPE_CHECKING:
     from facediff.data.corpus import Corpus
 
-TEMPLATES = {
-    "biwi": {"606284c0": "FaceFormer and TalkingStyle", "d436309f": "FaceDiffuser and DiffSpeaker"},
-    "vocaset": {"2fc95570": "TalkingStyle and DiffSpeaker"},
-}
-"""Projects whose repositories hold a ``templates.pkl``, by the beginning of the file's git blob id."""
-
-UNIT_AREA = {"biwi"}
-"""Corpora with circulating templates of a surface area of one."""
 AREA_TOLERANCE = 1e-3  # float32 templates are within 1e-6
-
-FLAME_REGIONS = {
-    "regions/lve.txt": 428,
-    "regions/fdd.txt": 1501,
-    "FLAME_masks.pkl:lips": 250,
-    "regions/FLAME_masks.pkl:lips": 250,
-    "FLAME_masks.pkl:forehead+eye_region": 827,
-    "regions/FLAME_masks.pkl:forehead+eye_region": 827,
-    "regions/lip.txt": 648,
-}
-REGIONS = {
-    "biwi": {"regions/lve.txt": 4996, "regions/lip.txt": 4996, "BIWI_lip.pkl": 4996, "regions/fdd.txt": 7784},
-    "vocaset": FLAME_REGIONS,
-    "mead3d": FLAME_REGIONS,
-}
-"""Number of distinct vertices in the circulating lists."""
 
 
 # The records of ``facediff data prepare``, and whether the files still agree with them.
@@ -142,8 +118,8 @@ def check_templates(root: Path, view: CorpusView, findings: Findings) -> tuple[d
 
 def _origin(view: CorpusView, blob: str, findings: Findings) -> str | None:
     """The project that the templates come from; None for corpora without circulating copies."""
-    circulating = TEMPLATES.get(view.corpus)
-    if circulating is None:
+    circulating = {} if view.circulating is None else view.circulating.templates
+    if not circulating:
         return None
     origin = next((who for start, who in circulating.items() if blob.startswith(start)), "own")
     if len(circulating) > 1:
@@ -164,7 +140,7 @@ def check_areas(
 
     ``unit`` is that in ``manifest.json``, if it has one.
     """
-    if view.corpus not in UNIT_AREA or not templates:
+    if view.circulating is None or not view.circulating.unit_area or not templates:
         return None
     areas = {subject: surface_area(template, faces) for subject, template in sorted(templates.items())}
     other = {subject: area for subject, area in areas.items() if abs(area - 1) > AREA_TOLERANCE}
@@ -226,7 +202,7 @@ def _check_region(
         if region.duplicates:
             message = f"{counted(region.duplicates, 'index', 'indices')} of {name} repeated; counted once"
             findings.note("region_repeats", str(source), message)
-        usual = REGIONS.get(view.corpus, {}).get(str(source))
+        usual = None if view.circulating is None else view.circulating.regions.get(str(source))
         if usual is not None and usual != region.count:
             message = (
                 f"{name} has {counted(region.count, 'vertex', 'vertices')}, the list that circulates under this name "

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.check import CheckReport
 from facediff.data.check.layouts import MANIFEST, CorpusView, identify, list_folder, read_record
+from facediff.data.check.report import Findings
 from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import Mesh
@@ -69,12 +69,11 @@ def find_view(root: Path, corpus: str | None) -> CorpusView:
     """What a folder is, as ``facediff data check`` recognises it."""
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
-    report = CheckReport(root, quick=True)
-    manifest = read_record(root, MANIFEST, report.findings)
-    folder = list_folder(root, MOTION_FOLDERS)
-    view = identify(report, folder, manifest.get("corpus"), corpus, None, manifest)
+    findings = Findings()
+    manifest = read_record(root, MANIFEST, findings)
+    view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)
     if view is None:
-        raise FaceDiffError(f"{root}: {report.findings[-1].message}")
+        raise FaceDiffError(f"{root}: {findings[-1].message}")
     return view
 
 

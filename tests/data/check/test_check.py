@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,8 @@ import pytest
 import soundfile
 
 from facediff.cli.app import run
+from facediff.data import Biwi
 from facediff.data.check import check
-from facediff.data.check import shared as facts
-from facediff.errors import FaceDiffError
 from tests.data.check import small
 from tests.data.check.small import BIWI, MEAD, VOCASET, kinds, message, rows
 from tests.fakes import biwi, vocaset
@@ -40,7 +40,7 @@ def test_the_json_object_is_complete(copies: Path, capsys: pytest.CaptureFixture
     assert run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert set(report) == {
-        *("format", "root", "quick", "corpus", "data_module", "raw", "sound", "frame_rate", "stored_frame_rate"),
+        *("format", "root", "quick", "corpus", "data_module", "sound", "frame_rate", "stored_frame_rate"),
         *("n_vertices", "points", "findings", "splits", "subjects", "templates", "mesh", "regions", "manifest"),
         "truth",
     }
@@ -133,36 +133,20 @@ def test_templates_without_unit_area(copies: Path) -> None:
     assert "template_area" not in kinds(check(root, BIWI), "warning")
 
 
-@pytest.mark.parametrize(
-    ("corpus", "origin"), [("biwi", "FaceFormer and TalkingStyle"), ("biwi", "FaceDiffuser and DiffSpeaker")]
-)
-def test_templates_that_circulate_are_known(
-    copies: Path, monkeypatch: pytest.MonkeyPatch, corpus: str, origin: str
-) -> None:
+@pytest.mark.parametrize("origin", ["FaceFormer and TalkingStyle", "FaceDiffuser and DiffSpeaker"])
+def test_templates_that_circulate_are_known(copies: Path, monkeypatch: pytest.MonkeyPatch, origin: str) -> None:
     """The real files cannot be had here, so the fake's own blob id is entered in their place."""
-    content = (copies / corpus / "templates.pkl").read_bytes()
+    content = (copies / "biwi" / "templates.pkl").read_bytes()
     blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()  # noqa: S324 - git's name for a file
-    known = {who: start for start, who in facts.TEMPLATES[corpus].items()}
+    known = {who: start for start, who in Biwi.circulating.templates.items()}
     assert known == {"FaceFormer and TalkingStyle": "606284c0", "FaceDiffuser and DiffSpeaker": "d436309f"}
     other = next(who for who in known if who != origin)
-    monkeypatch.setitem(facts.TEMPLATES, corpus, {blob[:8]: origin, known[other]: other})
-    report = check(copies / corpus, BIWI, quick=True)
+    facts = replace(Biwi.circulating, templates={blob[:8]: origin, known[other]: other})
+    monkeypatch.setattr(small.SmallBiwi, "circulating", facts)
+    report = check(copies / "biwi", BIWI, quick=True)
     assert report.templates["origin"] == origin
     assert f"the templates of {origin}" in message(report, "templates_origin")
     assert f"{other} ({known[other]})" in message(report, "templates_origin")
-
-
-def test_names_of_facexhubert_are_explained(copies: Path) -> None:
-    root = copies / "biwi"
-    for path in [*root.glob("wav/*"), *root.glob("vertices_npy/*")]:
-        subject, sentence = path.stem.split("_e")
-        path.rename(path.with_name(f"{subject}_{int(sentence) + 40}{path.suffix}"))
-    for corpus in (None, BIWI):
-        report = check(root, corpus)
-        assert report.corpus == "biwi"
-        assert "facexhubert_names" in kinds(report)
-        assert "12 clips" in message(report, "facexhubert_names")
-    assert kinds(report) == ["facexhubert_names"]
 
 
 def test_neutral_sequences_are_names_that_biwi_does_not_read(copies: Path) -> None:
@@ -244,9 +228,3 @@ def test_3dmead_has_totals_of_both_ways_to_split_it(fakes: Path) -> None:
         "test_b": sizes["W040_030_7_2"],
         "none": sizes["M032_001_0_0"],
     }
-    only = check(fakes / "mead", MEAD, split="identity")
-    assert {row["way"] for row in only.splits} == {"identity"}
-    with pytest.raises(FaceDiffError, match='no split "identiy": did you mean "identity"'):
-        check(fakes / "mead", MEAD, split="identiy")
-    with pytest.raises(FaceDiffError, match="split in one way only"):
-        check(fakes / "biwi", BIWI, split="sentence")
