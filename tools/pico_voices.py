@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
-from facediff.synthetic.further_speech import WORDS
+from facediff.synthetic.sentences import WORDS
 from facediff.utils.files import atomic_folder
 
 RATE = 16_000

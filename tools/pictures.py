@@ -103,7 +103,6 @@ PICTURES: dict[str, tuple[str, ...]] = {
         "facediff retarget hello.npz --target-mesh face.obj -o mine.glb --correspondence map.npz --show {picture}",
     ),
     "own_mesh_picking.png": (BROWSER + "picking_picture.py {picture}",),
-    "puppet_editions.webp": ("python {root}/tools/puppet_sheet.py {picture} --editions",),
     "puppet_head.webp": ("python {root}/tools/puppet_sheet.py {picture}",),
     "regions.png": ("facediff data regions {corpus} -o {picture}",),
     "study_narrow.png": (*STUDY, f"{RATING} --width 390 --height 844"),

@@ -1,11 +1,9 @@
-"""Draw the head of the built-in corpus's second edition: views, expressions, speech sounds, wireframe and people.
+"""Draw the head of the built-in corpus: views, expressions, speech sounds, wireframe and people.
 
     python tools/puppet_sheet.py docs/images/puppet_head.webp
-    python tools/puppet_sheet.py docs/images/puppet_editions.webp --editions
 
 Rows: front, three quarters, side, wireframe; rest, smile, brows up, frown; /a/, /o/, /f/, /m/; open eyes, half a
-blink, a whole blink, a glance; and the ten of the cast. With ``--editions`` the first edition's head
-is above the second one's. Needs the extras ``render`` and ``puppet``.
+blink, a whole blink, a glance; and the ten of the cast. Needs the extras ``render`` and ``puppet``.
 """
 
 from __future__ import annotations
@@ -24,14 +22,10 @@ from facediff.render import contact_sheet  # noqa: E402
 from facediff.render.rasteriser import FIELD_OF_VIEW, Camera, Renderer, opencv  # noqa: E402
 from facediff.spaces.arkit import LEFT_AND_RIGHT  # noqa: E402
 from facediff.synthetic.cast import CAST  # noqa: E402
-from facediff.synthetic.face import build_face  # noqa: E402
-from facediff.synthetic.geometry import HeadMesh  # noqa: E402
 from facediff.synthetic.head.mesh import QuadMesh  # noqa: E402
 from facediff.synthetic.head.parts import build_head  # noqa: E402
 from facediff.synthetic.head.people import Complexion, coloured, dressed  # noqa: E402
 from facediff.synthetic.head.rig import head_shapes  # noqa: E402
-from facediff.synthetic.rig import CONTROLS, build_rig  # noqa: E402
-from facediff.synthetic.speakers import SPEAKERS  # noqa: E402
 
 Points = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -93,16 +87,15 @@ def main() -> None:
     """Draw the sheet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output", type=Path, help="a .webp file")
-    parser.add_argument("--editions", action="store_true", help="draw the first edition's head above the second one's")
     options = parser.parse_args()
-    pictures, labels = editions() if options.editions else sheet()
+    pictures, labels = sheet()
     Image.fromarray(contact_sheet(pictures, 4, labels=labels)).save(options.output, quality=85, method=6)
     mesh = build_head()
     print(f"{options.output}: {len(mesh.vertices)} vertices, {len(mesh.quads)} quads")
 
 
 def sheet() -> tuple[list[Picture], list[str]]:
-    """Everything that the second edition's head can do, with labels."""
+    """Everything that the head can do, with labels."""
     mesh = build_head()
     average = coloured(mesh, Complexion())
     pictures = [draw(mesh, mesh.vertices, camera((0, -25, 0), turn, 350), average) for turn in (0, 40, 90)]
@@ -122,30 +115,7 @@ def sheet() -> tuple[list[Picture], list[str]]:
     return pictures, labels
 
 
-def editions() -> tuple[list[Picture], list[str]]:
-    """A speaker of the first edition above one of the second: at rest, from the side, saying /a/, and blinking."""
-    first, rig, mesh, member = build_face(), build_rig(SPEAKERS["F1"].shape), build_head(), CAST["F1"]
-    rest, colours = dressed(member.face, mesh, member.complexion), coloured(mesh, member.complexion)
-    pictures, labels = [], []
-    for name, old, new, turn in (
-        ("rest", {}, {}, 0),
-        ("three quarters", {}, {}, 35),
-        ("/a/", {"jaw_open": 1.0}, EXPRESSIONS["/a/"], 20),
-        ("a whole blink", {"lids_close": 1.0}, {"eyeBlink": 1.0}, 0),
-    ):
-        weights = np.array([[old.get(control, 0.0) for control in CONTROLS]])
-        moved = 1000.0 * rig.pose(weights)[0]
-        pictures.append(draw(first, moved, camera((0, 0, 0), turn, 330), first.colours, 1000.0 * rig.neutral))
-        labels.append(f"first edition, {name}")
-        points = rest + member.face(posed(new)) - member.face(mesh.vertices)
-        pictures.append(draw(mesh, points, camera((0, -25, 0), turn, 350), colours, rest))
-        labels.append(f"second edition, {name}")
-    return pictures[::2] + pictures[1::2], labels[::2] + labels[1::2]
-
-
-def draw(
-    mesh: QuadMesh | HeadMesh, vertices: Points, view: Camera, colours: Picture, rest: Points | None = None
-) -> Picture:
+def draw(mesh: QuadMesh, vertices: Points, view: Camera, colours: Picture, rest: Points | None = None) -> Picture:
     """One picture; ``rest`` is the face at rest where it is not the mesh's own."""
     template = mesh.vertices if rest is None else rest
     return Renderer(mesh.faces, template=template, size=SIZE, camera=view, colours=colours).render(vertices)

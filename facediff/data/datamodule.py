@@ -99,7 +99,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         circulating: facts about the copies that circulate.
         makes_itself: whether ``prepare_data`` makes the corpus where it is missing.
         languages: codes of the languages that are spoken in it.
-        former_options: values of options that came later, for checkpoints that were trained before these.
 
     Attributes:
         pair_sentences: whether neighbours in training batches speak the same sentence; a model that learns from such
@@ -167,7 +166,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     circulating: ClassVar[Circulating] = Circulating()
     makes_itself: ClassVar[bool] = False
     languages: ClassVar[tuple[str, ...]] = ()
-    former_options: ClassVar[dict[str, Any]] = {}
 
     @keeps_arguments
     def __init__(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -15,24 +14,17 @@ import torch
 from torch import Tensor
 
 from facediff import registry
-from facediff import synthetic as puppet
 from facediff.data.corpus import Clip, Corpus
 from facediff.data.datamodule import Count, SpeechMotionDataModule, person_name
 from facediff.data.manifest import read_manifest
 from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, ClipStorage
 from facediff.errors import FaceDiffError
-from facediff.mesh import Mesh
 from facediff.spaces import Rotation, Space
-from facediff.synthetic import corpus as puppet_corpus
-from facediff.synthetic import second_edition
+from facediff.synthetic import corpus as puppet
 from facediff.synthetic.cast import CAST, MOST_DRAWN, SEEN, UNSEEN, drawn_names
-from facediff.synthetic.face import build_face
-from facediff.synthetic.further_speech import further_speech, said
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.known_faces import built_in_rig as built_in_rig
 from facediff.synthetic.recordings import ALIGNED, speakers_of
-from facediff.synthetic.rig import eyelid_pairs
-from facediff.synthetic.speakers import MOST_DRAWN as FIRST_MOST_DRAWN
 from facediff.synthetic.voices import in_language
 from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
@@ -40,115 +32,24 @@ from facediff.utils.licences import Commercial
 from facediff.utils.ranges import Range
 from facediff.utils.workers import processors
 
-
-@dataclass(frozen=True)
-class FirstEdition:
-    """The first edition: a face of 1 008 vertices that a rig of 21 controls moves, and one synthesiser.
-
-    Attributes:
-        seed: of what is left to chance.
-        drawn: how many drawn speakers there are.
-        people: voices of people; this edition has none.
-    """
-
-    seed: int = 0
-    drawn: int = 0
-    people: tuple[str, ...] = ()
-    generator: ClassVar[str] = puppet.GENERATOR
-    unseen: ClassVar[tuple[str, ...]] = puppet.UNSEEN_IDENTITIES
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of the face."""
-        return puppet.N_VERTICES
-
-    def make(self, root: Path) -> None:
-        """Write the corpus, unless the folder holds it already."""
-        if not puppet.is_complete(root, seed=self.seed, drawn=self.drawn):
-            workers = min(4, processors()) if self.drawn else 1
-            puppet.generate(root, seed=self.seed, drawn=self.drawn, workers=workers)
-
-    def split_of(self, clip: Clip) -> str | None:
-        """By speaker and sentence number, like BIWI."""
-        seen = clip.identity in puppet.SEEN_IDENTITIES
-        if clip.number in puppet.TEST_SENTENCES:
-            return "test_a" if seen else "test_b"
-        if not seen:
-            return None
-        return "train" if clip.number in puppet.TRAIN_SENTENCES else "val"
-
-    def further_speech(self, identities: tuple[str, ...]) -> Callable[[int], npt.NDArray[np.float32]]:
-        """Random words by these speakers."""
-        return partial(further_speech, identities=identities)
-
-    def say(self, text: str, number: int, language: str) -> npt.NDArray[np.float32]:
-        """A text by one of the seen speakers."""
-        return said(text, puppet.SEEN_IDENTITIES[number % len(puppet.SEEN_IDENTITIES)], language)
-
-    def eyelid_pairs(self) -> Tensor | None:
-        """Of the mesh, for folders that come from a version without such a file."""
-        return torch.from_numpy(np.stack(eyelid_pairs(build_face()), 1))
-
-
-@dataclass(frozen=True)
-class SecondEdition:
-    """The second edition: a head that ARKit's 52 shapes move, and several synthesisers; attributes as in the first."""
-
-    seed: int = 0
-    drawn: int = 0
-    people: tuple[str, ...] = ()
-    generator: ClassVar[str] = second_edition.GENERATOR
-    unseen: ClassVar[tuple[str, ...]] = UNSEEN
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of the head."""
-        return second_edition.vertex_count()
-
-    def make(self, root: Path) -> None:
-        """Write the corpus, unless the folder holds it already."""
-        workers = min(4, processors()) if self.drawn else 1
-        second_edition.generate_second(root, seed=self.seed, drawn=self.drawn, people=self.people, workers=workers)
-
-    def split_of(self, clip: Clip) -> str | None:
-        """By the table of clips."""
-        split = clip.attributes.get("split")
-        return None if split == "references" else split
-
-    def further_speech(self, identities: tuple[str, ...]) -> Callable[[int], npt.NDArray[np.float32]]:
-        """Random words by these speakers."""
-        return partial(second_edition.spoken_words, identities=identities, people=self.people)
-
-    def say(self, text: str, number: int, language: str) -> npt.NDArray[np.float32]:
-        """A text by one of the seen speakers, in neutral mood."""
-        speaker = SEEN[number % len(SEEN)]
-        voice = f"espeak:{in_language(CAST[speaker].voice.removeprefix('espeak:'), language)}"
-        clip = second_edition.PerformedClip(speaker, "train", 1, text, "neutral", voice)
-        return second_edition.speak_clip(clip).samples
-
-    def eyelid_pairs(self) -> Tensor | None:
-        """None: every folder has the file."""
-        return None
-
-
 TURNS = ("Head", "LeftEye", "RightEye")
-"""What turns as a whole in the channels of the second edition, by yaw, pitch and roll each, as in Live Link Face."""
+"""What turns as a whole in the corpus's channels, by yaw, pitch and roll each, as in Live Link Face."""
 
 
 def channel_space() -> Space:
-    """The space of the second edition's channels: ARKit's shapes and two of the tongue, head and gaze in radians.
+    """The space of the corpus's channels: ARKit's shapes and two of the tongue, head and gaze in radians.
 
     Yaw is to the face's left, pitch down, roll towards its right shoulder: turns about y, x and z, as facediff.spaces
     takes Euler angles.
     """
     named = tuple(f"{turn}{angle}" for turn in TURNS for angle in ("Yaw", "Pitch", "Roll"))
-    identity = f"{puppet_corpus.CORPUS} {second_edition.GENERATOR} {' '.join(SHAPES)}"
+    identity = f"{puppet.CORPUS} {puppet.GENERATOR} {' '.join(SHAPES)}"
     first = len(SHAPES)
     return Space(
         "arkit",
         (*SHAPES, *named),
         version="arkit",
-        rig=puppet_corpus.CORPUS,
+        rig=puppet.CORPUS,
         # The shapes follow from the generator, to the last digit only on one machine.
         rig_hash=hashlib.sha256(identity.encode()).hexdigest()[:16],
         rotations=(
@@ -162,7 +63,7 @@ def channel_space() -> Space:
 
 
 class PuppetChannels(ChannelFolder):
-    """Weights, head and gaze of the second edition as channels of :func:`channel_space`."""
+    """Weights, head and gaze as channels of :func:`channel_space`."""
 
     folder = WEIGHTS_FOLDER
 
@@ -185,36 +86,26 @@ class PuppetChannels(ChannelFolder):
         return np.concatenate([weights, turns], axis=1).astype(np.float32)
 
 
-EDITIONS: dict[int, type[FirstEdition] | type[SecondEdition]] = {1: FirstEdition, 2: SecondEdition}
-
-
-def cache_root(edition: FirstEdition | SecondEdition) -> Path:
-    """Where an edition is kept: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    more = f"-drawn{edition.drawn}" if edition.drawn else ""
-    more += f"-people{len(edition.people)}" if edition.people else ""
+def cache_root(seed: int = 0, drawn: int = 0, people: Sequence[str] = ()) -> Path:
+    """The corpus's folder: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
+    more = f"-drawn{drawn}" if drawn else ""
+    more += f"-people{len(people)}" if people else ""
     # Two folders of recordings may have equally many speakers.
-    if edition.people and edition.people[0].startswith(ALIGNED):
-        more += "-" + hashlib.sha256("\n".join(edition.people).encode()).hexdigest()[:8]
-    return cache_dir() / f"puppet-{edition.generator}-seed{edition.seed}{more}"
+    if people and people[0].startswith(ALIGNED):
+        more += "-" + hashlib.sha256("\n".join(people).encode()).hexdigest()[:8]
+    return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
 
 
 def made_root(seed: int) -> Path | None:
-    """An existing folder of :func:`cache_root`, of the second edition if there is one; None if there is none."""
-    usual = [cache_root(edition(seed)) for edition in (SecondEdition, FirstEdition)]
-    folders = [path for root in usual for path in (root, *sorted(root.parent.glob(f"{root.name}-*")))]
-    return next((folder for folder in folders if folder.is_dir()), None)
+    """An existing folder of :func:`cache_root`; None if there is none."""
+    root = cache_root(seed)
+    return next((folder for folder in (root, *sorted(root.parent.glob(f"{root.name}-*"))) if folder.is_dir()), None)
 
 
-def edition_of(root: Path) -> int | None:
-    """The edition in a folder; None if it holds none."""
-    generator = str(read_manifest(root).get("generator", ""))
-    return int(generator[0]) if generator[:1] in ("1", "2") else None
-
-
-def built_in_mesh() -> Mesh:
-    """The mesh of the built-in corpus, with its colours."""
-    face = build_face()
-    return Mesh(face.vertices, face.faces.astype("int32"), face.colours)
+def split_in_table(clip: Clip) -> str | None:
+    """The split that the corpus's table of clips names; None for style references."""
+    split = clip.attributes.get("split")
+    return None if split == "references" else split
 
 
 @registry.corpus.register("Puppet")
@@ -223,19 +114,18 @@ class Puppet(SpeechMotionDataModule):
 
     Synthetic: scores on it say nothing about real people. 25 frames per second, metres. Six seen speakers say 32
     sentences in training and 10 on test A, four unseen ones 10 on test B, and test C has voices that nobody is trained
-    with. The first edition has a face of 1 008 vertices, six and two speakers, and 24 and 5 sentences of each.
+    with.
 
     Args:
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
         drawn_speakers: how many speakers with random voice, face and speaking style also say training sentences.
             The test splits do not change.
-        edition: 1 or 2; the one in the folder if None, and the second where there is none yet.
         people_voices: let every second drawn speaker speak with a voice made from recordings of people, as far as flite
             and Festival are installed.
         recordings: folder of people's recordings, ``SPEAKER/NAME.wav`` or ``.flac`` with ``NAME.TextGrid``: each drawn
             speaker speaks with those of one person.
-        motion: ``vertices``, or ``arkit`` for the second edition's truth as it is kept: ARKit's 52 shapes and two of
+        motion: ``vertices``, or ``arkit`` for the truth as it is kept: ARKit's 52 shapes and two of
             the tongue, the turns of head and eyes; see docs/parameters.md.
         batch_size: clips a batch; used where no frame budget is given.
         options: those of every data module.
@@ -246,11 +136,10 @@ class Puppet(SpeechMotionDataModule):
     makes_itself: ClassVar[bool] = True
     unit = puppet.UNIT
     frame_rate: ClassVar[float] = float(puppet.FRAME_RATE)
-    n_vertices = puppet.N_VERTICES
+    n_vertices = puppet.vertex_count()
     identities = list(SEEN)
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
-    former_options: ClassVar[dict[str, Any]] = {"edition": 1}
     # Face and motion come from this package's code. The program espeak-ng, which speaks, is under the GPL 3, whose
     # terms cover the program and not its output (gnu.org/licenses/gpl-faq.html#GPLOutput).
     licence: ClassVar[str] = "Apache-2.0"
@@ -264,7 +153,6 @@ class Puppet(SpeechMotionDataModule):
         root: str | None = None,
         seed: Annotated[int, Range(0, 2**32 - 1)] = 0,
         drawn_speakers: Annotated[int, Range(0, MOST_DRAWN)] = 0,
-        edition: Literal[1, 2] | None = None,
         people_voices: bool = False,
         recordings: str | None = None,
         motion: Literal["vertices", "arkit"] = "vertices",
@@ -274,42 +162,34 @@ class Puppet(SpeechMotionDataModule):
     ) -> None:
         if people_voices and recordings is not None:
             raise FaceDiffError("data.people_voices and data.recordings both say who speaks; give one of them")
-        people = second_edition.people_voices() if people_voices else ()
+        people = puppet.people_voices() if people_voices else ()
         if recordings is not None:
             people = tuple(f"{ALIGNED}:{speaker}" for speaker in speakers_of(Path(recordings).expanduser().absolute()))
-        facts = EDITIONS[edition or 2](seed, drawn_speakers, people)
         drawn = drawn_names(drawn_speakers)
         super().__init__(
-            root=str(cache_root(facts)) if root is None else root,
+            root=str(cache_root(seed, drawn_speakers, people)) if root is None else root,
             batch_size=batch_size,
             extra_identities=[*(extra_identities or []), *drawn],
             **options,
         )
-        stored = None if edition or root is None else edition_of(self.root)
-        self.edition = facts if stored is None else EDITIONS[stored](seed, drawn_speakers, people)
-        asks_people = people_voices or recordings is not None  # whether or not such a voice is installed
-        if isinstance(self.edition, FirstEdition) and (asks_people or drawn_speakers > FIRST_MOST_DRAWN):
+        if str(read_manifest(self.root).get("generator", "")).startswith("1."):
             raise FaceDiffError(
-                f"data.edition: the first has no voices of people and {FIRST_MOST_DRAWN} drawn speakers at most; "
-                f"choose the second, or leave data.people_voices and data.recordings out"
+                f"{self.root}: holds the first edition of the built-in corpus, which 1.1 was the last to read; choose "
+                f"another folder, or remove it"
             )
-        self.n_vertices = self.edition.n_vertices
+        self.seed, self.drawn, self.voices = seed, drawn, people
         if motion != "vertices":
-            if isinstance(self.edition, FirstEdition):
-                raise FaceDiffError(
-                    f"data.motion={motion}: the first edition of the built-in corpus has no such weights; choose "
-                    f"data.edition=2"
-                )
             self.space = channel_space()
             self.n_vertices = len(self.space.channels)
-        self.compared_speakers = (*SEEN, *self.edition.unseen)
+        self.compared_speakers = (*SEEN, *UNSEEN)
         # The first identity is animated unless another is named, so it is one of the cast, not a drawn one.
         self.identities = [*(name for name in self.identities if name not in drawn), *drawn]
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
         if self.packed is None:
-            self.edition.make(self.root)
+            workers = min(4, processors()) if self.drawn else 1
+            puppet.generate(self.root, seed=self.seed, drawn=len(self.drawn), people=self.voices, workers=workers)
         super().prepare_data()
 
     def channel_folder(self) -> ClipStorage:
@@ -321,38 +201,35 @@ class Puppet(SpeechMotionDataModule):
         """The corpus as vertices."""
         if self.space.is_vertices:
             return self.corpus
-        return Corpus(self.root, self.edition.n_vertices, self.frame_rate, parse=self.parse_name)
+        return Corpus(self.root, type(self).n_vertices, self.frame_rate, parse=self.parse_name)
 
     def deltas(self) -> dict[str, Tensor]:
         """The shapes of those of the cast; drawn speakers have theirs in the corpus's folder only."""
         files = {name: self.root / RIGS_FOLDER / f"{name}.npy" for name in sorted(self.corpus.templates)}
         return {
-            name: torch.from_numpy(np.array(open_vertices(file, self.edition.n_vertices)[1:], np.float32))
+            name: torch.from_numpy(np.array(open_vertices(file, type(self).n_vertices)[1:], np.float32))
             for name, file in files.items()
             # An imported speaker has no shapes: the mean of all others' moves their face.
             if self.stores_reference(name) and (file.is_file() or name not in map(person_name, self.people))
         }
 
-    def eyelid_pairs(self) -> Tensor | None:
-        """The corpus folder's pairs, or the mesh's own where the folder comes from a version without such a file."""
-        pairs = super().eyelid_pairs()
-        return self.edition.eyelid_pairs() if pairs is None else pairs
-
     def split_of(self, clip: Clip) -> str | None:
-        """By speaker and sentence number, like BIWI; the second edition's table of clips says it."""
-        return self.edition.split_of(clip)
+        """By the table of clips."""
+        return split_in_table(clip)
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
         """Random words by the training speakers."""
-        return self.edition.further_speech(tuple(self.identities))
+        return partial(puppet.spoken_words, identities=tuple(self.identities), people=self.voices)
 
     def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
-        """A text by one of the seen speakers, who take turns."""
-        return self.edition.say(text, number, language)
+        """A text by one of the seen speakers in neutral mood; they take turns."""
+        speaker = SEEN[number % len(SEEN)]
+        voice = f"espeak:{in_language(CAST[speaker].voice.removeprefix('espeak:'), language)}"
+        return puppet.speak_clip(puppet.PerformedClip(speaker, "train", 1, text, "neutral", voice)).samples
 
     def stores_reference(self, identity: str) -> bool:
         """Those of the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""
-        return identity not in drawn_names(self.edition.drawn)
+        return identity not in self.drawn
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""
@@ -363,8 +240,8 @@ class Puppet(SpeechMotionDataModule):
 class PuppetMask(SpeechMotionDataModule):
     """A second corpus by the same code, to try models on another one: a mask of 23 550 vertices, 30 frames a second.
 
-    Synthetic. Eight seen speakers and four unseen ones, whom the first corpus does not have, say the sentences of its
-    first edition: 1–24 train, 25–27 validate, 28–32 test A and B. Metres.
+    Synthetic. Eight seen speakers and four unseen ones, whom the first corpus does not have, say 32 other sentences:
+    1–24 train, 25–27 validate, 28–32 test A and B. Metres.
 
     Args:
         root: the corpus folder; the user's cache folder if None.
@@ -377,10 +254,10 @@ class PuppetMask(SpeechMotionDataModule):
     synthetic: ClassVar[bool] = True
     makes_itself: ClassVar[bool] = True
     unit = puppet.UNIT
-    frame_rate: ClassVar[float] = float(second_edition.MASK.frame_rate)
-    n_vertices = second_edition.vertex_count(second_edition.MASK)
-    identities = list(second_edition.MASK_SEEN)
-    mesh_files: ClassVar[tuple[str, ...]] = (second_edition.MASK.mesh_file,)
+    frame_rate: ClassVar[float] = float(puppet.MASK.frame_rate)
+    n_vertices = puppet.vertex_count(puppet.MASK)
+    identities = list(puppet.MASK_SEEN)
+    mesh_files: ClassVar[tuple[str, ...]] = (puppet.MASK.mesh_file,)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
     licence: ClassVar[str] = Puppet.licence
     languages: ClassVar[tuple[str, ...]] = ("en",)
@@ -395,21 +272,19 @@ class PuppetMask(SpeechMotionDataModule):
         batch_size: Count = 8,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        folder = cache_dir() / f"puppet-mask-{second_edition.GENERATOR}-seed{seed}"
+        folder = cache_dir() / f"puppet-mask-{puppet.GENERATOR}-seed{seed}"
         super().__init__(root=str(folder) if root is None else root, batch_size=batch_size, **options)
         self.seed = seed
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
         if self.packed is None:
-            second_edition.generate_second(
-                self.root, seed=self.seed, workers=min(4, processors()), production=second_edition.MASK
-            )
+            puppet.generate(self.root, seed=self.seed, workers=min(4, processors()), production=puppet.MASK)
         super().prepare_data()
 
     def split_of(self, clip: Clip) -> str | None:
         """By the table of clips."""
-        return SecondEdition().split_of(clip)
+        return split_in_table(clip)
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""

@@ -240,9 +240,9 @@ def has_arkit_weights(animation: Animation) -> bool:
 
 def is_built_in_face(vertices: int, faces: npt.NDArray[np.integer] | None) -> bool:
     """Whether a mesh of so many vertices with these triangles is one of the built-in faces."""
-    from facediff.synthetic.known_faces import edition_of_mesh
+    from facediff.synthetic.known_faces import is_built_in
 
-    return faces is not None and edition_of_mesh(vertices, faces) is not None
+    return faces is not None and is_built_in(vertices, faces)
 
 
 def arkit_weights(animation: Animation) -> Weights:

@@ -59,12 +59,11 @@ def brows_of(
         weights = region_factors(template, {REGION: named}, {REGION: 1.0, ALL: 0.0})
         up = weights[:, None] * np.array([0.0, 1.0, 0.0])
         return Brows(_one_millimetre(up, unit), _one_millimetre(-up, unit))
-    from facediff.synthetic.face import build_face
-    from facediff.synthetic.known_faces import known_face, resting_faces
+    from facediff.synthetic.known_faces import built_in_shapes, known_face
 
     puppet = known_face(template, faces)
-    if puppet is None:  # those of a speaker of the first edition, whose mesh is small
-        neutral, triangles = resting_faces(1)["F1"], build_face().faces
+    if puppet is None:
+        neutral, triangles, _ = built_in_shapes("F1")
         lender = known_face(neutral, triangles)
         assert lender is not None  # noqa: S101 - for type checkers
         moved = carried(neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)

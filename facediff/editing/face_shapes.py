@@ -15,13 +15,12 @@ Fields = Mapping[str, npt.NDArray[np.float32]]
 
 def own_shapes(template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None) -> Fields | None:
     """Displacements (V, 3) by ARKit's names of a built-in face in metres; None for any other face."""
-    from facediff.synthetic.known_faces import built_in_rig, edition_of_mesh, known_face
+    from facediff.synthetic.known_faces import built_in_rig, known_face
 
-    edition = None if faces is None else edition_of_mesh(len(template), faces)
     puppet = known_face(template, faces)
-    if edition is None or puppet is None:
+    if puppet is None:
         return None
-    rig = built_in_rig(puppet.speaker, edition)
+    rig = built_in_rig(puppet.speaker)
     return dict(zip(rig.names, rig.deltas.astype(np.float32), strict=True))
 
 
@@ -39,7 +38,7 @@ def shapes_of(
     from facediff.editing.brows import carried
     from facediff.synthetic.known_faces import built_in_rig
 
-    rig = built_in_rig("F1", 1)
+    rig = built_in_rig("F1")
     assert rig.faces is not None  # noqa: S101 - for type checkers
     deltas = np.stack([rig.deltas[rig.names.index(name)] for name in names])
     moved = carried(rig.neutral, rig.faces, deltas, template, faces)

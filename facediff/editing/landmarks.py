@@ -8,18 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.editing.face_features import Features, Opening, find_features
 from facediff.errors import FaceDiffError, choices
-from facediff.synthetic.face import N_VERTICES, build_face
-from facediff.synthetic.geometry import HeadMesh
-from facediff.synthetic.head.mesh import QuadMesh
 from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
 from facediff.utils.limits import check_format
 from facediff.utils.plain_files import load_json, read_table, write_json
@@ -76,33 +72,27 @@ No list was found for BIWI (23370 vertices), and Multiface's authors say that th
 """
 
 
-def puppet_landmarks(edition: Literal[1, 2] = 1) -> dict[str, int]:
-    """Vertices of the built-in face, of the corpus's first edition or of the second one.
+def puppet_landmarks() -> dict[str, int]:
+    """Vertices of the built-in head.
 
     Example:
         >>> puppet_landmarks()["nose_tip"]
-        124
+        704
     """
-    face: HeadMesh | QuadMesh = build_face() if edition == 1 else build_head()
-    points = 1000.0 * face.vertices if edition == 1 else face.vertices
-    lips, eyes = ("mouth_0", "eye_0") if edition == 1 else ("lip_border", "eye_edge")
-    border, front, eye = face.groups[lips], face.groups["lip_front"], face.groups[eyes]
-    middle = np.flatnonzero(face.mirror == np.arange(len(points)))
+    face = build_head()
+    points, border, eye = face.vertices, face.groups["lip_border"], face.groups["eye_edge"]
+    front, middle = face.groups["lip_front"], np.flatnonzero(face.mirror == np.arange(len(points)))
     # Of the skin in front: without the crown, the teeth and the inside of the mouth.
     middle = middle[np.isin(middle, face.groups["skin"]) & (points[middle, 2] > 30.0)]
     height, depth = points[middle, 1], points[middle, 2]
     tip, level = middle[depth.argmax()], points[eye[0], 1]
-    if edition == 1:
-        nose = middle[np.isin(middle, face.groups["nose"])]
-        base = nose[points[nose, 1].argmin()]
-    else:  # the nose begins where the profile lies furthest back between its tip and the lips
-        nose = middle
-        base = middle[np.where((height < points[tip, 1]) & (height > points[border[0], 1]), depth, np.inf).argmin()]
+    # The nose begins where the profile lies furthest back between its tip and the lips.
+    base = middle[np.where((height < points[tip, 1]) & (height > points[border[0], 1]), depth, np.inf).argmin()]
     left = {"mouth_corner": border[len(border) // 2], "eye_outer": eye[len(eye) // 2], "eye_inner": eye[0]}
     vertices = {
         "nose_tip": tip,
         "chin": middle[np.where(height < points[border[-1], 1] - 10.0, depth, -1.0).argmax()],
-        "nose_bridge": nose[np.abs(points[nose, 1] - level).argmin()],
+        "nose_bridge": middle[np.abs(height - level).argmin()],
         "nose_base": base,
         "upper_lip_top": border[0],
         "lower_lip_bottom": border[-1],
@@ -144,8 +134,8 @@ def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.in
         faces: (F, 3).
 
     Example:
-        >>> face = build_face()
-        >>> known_landmarks(1000 * face.vertices, face.faces).topology
+        >>> head = build_head()
+        >>> known_landmarks(head.vertices, head.faces).topology
         'puppet'
     """
     by_topology = known_topology(vertices)
@@ -158,8 +148,7 @@ def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
     """The named places of a mesh of a known topology; None of another one."""
     points = np.asarray(vertices, np.float64)
     for topology, count, table in (
-        ("puppet", N_VERTICES, puppet_landmarks),
-        ("puppet", N_HEAD_VERTICES, partial(puppet_landmarks, 2)),
+        ("puppet", N_HEAD_VERTICES, puppet_landmarks),
         ("FLAME", FLAME_VERTICES, FLAME.copy),
     ):
         if len(points) == count and _lie_as_on_a_face(points, landmarks := table()):

@@ -179,15 +179,15 @@ def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -
 
 def built_in_files(template: Array | None = None) -> ShapeFiles:
     """The built-in shapes: of the speaker with the face nearest to a template (V, 3) in metres, or the common ones."""
-    from facediff.synthetic.known_faces import built_in_shapes, edition_of_mesh, resting_faces
+    from facediff.synthetic.known_faces import built_in_shapes, is_built_in, resting_heads
 
-    edition, nearest = None if template is None else edition_of_mesh(len(template)), None
-    if template is not None and edition is not None:
-        at_rest: dict[str | None, Array] = {None: built_in_shapes(None, edition)[0]}
-        at_rest.update(resting_faces(edition).items())
+    nearest = None
+    if template is not None and is_built_in(len(template)):
+        at_rest: dict[str | None, Array] = {None: built_in_shapes()[0]}
+        at_rest.update(resting_heads().items())
         centred = template - template.mean(0)
         nearest = min(at_rest, key=lambda name: np.square(at_rest[name] - at_rest[name].mean(0) - centred).sum())
-    neutral, faces, shapes = built_in_shapes(nearest, edition or 2)
+    neutral, faces, shapes = built_in_shapes(nearest)
     points = np.stack(list(shapes.values()))
     path = Path(BUILT_IN)
     return ShapeFiles(path, path, tuple(shapes), points, neutral, faces, metric=True, rest=BUILT_IN)

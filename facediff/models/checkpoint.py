@@ -190,7 +190,8 @@ def corpus_of(path: Path | str, checkpoint: Mapping[str, Any]) -> tuple[type[Spe
     module = corpus_class(path, source)
     # An imported model knows its corpus, but not where its folder is.
     saved = checkpoint.get("datamodule_hyper_parameters")
-    stored = {**module.former_options, **saved} if saved else {name: source[name] for name in source.keys() & {"root"}}
+    stored = saved if saved else {name: source[name] for name in source.keys() & {"root"}}
+    stored = without_removed_options({"class_path": source.get("class_path"), "init_args": stored}, path)["init_args"]
     options = {name: value for name, value in stored.items() if not name.startswith("_")}
     # A folder that training was given relative to its working folder is found from another one.
     root, trained = options.get("root"), source.get("root")

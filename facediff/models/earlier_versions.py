@@ -1,4 +1,4 @@
-"""Options that models and components had in 1.x and have no more, for checkpoints and configs that still state them.
+"""Options that classes had in 1.x and have no more, for checkpoints and configs that still state them.
 
 An option that went had one value in practice. A file that states this value means what the present version does, and
 the option is dropped; another value asks for something that is gone, and is refused.
@@ -22,8 +22,10 @@ REMOVED: dict[str, dict[str, Any]] = {
     "facediff.models.audio_encoders.MelEncoder": {"n_mels": 64},
     "facediff.models.mesh_encoders.SpiralMeshEncoder": {"negative_slope": 0.2, "max_frames": None},
     "facediff.models.speaker_encoders.HierarchicalIdentity": {"unseen": "mean"},
+    "facediff.data.puppet.Puppet": {"edition": (None, 2)},
 }
-"""By class path, the removed options and the value that each has for good, as plain data of a checkpoint."""
+"""By class path, the removed options and the value that each has for good, as plain data of a checkpoint; a tuple
+holds several such values."""
 
 SHORT_NAMES = {"mel": "MelEncoder", "spiral": "SpiralMeshEncoder", "hierarchical": "HierarchicalIdentity"}
 """Registered names of components of :data:`REMOVED`, by which configs and checkpoints name them, and their classes."""
@@ -59,10 +61,12 @@ def _present(class_path: object, options: Mapping[str, Any], source: object) -> 
     """The options of a class that it still has."""
     removed = _removed_of(class_path)
     for name in removed.keys() & options.keys():
-        if _plain(options[name]) != removed[name]:
+        usual = removed[name] if isinstance(removed[name], tuple) else (removed[name],)
+        if _plain(options[name]) not in usual:
+            now = " or ".join(map(str, usual))
             raise FaceDiffError(
                 f"{source}: {name}={options[name]} of {class_path} is an option of facediff 1.1 that is gone (it is "
-                f"{removed[name]} now); use facediff 1.1 for this file, or train the model again without the option"
+                f"{now} now); use facediff 1.1 for this file, or train the model again without the option"
             )
     return {name: value for name, value in options.items() if name not in removed}
 

@@ -28,7 +28,7 @@ from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import even, read_parameters
 from facediff.spaces.rigs import decode_flame
 from facediff.spaces.rotations import convert
-from facediff.synthetic.known_faces import edition_of_mesh
+from facediff.synthetic.known_faces import is_built_in
 from facediff.synthetic.spoken_set import SPEAKER, OpenFace, SpokenClip, SpokenMotion, open_face
 from facediff.utils import SAMPLE_RATE, ranges
 
@@ -149,9 +149,9 @@ class Placement:
         still = animation.still()
         if still.faces is None and self.flame is not None and len(still.template) == self.flame.n_vertices:
             still = replace(still, faces=np.asarray(self.flame.faces, np.int32))
-        if still.faces is None and edition_of_mesh(len(still.template)) != 2:
+        if still.faces is None and not is_built_in(len(still.template)):
             raise FaceDiffError("its vertices come without triangles, so that they cannot be put on another face")
-        if edition_of_mesh(len(still.template), still.faces) == 2:
+        if is_built_in(len(still.template), still.faces):
             self.way = "the same topology"
             metres, points = metres_per_unit(still.unit), self.face.points
             moved = np.asarray(still.vertices[:, points], np.float64) - still.template[points]

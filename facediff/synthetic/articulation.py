@@ -17,8 +17,13 @@ import numpy as np
 
 from facediff.spaces.arkit import LEFT_AND_RIGHT
 from facediff.speech.espeak import SpokenPhoneme
-from facediff.synthetic.geometry import Array
-from facediff.synthetic.motion import UNHURRIED, rounded, shut_lips
+from facediff.synthetic.geometry import Array, rise
+
+_ROUND_TOP = 0.018
+_SURELY_SHUT = 0.028
+UNHURRIED = 0.11
+_CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
+"""Shortest and longest time in seconds that the lips take to meet and to part."""
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.
 _VOWELS: dict[str, tuple[float, float, float]] = {
@@ -230,8 +235,8 @@ def _blend_block(sounds: Sequence[SpeechSound], times: Array, spread: float) -> 
     start, end = (np.array([getattr(sound, name) for sound in sounds]) for name in ("start", "end"))
     # A target holds in the sound's middle part and fades from there towards both borders.
     core = 0.25 * (end - start)
-    before = rounded(np.maximum(start + core - times[:, None], 0.0))
-    after = rounded(np.maximum(times[:, None] - end + core, 0.0))
+    before = _rounded(np.maximum(start + core - times[:, None], 0.0))
+    after = _rounded(np.maximum(times[:, None] - end + core, 0.0))
     reach = spread * np.array([sound.articulation.reach for sound in sounds])
     weights = np.zeros((len(times), len(SPEECH_SHAPES)))
     for column, shape in enumerate(SPEECH_SHAPES):
@@ -248,4 +253,23 @@ def _blend_block(sounds: Sequence[SpeechSound], times: Array, spread: float) -> 
 
 def lip_closure(sounds: Sequence[SpeechSound], times: Array) -> Array:
     """How firmly the lips are shut (n,), 0 to 1: 1 from before the start to past the middle of every p, b and m."""
-    return shut_lips([(sound.start, sound.end, sound.articulation.closes) for sound in sounds], times)
+    apart = np.ones_like(times)
+    lengths = [sound.end - sound.start for sound in sounds]
+    for index, (sound, length) in enumerate(zip(sounds, lengths, strict=True)):
+        if sound.articulation.closes:
+            start = sound.start
+            # The lips must be shut in the frame nearest to the middle, which is up to half a frame away.
+            middle = start + 0.5 * length
+            first = min(start + min(0.15 * length, 0.012), middle - _SURELY_SHUT)
+            last = max(start + 0.72 * length, middle + _SURELY_SHUT)
+            # A short vowel between two closures needs time to open.
+            closing = np.clip(0.55 * lengths[index - 1], *_CLOSING) if index > 0 else _CLOSING[1]
+            opening = np.clip(0.55 * lengths[index + 1], *_OPENING) if index + 1 < len(lengths) else _OPENING[1]
+            shut = rise(times, first - float(closing), first) * rise(times, last + float(opening), last)
+            apart *= 1.0 - shut
+    return np.asarray(1.0 - apart)
+
+
+def _rounded(distance: Array) -> Array:
+    """Distance with a rounded start, so that its slope is continuous where a segment's core begins."""
+    return np.asarray(np.sqrt(distance**2 + _ROUND_TOP**2) - _ROUND_TOP)

@@ -1,4 +1,9 @@
-"""Writing the built-in corpus in the layout of BIWI's circulating copies."""
+"""Writing the built-in corpus: heads with a rig, performances, and speech of several voices.
+
+The truth of a clip is kept as weights of ARKit's shapes with gaze and head next to them, and each speaker's rig once: a
+head is a hundred times as many numbers as its weights. ``facediff.data`` decodes them to vertices as it reads a clip.
+Clips that are tested with have their vertices next to them, so that any program can score against them.
+"""
 
 from __future__ import annotations
 
@@ -8,161 +13,420 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import write_wav
-from facediff.speech.espeak import SpokenPhoneme, speak
-from facediff.synthetic.face import build_face
-from facediff.synthetic.geometry import Array
-from facediff.synthetic.motion import FRAME_RATE, analyse, generate_weights, segments_of, visemes_of
-from facediff.synthetic.rig import Rig, build_rig, eyelid_pairs, lip_pairs
-from facediff.synthetic.sentences import SENTENCES
-from facediff.synthetic.speakers import MOST_DRAWN, SPEAKERS, drawn_names, speaker_of
+from facediff.speech.espeak import SpokenPhoneme, Utterance
+from facediff.synthetic.articulation import speech_sounds
+from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
+from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
+from facediff.synthetic.head.parts import AROUND_EYE, N_HEAD_VERTICES, build_head
+from facediff.synthetic.head.people import Complexion, coloured, dressed
+from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
+from facediff.synthetic.performance import MOODS, FaceMotion, perform
+from facediff.synthetic.prosody import analyse
+from facediff.synthetic.recordings import ALIGNED, recordings_of
+from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
+from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder
-from facediff.utils.jobs import in_order, is_cluster, run_tasks
+from facediff.utils.jobs import is_cluster, run_tasks
 from facediff.utils.plain_files import read_json, write_json, write_table
+from facediff.utils.workers import WorkerDied
 
-FORMAT = 1
-GENERATOR = "1.1"
-MANIFEST = "manifest.json"
 CORPUS = "facediff-puppet"
-_SAMPLES_PER_FRAME = SAMPLE_RATE // FRAME_RATE
+MANIFEST = "manifest.json"
+GENERATOR = "2.2"
+FRAME_RATE = 25
+UNIT = "m"  # Of every length in the corpus
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
 _PEAK = 0.6
-
-# Who speaks what in which mood: the clips and their splits.
-
-SEEN_IDENTITIES = ("F1", "F2", "F3", "M1", "M2", "M3")
-UNSEEN_IDENTITIES = ("F4", "M4")
-MOODS = ("flat", "neutral", "lively")
-TRAIN_SENTENCES = tuple(range(1, 25))
-VAL_SENTENCES = tuple(range(25, 28))
-TEST_SENTENCES = tuple(range(28, 33))
-#: Sentences of the unseen speakers that belong to no split, about a minute each: style references, and what a trained
-#: model is adapted with.
-REFERENCE_SENTENCES = tuple(range(1, 25))
+_DRAWS = 7  # Performances of a test sentence of which the one of middle liveliness is taken
+TRAIN_EACH, REFERENCES_EACH, TEST_EACH, TEST_C_EACH = 32, 24, 10, 5
+"""Sentences of each speaker."""
 
 
 @dataclass(frozen=True)
-class SyntheticClip:
-    """One clip of the corpus."""
+class PerformedClip:
+    """One clip.
 
-    identity: str  # Who speaks
-    number: int  # Which sentence, from 1
-    mood: str  # One of `MOODS`
+    Attributes:
+        identity: who speaks.
+        split: ``train``, ``val``, ``test_a``, ``test_b``, ``test_c``, or ``references`` for those of unseen speakers
+            that belong to no split.
+        number: of the sentence in its list, from 1.
+        text: what is said.
+        mood: a name in :data:`facediff.synthetic.performance.MOODS`.
+        voice: what speaks, where it is not the speaker's own voice.
+    """
+
+    identity: str
+    split: str
+    number: int
+    text: str
+    mood: str
+    voice: str = ""
 
     @property
     def sentence(self) -> str:
-        """Name of the sentence, such as ``"e01"``."""
-        return f"e{self.number:02d}"
+        """Name of the sentence, such as ``t07``: training and reference sentences are e, those of test C c."""
+        letter = {"val": "v", "test_a": "t", "test_b": "t", "test_c": "c"}.get(self.split, "e")
+        return f"{letter}{self.number:02d}"
 
     @property
     def name(self) -> str:
-        """Name of the clip and stem of its files, such as ``"F1_e01"``."""
+        """Name of the clip and stem of its files, such as ``F1_t07``."""
         return f"{self.identity}_{self.sentence}"
 
-    def __str__(self) -> str:
-        return self.name
 
+def performed_clips(drawn: int = 0, people: Sequence[str] = ()) -> tuple[PerformedClip, ...]:
+    """All clips, speaker by speaker; moods take turns, so that every speaker has each of them equally often.
 
-def clips(drawn: int = 0) -> tuple[SyntheticClip, ...]:
-    """All clips, speaker by speaker.
-
-    Moods take turns, shifted by one from speaker to speaker, so that every speaker has every mood equally
-    often in training and every sentence is spoken in every mood.
-
-    Args:
-        drawn: How many drawn speakers there are besides the eight. They say the training sentences only.
+    Every speaker says other sentences in training, so that no sentence can be known by heart. On test A and B all
+    speakers have :data:`TEST` sentences that nobody is trained on; on test C the voices are new instead of the faces.
     """
-    everything = (*TRAIN_SENTENCES, *VAL_SENTENCES, *TEST_SENTENCES)
-    plan = [(identity, everything) for identity in SEEN_IDENTITIES]
-    plan += [(identity, (*REFERENCE_SENTENCES, *TEST_SENTENCES)) for identity in UNSEEN_IDENTITIES]
-    plan += [(identity, TRAIN_SENTENCES) for identity in drawn_names(drawn)]
+    plan: list[tuple[str, str, list[tuple[int, str]], str]] = []
+    for place, identity in enumerate(SEEN):
+        plan.append((identity, "train", turn(TRAIN, -6 * place, TRAIN_EACH), ""))
+        plan.append((identity, "val", turn(VALIDATION, place, 3), ""))
+        plan.append((identity, "test_a", turn(TEST, 3 * place, TEST_EACH), ""))
+    for place, identity in enumerate(UNSEEN):
+        plan.append((identity, "references", turn(TRAIN, 17 * place, REFERENCES_EACH), ""))
+        plan.append((identity, "test_b", turn(TEST, 4 * place + 1, TEST_EACH), ""))
+    for identity, voice in zip(SEEN, _voices_of_test_c(), strict=False):
+        texts = turn(GERMAN if voice.startswith("espeak:de") else TEST[-6:], 0, TEST_C_EACH)
+        plan.append((identity, "test_c", texts, voice))
+    moods = tuple(MOODS)
+    for place, name in enumerate(drawn_names(drawn)):
+        voice = member_of(name, people).voice
+        if voice.startswith(f"{ALIGNED}:"):  # who is recorded says what was recorded
+            recordings = recordings_of(voice.partition(":")[2], REFERENCES_EACH)
+            plan += [(name, "train", [(number, said.text)], said.voice) for number, said in enumerate(recordings, 1)]
+        else:
+            plan.append((name, "train", turn(TRAIN, 5 * place, 24), ""))
     return tuple(
-        SyntheticClip(identity, number, MOODS[(number + turn) % len(MOODS)])
-        for turn, (identity, numbers) in enumerate(plan)
+        PerformedClip(identity, split, number, text, moods[(number + place) % len(moods)], voice)
+        for place, (identity, split, texts, voice) in enumerate(plan)
+        for number, text in texts
+    )
+
+
+def mask_clips() -> tuple[PerformedClip, ...]:
+    """All clips of the second corpus, which has sentences and speakers of its own."""
+    plan = [(name, "train", range(24)) for name in MASK_SEEN]
+    plan += [(name, "val", range(24, 27)) for name in MASK_SEEN]
+    plan += [(name, "test_a", range(27, 32)) for name in MASK_SEEN]
+    plan += [(name, "references", range(12)) for name in MASK_UNSEEN]
+    plan += [(name, "test_b", range(27, 32)) for name in MASK_UNSEEN]
+    moods = tuple(MOODS)
+    return tuple(
+        PerformedClip(identity, split, number + 1, SENTENCES[number], moods[(number + place) % len(moods)])
+        for place, (identity, split, numbers) in enumerate(plan)
         for number in numbers
     )
+
+
+@dataclass(frozen=True)
+class Production:
+    """What differs between the corpora that are made here.
+
+    Attributes:
+        corpus: name in ``manifest.json``.
+        mesh_file: file with the faces.
+        frame_rate: motion frames a second.
+        mask: whether the motion is that of the mask instead of the whole head.
+    """
+
+    corpus: str = CORPUS
+    mesh_file: str = "PUPPET.ply"
+    frame_rate: int = FRAME_RATE
+    mask: bool = False
+
+    @property
+    def speakers(self) -> tuple[str, ...]:
+        """Who speaks, drawn speakers of the first corpus aside."""
+        return (*MASK_SEEN, *MASK_UNSEEN) if self.mask else tuple(CAST)
+
+    def clips(self, drawn: int, people: Sequence[str]) -> tuple[PerformedClip, ...]:
+        """All clips."""
+        return mask_clips() if self.mask else performed_clips(drawn, people)
+
+    def carry(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Values (V, …) of the head's vertices at those of this corpus's mesh."""
+        precise = np.asarray(values, np.float64)
+        return build_mask().carry(precise) if self.mask else precise
+
+    def colours(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colours (V, 3) of the head at this corpus's mesh."""
+        return np.rint(self.carry(colours.astype(np.float64))).astype(np.uint8)
+
+    def vertices(self, index: NDArray[np.int64], *, region: bool = False) -> NDArray[np.int64]:
+        """Vertices of this corpus's mesh at vertices of the head; those between them too if it is a region."""
+        if not self.mask:
+            return index
+        return build_mask().region(index) if region else build_mask().vertex_of[index]
+
+    def rig(self, identity: str) -> NDArray[np.float32]:
+        """A speaker's face at rest and the displacements of :data:`SHAPES`, in metres, (55, V, 3)."""
+        rig = rig_of(identity)
+        return self.carry(rig.transpose(1, 0, 2)).transpose(1, 0, 2).astype(np.float32) if self.mask else rig
+
+
+PUPPET = Production()
+MASK_SEEN = tuple(f"{DRAWN}{number}" for number in range(5001, 5009))
+MASK_UNSEEN = tuple(f"{DRAWN}{number}" for number in range(5009, 5013))
+"""Speakers of the second corpus: drawn ones that the first does not have."""
+MASK = Production(f"{CORPUS}_mask", "MASK.ply", 30, mask=True)
+
+
+def _voices_of_test_c() -> tuple[str, ...]:
+    """Voices kept out of training: a variant of espeak-ng, a language, and one of people where it is installed."""
+    people = [name for name in KEPT_OUT_PEOPLE if name.partition(":")[2] in Flite.voices()]
+    return ("espeak:en+m8", "espeak:de+f3", *people)
+
+
+def people_voices() -> tuple[str, ...]:
+    """Voices made from recordings of people that are installed and may be trained on."""
+    voices = installed_voices()
+    names = [f"{program}:{voice}" for program in ("flite", "festival") for voice in voices.get(program, [])]
+    # kal is there twice, and as diphones in Festival; one of them is enough.
+    return tuple(name for name in names if name not in KEPT_OUT_PEOPLE and not name.endswith(("kal", "kal_diphone")))
 
 
 def generate(
     root: Path,
     *,
     seed: int = 0,
+    drawn: int = 0,
+    people: Sequence[str] = (),
     workers: int | None = None,
     scheduler: str | None = "",
     progress: bool = True,
     only: Sequence[str] | None = None,
-    drawn: int = 0,
+    production: Production = PUPPET,
 ) -> None:
-    """Write the built-in corpus, unless the folder holds it already.
-
-    The corpus is written into a folder next to ``root`` and takes its name when it is whole, so an interruption leaves
-    nothing that could pass for a corpus.
+    """Write the corpus, unless the folder holds it already; it appears whole or not at all.
 
     Args:
-        root: The folder to make.
-        seed: Seed of the random part (blinks, drift, habits of the brows); the same seed gives the same bytes.
-        workers: How many workers share the work; by default one, or all of a cluster.
-        scheduler: Where; see :func:`facediff.utils.jobs.run_tasks`.
-        progress: Whether to show a progress bar.
-        only: Names of clips to write instead of all, for trials; such a corpus never counts as complete.
-        drawn: How many drawn speakers say the training sentences, besides the eight.
+        root: the folder to make.
+        seed: seed of what is left to chance; the same seed gives the same bytes.
+        drawn: how many drawn speakers say training sentences, besides the cast of ten.
+        people: voices of people that every second drawn speaker speaks with; see :func:`people_voices`.
+        workers: how many workers share the work; by default one, or all of a cluster.
+        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
+        progress: whether to show a progress bar.
+        only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
+        production: the corpus itself, or the second one with the mask.
     """
-    root = Path(root)
-    chosen = _chosen(only, drawn)
-    if only is None and is_complete(root, seed=seed, drawn=drawn):
+    facts = _facts(seed, drawn, people, production)
+    if only is None and _is_complete(root, facts):
         return
-    refuse_foreign(root)
+    _refuse_foreign(root, production.corpus)
+    every = production.clips(drawn, people)
+    clips = [clip for clip in every if only is None or clip.name in only]
+    if unknown := {*(only or ())} - {clip.name for clip in clips}:
+        raise FaceDiffError(f"the built-in corpus has no clip {min(unknown)!r}; clips are named like {every[0].name!r}")
     with atomic_folder(root, replace=True) as folder:
-        _write_common(folder, chosen)
-        frames = _write_clips(folder, chosen, seed, workers, scheduler, progress)
-        counts = {"subjects": len(SPEAKERS) + drawn, "vertices": len(build_face().vertices), "frames": frames}
-        files = describe_files(folder)
-        write_json(folder / MANIFEST, {**_facts(seed, len(chosen), drawn), **counts, "files": files})
+        _write_common(folder, clips, people, production)
+        tasks = run_tasks(
+            partial(_write_clip, folder, seed=seed, people=tuple(people), production=production),
+            clips,
+            workers=workers or (None if is_cluster(scheduler) else 1),
+            scheduler=scheduler,
+            writes=folder,
+            progress="Puppet corpus" if progress else "",
+        )
+        frames = 0
+        with closing(tasks):
+            for clip, count in tasks:
+                if isinstance(count, WorkerDied):
+                    raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
+                frames += count
+        counts = {"subjects": len(production.speakers) + drawn, "vertices": vertex_count(production), "frames": frames}
+        more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": production.frame_rate}
+        write_json(folder / MANIFEST, {**facts, **more, "files": describe_files(folder)})
 
 
-def is_complete(root: Path, *, seed: int = 0, drawn: int = 0) -> bool:
-    """Whether a folder holds the whole corpus of this version and seed; compares sizes, not contents.
-
-    Args:
-        root: The folder.
-        seed: The seed that it must have been made with.
-        drawn: How many drawn speakers it must have.
-    """
+def _is_complete(root: Path, facts: dict[str, object]) -> bool:
+    """Whether a folder holds the whole corpus of this version, seed and voices; compares sizes, not contents."""
     manifest = read_json(Path(root) / MANIFEST) or {}
-    facts, files = _facts(seed, len(clips(drawn)), drawn), manifest.get("files")
-    same = all(manifest.get(key) == value for key, value in facts.items())
+    files = manifest.get("files")
+    same = all(manifest.get(key) == value for key, value in {**facts, "whole": True}.items())
     return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
-def generate_clip(clip: SyntheticClip, seed: int = 0) -> tuple[NDArray[np.int16], Array, tuple[SpokenPhoneme, ...]]:
-    """One clip's waveform (640 T,) at 16 kHz, rig weights (T, controls), and phonemes in time."""
-    speaker = speaker_of(clip.identity)
-    spoken = speak(SENTENCES[clip.number - 1], speaker.voice)
-    before = round(_QUIET_BEFORE * SAMPLE_RATE)
-    length = before + spoken.samples.size + round(_QUIET_AFTER * SAMPLE_RATE)
-    frames = round(length / _SAMPLES_PER_FRAME)
-    samples = np.zeros(max(frames * _SAMPLES_PER_FRAME, before + spoken.samples.size), dtype=np.float32)
-    samples[before : before + spoken.samples.size] = spoken.samples * (_PEAK / np.abs(spoken.samples).max())
-    samples = samples[: frames * _SAMPLES_PER_FRAME]
-    end = frames / FRAME_RATE
-    phonemes = in_quiet(spoken.phonemes, before / SAMPLE_RATE, end)
-    # The index of a speaker seeds the random part, so it must not depend on how many speakers are drawn.
-    speakers = (*SPEAKERS, *drawn_names(MOST_DRAWN))
-    random = np.random.default_rng([seed, speakers.index(clip.identity), clip.number])
-    weights = generate_weights(
-        segments_of(phonemes), analyse(samples, SAMPLE_RATE), frames, speaker.style, clip.mood, random
-    )
-    return np.rint(samples * 32767.0).astype(np.int16), weights, phonemes
+def _facts(seed: int, drawn: int, people: Sequence[str], production: Production) -> dict[str, object]:
+    # Without what test C is spoken with: a folder stays whole where flite is installed later, or is missing.
+    facts = {"corpus": production.corpus, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
+    return {**facts, "people": list(people)}
 
 
-def in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) -> tuple[SpokenPhoneme, ...]:
+def resting_head(member: CastMember) -> NDArray[np.float64]:
+    """A speaker's head at rest in metres, (V, 3)."""
+    return np.asarray(dressed(member.face, build_head(), member.complexion) / 1000.0)
+
+
+@lru_cache(maxsize=4)
+def rig_of(identity: str) -> NDArray[np.float32]:
+    """A speaker's head at rest and the displacements of :data:`SHAPES`, in metres, (55, V, 3).
+
+    The average head's poses are sent through the speaker's deformation of space, so that lips that meet on the one meet
+    on the other.
+    """
+    member, mesh, shapes = member_of(identity), build_head(), head_shapes()
+    rest = member.face(mesh.vertices)
+    rig = np.zeros((1 + len(SHAPES), *rest.shape), np.float32)
+    rig[0] = resting_head(member)
+    for number, name in enumerate(SHAPES, start=1):
+        moved = np.flatnonzero(np.abs(shapes[name]).max(axis=1) > 1e-9)
+        posed = member.face(mesh.vertices[moved] + shapes[name][moved])
+        rig[number, moved] = (posed - rest[moved]) / 1000.0
+    return rig
+
+
+def vertex_count(production: Production = PUPPET) -> int:
+    """Vertices of a corpus's mesh."""
+    return N_MASK_VERTICES if production.mask else N_HEAD_VERTICES
+
+
+def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] = ()) -> NDArray[np.float32]:
+    """Five to eight random words by one of some speakers, (S,) at 16 kHz; the same number gives the same speech."""
+    random = np.random.default_rng([number, len(WORDS), 2])
+    text = " ".join(random.choice(WORDS, size=random.integers(5, 9)))
+    identity = identities[int(random.integers(len(identities)))]
+    people = [voice for voice in people if not voice.startswith(ALIGNED)]  # recordings say their own words only
+    return speak_clip(PerformedClip(identity, "train", 1, text, str(random.choice([*MOODS]))), people).samples
+
+
+def region_vertices() -> dict[str, NDArray[np.int64]]:
+    """Vertices of the regions ``lve`` (both lips) and ``fdd`` (forehead, brows and round the eyes)."""
+    mesh = build_head()
+    x, y, z = mesh.vertices.T
+    skin = np.zeros(len(x), dtype=bool)
+    skin[mesh.both("skin")] = True
+    forehead = np.flatnonzero(skin & (y > 32.0) & (y < 80.0) & (np.abs(x) < 60.0) & (z > 35.0))
+    eyes = mesh.both(*AROUND_EYE, "lid_edge", "brow_")
+    return {
+        "lve": mesh.both("lip_border", "lip_outer", "lip_crest", "lip_front", "lip_inner"),
+        "fdd": np.union1d(forehead, eyes),
+    }
+
+
+def speak_clip(clip: PerformedClip, people: Sequence[str] = ()) -> Utterance:
+    """What a clip sounds like: the speaker's voice, or the clip's own, in the clip's mood, with quiet at both ends.
+
+    The waveform lasts a whole number of frames at 25 a second.
+    """
+    member, mood = member_of(clip.identity, people), MOODS[clip.mood]
+    delivery = Delivery(member.rate * mood.rate, member.pitch + mood.pitch, member.pitch_range * mood.pitch_range)
+    spoken = open_voice(clip.voice or member.voice).speak(clip.text, delivery)
+    speech = spoken.samples * (_PEAK / max(float(np.abs(spoken.samples).max()), 1e-6))
+    speech = np.clip(coloured_speech(speech, mood.loudness, mood.brightness), -1.0, 1.0)
+    before, frame = round(_QUIET_BEFORE * SAMPLE_RATE), SAMPLE_RATE // FRAME_RATE
+    frames = round((before + len(speech) + round(_QUIET_AFTER * SAMPLE_RATE)) / frame)
+    samples = np.zeros(max(frames * frame, before + len(speech)), dtype=np.float32)
+    samples[before : before + len(speech)] = speech
+    return Utterance(samples[: frames * frame], _in_quiet(spoken.phonemes, before / SAMPLE_RATE, frames / FRAME_RATE))
+
+
+def perform_clip(
+    clip: PerformedClip, spoken: Utterance, seed: int = 0, frame_rate: float = FRAME_RATE
+) -> tuple[FaceMotion, FaceMotion]:
+    """The motion of a clip, and another that its speaker could have made with the same speech.
+
+    Of several performances of a test sentence the one is taken whose upper face is of middle liveliness, so that the
+    truth of a few sentences is typical of all; the other is the first of those that are left.
+    """
+    member, sounds = member_of(clip.identity), speech_sounds(spoken.phonemes)
+    contours = analyse(spoken.samples, SAMPLE_RATE)
+    frames = round(len(spoken.samples) / SAMPLE_RATE * frame_rate)
+    everybody = list(CAST)
+    drawn = len(everybody) - 1 + int(clip.identity.removeprefix(DRAWN)) if clip.identity not in CAST else 0
+    key = [seed, drawn or everybody.index(clip.identity), *map(ord, clip.sentence)]
+    draws = _DRAWS if clip.split.startswith("test") else 1
+    performances = [
+        perform(sounds, contours, frames, frame_rate, member.habits, clip.mood, np.random.default_rng([*key, draw]))
+        for draw in range(draws)
+    ]
+    if draws == 1:
+        return performances[0], performances[0]
+    brows = [SHAPES.index(name) for name in SHAPES if name.startswith(("brow", "eyeBlink"))]
+    lively = [float(performance.weights[:, brows].std(axis=0).mean()) for performance in performances]
+    middle = int(np.argsort(lively)[draws // 2])
+    return performances[middle], performances[0 if middle else 1]
+
+
+def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str], production: Production) -> None:
+    """Write everything that is not a clip."""
+    for name in (
+        "wav",
+        "vertices_npy",
+        "weights_npy",
+        "gaze_npy",
+        "head_npy",
+        "another_weights_npy",
+        "rigs",
+        "phonemes",
+        "regions",
+    ):
+        (folder / name).mkdir()
+    mesh = build_head()
+    templates = {}
+    for identity in dict.fromkeys(clip.identity for clip in clips):
+        rig = production.rig(identity)
+        np.save(folder / "rigs" / f"{identity}.npy", rig)
+        templates[identity] = rig[0].astype(np.float64)
+    with (folder / "templates.pkl").open("wb") as stream:
+        pickle.dump(templates, stream, protocol=2)
+    complexions: dict[str, Any] = {
+        name: production.colours(coloured(mesh, member_of(name, people).complexion)) for name in templates
+    }
+    np.savez(folder / "colours.npz", **complexions)
+    mean = production.carry(np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0)
+    faces = build_mask().faces if production.mask else mesh.faces
+    _write_ply(folder / production.mesh_file, mean, faces, production.colours(coloured(mesh, Complexion())))
+    for name, index in region_vertices().items():
+        own = production.vertices(index, region=True)
+        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, own.tolist())) + "\n")
+    for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
+        pairs = zip(*(production.vertices(side).tolist() for side in sides), strict=True)
+        (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
+    write_table(folder / "shapes.csv", [["shape"], *([name] for name in SHAPES)])
+    table = [["clip", "subject", "sentence", "split", "mood", "voice", "text"]]
+    for clip in clips:
+        voice = clip.voice or member_of(clip.identity, people).voice
+        table.append([clip.name, clip.identity, clip.sentence, clip.split, clip.mood, voice, clip.text])
+    write_table(folder / "clips.csv", table)
+
+
+def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str], production: Production) -> int:
+    """Write sound, motion and phonemes of a clip and return its number of frames."""
+    spoken = speak_clip(clip, people)
+    performance, another = perform_clip(clip, spoken, seed, production.frame_rate)
+    whole = np.rint(spoken.samples * 32767.0).astype(np.int16)
+    write_wav(folder / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
+    for name, track in (("weights", performance.weights), ("gaze", performance.gaze), ("head", performance.head)):
+        np.save(folder / f"{name}_npy" / f"{clip.name}.npy", track.astype(np.float32))
+    if clip.split.startswith("test") and not production.mask:  # those of the mask would take a gigabyte
+        rig = rig_of(clip.identity)
+        vertices = rig[0] + np.einsum("tk,kvc->tvc", performance.weights.astype(np.float32), rig[1:])
+        np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
+    if clip.split.startswith("test"):
+        np.save(folder / "another_weights_npy" / f"{clip.name}.npy", another.weights.astype(np.float32))
+    write_table(folder / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *map(_row, spoken.phonemes)])
+    return len(performance.weights)
+
+
+def _row(phoneme: SpokenPhoneme) -> list[str]:
+    return [f"{phoneme.start:.4f}", f"{phoneme.end:.4f}", phoneme.ipa]
+
+
+def _in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) -> tuple[SpokenPhoneme, ...]:
     """Shift phonemes by the quiet before speech and fill up with pauses to the end of the clip."""
     moved = [SpokenPhoneme(p.start + before, min(p.end + before, end), p.ipa) for p in phonemes]
     moved = [p for p in moved if p.end > p.start]
@@ -173,42 +437,7 @@ def in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) -> 
     return tuple(moved)
 
 
-@lru_cache(maxsize=8)
-def rig_of(identity: str) -> Rig:
-    """Rig of a speaker, by name."""
-    speaker = speaker_of(identity)
-    return build_rig(speaker.shape, speaker.style.asymmetry)
-
-
-def regions() -> dict[str, NDArray[np.int64]]:
-    """Vertices of the regions ``lve`` (both lips) and ``fdd`` (forehead, brows and around the eyes)."""
-    mesh = build_face()
-    x, y, z = (1000.0 * mesh.vertices).T
-    skin = np.zeros(len(x), dtype=bool)
-    skin[mesh.both("skin")] = True
-    above = (y > 32.0) & (y < 84.0) & (np.abs(x) < 62.0) & (z > 30.0)
-    upper = np.flatnonzero(skin & above)
-    eyes = mesh.both("eye_0", "eye_1", "eye_2", "lid_inner", "brow")
-    return {"lve": mesh.both("mouth_0", "lip_crest", "lip_front", "lip_inner"), "fdd": np.union1d(upper, eyes)}
-
-
-def _facts(seed: int, count: int, drawn: int) -> dict[str, int | str]:
-    facts: dict[str, int | str] = {"corpus": CORPUS, "format": FORMAT, "generator": GENERATOR, "seed": seed}
-    return {**facts, "clips": count, **({"drawn": drawn} if drawn else {})}
-
-
-def _chosen(only: Sequence[str] | None, drawn: int) -> tuple[SyntheticClip, ...]:
-    everything = clips(drawn)
-    if only is None:
-        return everything
-    clips_by_name = {clip.name: clip for clip in everything}
-    unknown = [name for name in only if name not in clips_by_name]
-    if unknown:
-        raise FaceDiffError(f"the built-in corpus has no clip {unknown[0]!r}; clips are named like 'F1_e01'")
-    return tuple(clips_by_name[name] for name in only)
-
-
-def refuse_foreign(root: Path, corpus: str = CORPUS) -> None:
+def _refuse_foreign(root: Path, corpus: str) -> None:
     """Never replace a folder that this generator did not write."""
     if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != corpus:
         raise FaceDiffError(
@@ -216,60 +445,7 @@ def refuse_foreign(root: Path, corpus: str = CORPUS) -> None:
         )
 
 
-def _write_common(folder: Path, chosen: Sequence[SyntheticClip]) -> None:
-    """Write everything that is not a clip."""
-    for name in ("wav", "vertices_npy", "phonemes", "regions"):
-        (folder / name).mkdir()
-    mesh = build_face()
-    speakers = dict.fromkeys((*SEEN_IDENTITIES, *UNSEEN_IDENTITIES, *(clip.identity for clip in chosen)))
-    templates = {identity: np.array(rig_of(identity).neutral) for identity in speakers}
-    with (folder / "templates.pkl").open("wb") as stream:
-        pickle.dump(templates, stream, protocol=2)
-    mean = np.mean([templates[identity] for identity in SEEN_IDENTITIES], axis=0)
-    write_ply(folder / "PUPPET.ply", mean, mesh.faces, mesh.colours)
-    for name, index in regions().items():
-        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, index.tolist())) + "\n")
-    for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
-        pairs = zip(*(side.tolist() for side in sides), strict=True)
-        (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
-    table = [["clip", "subject", "sentence", "mood", "voice", "text"]]
-    for clip in chosen:
-        voice, text = speaker_of(clip.identity).voice.name, SENTENCES[clip.number - 1]
-        table.append([clip.name, clip.identity, clip.sentence, clip.mood, voice, text])
-    write_table(folder / "clips.csv", table)
-
-
-def _write_clips(
-    folder: Path, chosen: Sequence[SyntheticClip], seed: int, workers: int | None, scheduler: str | None, progress: bool
-) -> int:
-    """Write all clips and return how many frames they have together."""
-    results = run_tasks(
-        partial(_write_clip, folder, seed=seed),
-        chosen,
-        workers=workers or (None if is_cluster(scheduler) else 1),
-        scheduler=scheduler,
-        writes=folder,
-        progress="Puppet corpus" if progress else "",
-    )
-    with closing(results):
-        return sum(frames for _, frames in in_order(results, chosen))
-
-
-def _write_clip(folder: Path, clip: SyntheticClip, seed: int) -> int:
-    """Write sound, motion and phonemes of a clip and return its number of frames."""
-    samples, weights, phonemes = generate_clip(clip, seed)
-    write_wav(folder / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE)
-    vertices = rig_of(clip.identity).pose(weights).astype(np.float32)
-    np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
-    table = [["start", "end", "ipa", "viseme"]]
-    for phoneme in phonemes:
-        visemes = "+".join(visemes_of(phoneme.ipa))
-        table.append([f"{phoneme.start:.4f}", f"{phoneme.end:.4f}", phoneme.ipa, visemes])
-    write_table(folder / "phonemes" / f"{clip.name}.csv", table)
-    return len(vertices)
-
-
-def write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
+def _write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
     """Write a triangle mesh (V, 3), (F, 3) with colours (V, 3) in red, green, blue as binary little-endian PLY."""
     header = [
         "ply",

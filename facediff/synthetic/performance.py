@@ -1,4 +1,4 @@
-"""From a spoken sentence to the motion of a face of the second edition: mouth, brows, lids, gaze and head.
+"""From a spoken sentence to the motion of a face: mouth, brows, lids, gaze and head.
 
 Speech decides the mouth, and chance much of the rest, so that one recording has many possible motions. Rates, lengths
 and sizes are those measured in people; each has its source next to it. Everything is computed at 200 Hz and read off at
@@ -15,8 +15,9 @@ import numpy as np
 from facediff.synthetic.articulation import SIDED, SPEECH_SHAPES, SpeechSound, blend, lip_closure
 from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.head.rig import LOOK_DOWN, LOOK_SIDEWAYS, LOOK_UP, SHAPES
-from facediff.synthetic.motion import FINE_RATE, ProsodyContours, drift, smooth
+from facediff.synthetic.prosody import ProsodyContours, blurred
 
+FINE_RATE = 200  # Steps a second
 _MARGIN = 0.4  # Seconds before and after the clip in which motion goes on
 _SACCADE_VELOCITY = (0.021, 0.0022)
 """Seconds that a saccade takes, and those that each degree adds (Carpenter, "Movements of the eyes", 1988)."""
@@ -327,3 +328,17 @@ def _sided(
         share = np.zeros_like(times) if name.startswith("eye") else lean
         result[f"{name}Left"], result[f"{name}Right"] = track * (1.0 + share), track * (1.0 - share)
     return result
+
+
+def drift(times: Array, random: np.random.Generator) -> Array:
+    """Slow random drift of about unit size: a few sines below 0.8 Hz."""
+    rates = random.uniform(0.12, 0.8, 4)
+    phases = random.uniform(0.0, 2.0 * np.pi, 4)
+    waves = np.sin(2.0 * np.pi * rates[:, None] * times + phases[:, None])
+    return np.asarray(0.7 * waves.sum(axis=0))
+
+
+def smooth(track: Array, deviation: float) -> Array:
+    """Blur in time with a Gaussian of so many seconds."""
+    reach = max(int(np.ceil(3.0 * deviation * FINE_RATE)), 1)
+    return blurred(track, np.arange(-reach, reach + 1) / (deviation * FINE_RATE))

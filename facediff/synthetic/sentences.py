@@ -1,4 +1,4 @@
-"""What the speakers of the second edition say: the first edition's sentences and others written for this corpus.
+"""Sentences and words of the built-in corpus, all written for it.
 
 Most sentences are rich in p, b and m, in rounded and in open vowels, since these are what the mouth shows. No sentence
 is in two of the lists.
@@ -120,3 +120,29 @@ def turn(sentences: Sequence[str], first: int, count: int) -> list[tuple[int, st
     """Some sentences in a row from a place on, round the end, with their numbers from 1."""
     places = [(first + step) % len(sentences) for step in range(count)]
     return [(place + 1, sentences[place]) for place in places]
+
+
+# Chosen for this corpus, so that every English sound occurs in several places of a word; no content word is in the test
+# sentences.
+_WORDS = """
+apple arm beach begin below bench bird bite black blanket blood blow bone bottle bread bridge bring bubble
+build burn butter cabin camel candle car carpet catch chair cheap cheese chimney choice church circle climb
+clock cloth cloud coffee cold computer copper corner cotton cream crowd cry cup damp dance dark deep desk
+dinner dish divide dog doubt dream drum dust eagle early east eight empty engine enough evening eye fabric
+fall family fast feather field finger fire fish five flag flower fly forget fork fresh frog garden gate gentle
+ghost gift glass goat gold grape green guess hammer hand happy harbour heavy help high hill holiday honey
+horse humble hungry ice imagine important inside island job join judge jump jungle keep kettle kick kind
+kitchen knife label ladder large laugh lazy leaf leave lemon letter library light limb little lobster long
+loud lucky lump machine market measure medicine member milk mirror mistake monkey month morning mouse museum
+music nature neighbour never night nobody noise north number nurse object ocean often onion orange outside
+oven paint palace paper party path pencil people perhaps picture pigeon pillow planet pleasure pocket poison
+pony possible potato powder pretty problem proud public puddle purpose push quick quiet rabbit radio rain
+rapid ready remember repeat ribbon right ring robin rough round rubber running sailor salt sample sandwich
+scrub secret seven shadow shallow sharp ship shop shoulder silver simple sister sleep slippery small smooth
+snow soap somebody south space spider spring square station stone storm street strong stubborn student subject
+sugar summer sunny supper surprise table tail teacher temper ten thank thick thin thirty thousand thumb ticket
+tiger timber toilet tomato tongue touch towel treasure trip trouble trumpet twelve twenty uncover under upset
+usual valley velvet very village visit voice volume wagon walk wander watch water weather weekend wheel
+whisper window winter wise wonder wool work wrap yard year yellow yesterday young zebra zipper
+"""
+WORDS = tuple(_WORDS.split())

@@ -18,11 +18,11 @@ from facediff.errors import FaceDiffError, choices
 from facediff.spaces.rigs import LinearRig
 from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, Utterance
+from facediff.synthetic.corpus import PerformedClip, perform_clip, region_vertices, rig_of, speak_clip
 from facediff.synthetic.geometry import Array
 from facediff.synthetic.head.parts import build_head
 from facediff.synthetic.head.rig import eyelid_pairs, lip_pairs
 from facediff.synthetic.known_faces import built_in_rig
-from facediff.synthetic.second_edition import PerformedClip, perform_clip, region_vertices, rig_of, speak_clip
 from facediff.synthetic.sentences import GERMAN, TEST
 from facediff.synthetic.voices import installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE

@@ -222,15 +222,14 @@ def test_missing_pieces_of_a_corpus(corpus: Path, capsys: pytest.CaptureFixture[
 def test_the_built_in_corpus_by_name(
     drawn: int, corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from facediff.data.puppet import FirstEdition, SecondEdition, cache_root
+    from facediff.data.puppet import cache_root
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
     given = ["figure", "error", "ours", "puppet", *TINY, *SMALL, "-o", "a.png"]
     assert main(given) == 2
     assert "`facediff demo` makes it" in capsys.readouterr().err
-    edition = FirstEdition if drawn else SecondEdition
-    shutil.copytree(corpus, cache_root(edition(0, drawn)))
+    shutil.copytree(corpus, cache_root(0, drawn))
     assert main(given) == 0
 
 

@@ -188,7 +188,7 @@ def puppet_of_two(tmp_path_factory: pytest.TempPathFactory) -> str:
     from facediff.synthetic.corpus import generate
 
     root = tmp_path_factory.mktemp("two") / "corpus"
-    generate(root, only=["F1_e01", "F1_e02", "F1_e28"], progress=False)
+    generate(root, only=["F1_e01", "F1_e02", "F1_t01"], progress=False)
     return str(root)
 
 

@@ -17,12 +17,12 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 SMALL = """
-from facediff.synthetic import second_edition
+from facediff.synthetic import corpus
 
 # 42 clips instead of 420
-second_edition.TRAIN_EACH = second_edition.REFERENCES_EACH = 3
-second_edition.TEST_EACH = second_edition.TEST_C_EACH = 1
-second_edition.TRAIN = second_edition.TRAIN[:4]  # so that all say the same ones
+corpus.TRAIN_EACH = corpus.REFERENCES_EACH = 3
+corpus.TEST_EACH = corpus.TEST_C_EACH = 1
+corpus.TRAIN = corpus.TRAIN[:4]  # so that all say the same ones
 """
 """Runs before a notebook."""
 

@@ -15,9 +15,9 @@ from facediff.errors import FaceDiffError
 from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
-from facediff.synthetic.arkit import puppet_shapes
 from facediff.synthetic.known_faces import built_in_rig
 from tests.fakes.glb_reader import Reader
+from tests.fakes.small_face import F1, small_shapes
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
@@ -126,7 +126,7 @@ def test_the_command_writes_the_weights_of_a_take_and_plays_it_on_an_avatars_own
     np.testing.assert_allclose(beat.values, weights, atol=1e-6)
     np.testing.assert_allclose(again.values[:30], clip.values, atol=1e-5)
     assert "Blink_L" in (tmp_path / "vowels.csv").read_text().splitlines()[0]
-    rest, faces, shapes = puppet_shapes("F1")  # another head than the one that plays takes, of another topology
+    rest, faces, shapes = small_shapes(F1)  # another head than the one that plays takes, of another topology
     avatar = Animation("avatar", rest[None].astype(np.float32), rest.astype(np.float32), 30.0, faces=faces)
     deltas = np.stack([shapes[name] - rest for name in layout("arkit").channels])
     avatar.made_of(layout("arkit"), np.zeros((1, 52), np.float32), deltas).save(tmp_path / "avatar.glb")

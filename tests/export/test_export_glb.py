@@ -20,10 +20,10 @@ from facediff.export.format import normals_of, outward
 from facediff.export.glb import compress
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb
-from facediff.synthetic.arkit import puppet_shapes
 from facediff.utils.colours import to_linear, to_srgb
 from tests.fakes.glb_reader import COMPONENTS, WIDTHS, Reader
 from tests.fakes.glb_targets import pack
+from tests.fakes.small_face import M2, small_shapes
 
 
 @pytest.mark.parametrize("unit", ["m", "mm", "normalised (about 185 mm)"])
@@ -223,7 +223,7 @@ def test_glb_of_the_same_animation_has_the_same_bytes(animation: Animation, tmp_
 @pytest.mark.parametrize("key_tolerance", [0.0, 0.05])
 def test_named_shapes_give_named_targets_and_curves(tmp_path: Path, key_tolerance: float) -> None:
     """Targets, their normals, and weights at the keys are those of the shapes' own face."""
-    neutral, faces, shapes = puppet_shapes("M1")
+    neutral, faces, shapes = small_shapes(M2)
     time = np.arange(40) / 25
     goal = {"jawOpen": 0.4 + 0.4 * np.sin(3 * time), "eyeBlinkLeft": np.clip(1 - 8 * np.abs(time - 0.8), 0, 1)}
     moved = neutral + sum(curve[:, None, None] * (shapes[name] - neutral) for name, curve in goal.items())

@@ -23,10 +23,10 @@ from facediff.mesh.glb_scene import placed_parts
 from facediff.spaces import layout
 from facediff.spaces.arkit import ALPHABETICAL
 from facediff.spaces.visemes import visemes
-from facediff.synthetic.arkit import puppet_shapes
 from tests.fakes.avatar import AvatarPart, avatar_parts, write_avatar
 from tests.fakes.glb_targets import pack
 from tests.fakes.gltf_scene import GltfScene
+from tests.fakes.small_face import F1, small_shapes
 
 FRAMES = 30
 NECK = np.array([0.0, 1.5, 0.0])  # where the avatar's bone of the head is
@@ -40,7 +40,7 @@ def parts() -> dict[str, AvatarPart]:
 @pytest.fixture(scope="module")
 def spoken() -> Animation:
     """Weights of ARKit's shapes that go up and down one after the other, with a head that turns."""
-    rest, faces, _ = puppet_shapes("F1")
+    rest, faces, _ = small_shapes(F1)
     times = np.arange(FRAMES) / 25
     values = np.zeros((FRAMES, 52), np.float32)
     for k, name in enumerate(

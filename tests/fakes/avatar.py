@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from facediff.synthetic.arkit import puppet_shapes
-from facediff.synthetic.face import build_face
-from facediff.synthetic.speakers import SPEAKERS
 from tests.fakes.glb_targets import pack
 from tests.fakes.heads import cleaned, eyeballs, teeth
+from tests.fakes.small_face import M2, Shape, build_face, small_shapes
 
 TYPES = {"float32": 5126, "int16": 5122, "uint16": 5123, "uint8": 5121}
 
@@ -106,16 +104,13 @@ class AvatarPart:
     joint: int = 1
 
 
-SPEAKER = "M2"
-
-
 @lru_cache(maxsize=2)
-def avatar_parts(speaker: str = SPEAKER, *, rounds: int = 1) -> dict[str, AvatarPart]:
+def avatar_parts(shape: Shape = M2, *, rounds: int = 1) -> dict[str, AvatarPart]:
     """Body, head, eyes, teeth, tongue and hair of a figure 1.7 m tall whose head has ARKit's shapes."""
-    mesh, shape = build_face(), SPEAKERS[speaker].shape
-    rest, faces, shapes = puppet_shapes(speaker)
+    mesh = build_face()
+    rest, faces, shapes = small_shapes(shape)
     gone = np.zeros(len(rest), bool)
-    gone[mesh.both(*(name for name in mesh.groups if name.startswith(("teeth", "eyeball", "pupil"))))] = True
+    gone[mesh.both("teeth", "eyeball", "pupil")] = True
     faces = faces[~gone[faces].any(axis=1)]
 
     def cut(points: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
-"""A family of heads that are not the puppet's: other people, other topologies, other units and axes, made by code.
+"""A family of heads that are not the built-in one: other people, other topologies, other units and axes, made by code.
 
-Each is a different person's puppet head, cut, closed, resampled, warped and completed with parts of its own, as masks,
+Each is a different person's head, cut, closed, resampled, warped and completed with parts of its own, as masks,
 registered heads, scans and avatars from elsewhere are. Nothing in them says which vertex was which.
 """
 
@@ -14,13 +14,11 @@ import numpy as np
 import trimesh
 
 from facediff.animation import Animation
-from facediff.editing.landmarks import puppet_landmarks
-from facediff.synthetic.face import EYE_CENTRE, build_face
-from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.parts import EYE_CENTRE, build_head
 from facediff.synthetic.head.people import Face
 from facediff.synthetic.head.rig import head_shapes
 from facediff.synthetic.head.rig import lip_pairs as lip_pairs_of_head
-from facediff.synthetic.rig import CONTROLS, Shape, build_rig, lip_pairs
+from tests.fakes.small_face import CONTROLS, LANDMARKS, Shape, build_face, build_rig, lip_pairs
 
 Mesh = tuple[np.ndarray, np.ndarray]
 INTERIOR = ("lip_roll", "mouth_bag", "mouth_back")
@@ -60,7 +58,7 @@ def talking(shape: Shape | None = None) -> Animation:
     ):
         for name, amount in amounts.items():
             weights[frame, CONTROLS.index(name)] = amount
-    upper, lower = lip_pairs(mesh)
+    upper, lower = lip_pairs()
     return Animation(
         "talking",
         rig.pose(weights).astype(np.float32),
@@ -86,12 +84,12 @@ def turned(*degrees: float) -> np.ndarray:
 
 
 def person(shape: Shape, *without: str) -> Mesh:
-    """A person's head in metres without the named groups of the puppet's vertices."""
+    """A person's head in metres without the named groups of vertices."""
     mesh = build_face()
     vertices, faces = build_rig(shape).neutral, np.asarray(mesh.faces)
     if without:
         gone = np.zeros(len(vertices), bool)
-        gone[mesh.both(*(name for name in mesh.groups if name.startswith(without)))] = True
+        gone[mesh.both(*without)] = True
         faces = faces[~gone[faces].any(axis=1)]
     return cleaned(vertices, faces)
 
@@ -305,7 +303,7 @@ APART = ("teeth", "tongue", "hair", "brow_", "lash_", *BALLS)
 
 
 def second(face: Face, *without: str, **pose: float) -> Mesh:
-    """A person of the second edition in metres, posed by ARKit's shapes, without the named groups of vertices."""
+    """A person with the built-in head in metres, posed by ARKit's shapes, without the named groups of vertices."""
     mesh = build_head()
     gone = np.zeros(len(mesh.vertices), bool)
     if without:
@@ -314,13 +312,13 @@ def second(face: Face, *without: str, **pose: float) -> Mesh:
 
 
 def only(face: Face, *groups: str) -> Mesh:
-    """Some groups of a person of the second edition."""
+    """Some groups of a person with the built-in head."""
     mesh = build_head()
     return second(face, *(name for name in mesh.groups if not name.startswith(groups)))
 
 
 def talking_second() -> Animation:
-    """What :func:`talking` does, on the average head of the second edition: (13, 5875, 3)."""
+    """What :func:`talking` does, on the average head with the built-in head: (13, 5875, 3)."""
     pairs = lip_pairs_of_head(build_head())
     poses: list[dict[str, float]] = [
         {},
@@ -386,7 +384,7 @@ def painted_eyes() -> Head:
 
 
 def second_places(face: Face, **pose: float) -> np.ndarray:
-    """All vertices of a person of the second edition in metres, posed."""
+    """All vertices of a person with the built-in head in metres, posed."""
     mesh, shapes = build_head(), head_shapes()
     posed = mesh.vertices + sum((pose[name] * shapes[name] for name in pose), np.zeros_like(mesh.vertices))
     return np.asarray(face(posed) / 1000.0)
@@ -456,8 +454,7 @@ LOWER_MARKS = ("chin", "mouth_corner_left", "mouth_corner_right", "nose_base", "
 def lower_face_marks(head: Head) -> dict[str, int]:
     """The vertices of the head's named places: those nearest to the person's own."""
     places = 3.0 * build_rig(YOUNG).neutral @ turned(20, 140, 0).T
-    found = puppet_landmarks()
-    return {name: int(np.linalg.norm(head.vertices - places[found[name]], axis=1).argmin()) for name in LOWER_MARKS}
+    return {name: int(np.linalg.norm(head.vertices - places[LANDMARKS[name]], axis=1).argmin()) for name in LOWER_MARKS}
 
 
 FAMILY: dict[str, Callable[[], Head]] = {

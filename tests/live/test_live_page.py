@@ -11,8 +11,8 @@ import pytest
 
 from facediff.live.frames import LiveFrame, Performance
 from facediff.live.receivers.browser import STEP, Browser
-from facediff.synthetic.face import build_face
 from tests.fakes.chromium import Chromium, Page
+from tests.fakes.small_face import build_face
 from tests.live.conftest import FRAME_RATE
 from tests.live.test_browser_receiver import serving
 from tests.live.test_json_lines import wait_for

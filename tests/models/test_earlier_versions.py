@@ -27,7 +27,8 @@ def class_at(path: str) -> type:
 @pytest.mark.parametrize("path", REMOVED)
 def test_a_removed_option_is_gone_and_named_in_plain_data(path: str) -> None:
     assert not REMOVED[path].keys() & defaults(class_at(path)).keys()
-    assert yaml.safe_load(yaml.safe_dump(REMOVED[path])) == REMOVED[path]
+    values = {name: list(v) if isinstance(v, tuple) else v for name, v in REMOVED[path].items()}
+    assert yaml.safe_load(yaml.safe_dump(values)) == values
 
 
 @pytest.mark.parametrize("name", SHORT_NAMES)

@@ -177,12 +177,11 @@ def test_people_cannot_say_what_they_are_told(
 def test_without_espeak_a_language_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Espeak, "voices", classmethod(lambda cls: []))
     with pytest.raises(FaceDiffError, match=r"espeak is not installed; pip install"):
-        Puppet(root=str(tmp_path / "none"), edition=2).say("My map", 0, "de")
+        Puppet(root=str(tmp_path / "none")).say("My map", 0, "de")
 
 
-@pytest.mark.parametrize("edition", [1, 2])
-def test_speakers_of_the_built_in_corpus_take_turns(edition: int, tmp_path: Path) -> None:
-    data = Puppet(root=str(tmp_path / "none"), edition=edition)
+def test_speakers_of_the_built_in_corpus_take_turns(tmp_path: Path) -> None:
+    data = Puppet(root=str(tmp_path / "none"))
     first, second, again = (data.say("My map", number) for number in (0, 1, 6))
     assert not np.array_equal(data.say("My map", 0, "de"), first)
     with pytest.raises(FaceDiffError, match='language "dee": .*did you mean "de"'):

@@ -30,7 +30,7 @@ def test_the_blocks_run_as_they_stand(workplace: Path, puppet_corpus: Path, monk
         exec(compile(block, "docs/python.md", "exec"), names)  # noqa: S102 - our own page
     anim = names["anim"]
     assert anim.vertices.dtype == "float32"
-    assert anim.vertices.shape == names["truth"].vertices.shape == (len(anim.vertices), 1008, 3)
+    assert anim.vertices.shape == names["truth"].vertices.shape == (len(anim.vertices), 5875, 3)
     assert {"lips", "upper_face"} <= anim.regions.keys()
     assert anim.metadata["style"] == "0.4 F1_e03 + 0.6 M2_e05"
     written = {path.name for path in workplace.iterdir()}

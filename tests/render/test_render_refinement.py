@@ -9,9 +9,8 @@ import pytest
 
 from facediff.render import Renderer, panels, side_by_side
 from facediff.render.refinement import Refinement
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import CONTROLS, Shape, build_rig
 from tests.fakes.light_per_sample import PerSampleRenderer
+from tests.fakes.small_face import CONTROLS, Shape, build_face, build_rig
 
 
 @pytest.fixture(scope="module")

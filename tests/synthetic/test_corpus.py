@@ -1,136 +1,241 @@
-"""On disk: the layout of BIWI's copies, whole or not there, the same bytes for the same seed."""
+"""The built-in corpus on disk: bytes, splits, and truth that decodes to what its regions and pairs describe."""
 
-import csv
+from __future__ import annotations
+
 import hashlib
 import json
-import pickle
 import subprocess
 import sys
+from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 
-from facediff import synthetic as puppet
+from facediff.data import Puppet
+from facediff.data.batch import DATA_SOURCE_KEY
+from facediff.data.check import check, text, truth
+from facediff.data.packed.packing import pack
+from facediff.data.puppet import PuppetMask
+from facediff.data.storage import ClipFolder, WeightFile
 from facediff.errors import FaceDiffError
+from facediff.models.checkpoint import corpus_of
 from facediff.synthetic import corpus as corpus_module
-from facediff.synthetic.corpus import clips, generate, is_complete
+from facediff.synthetic.cast import KEPT_OUT, SEEN, UNSEEN, drawn_names, member_of
+from facediff.synthetic.corpus import MASK, generate, perform_clip, performed_clips, rig_of, speak_clip, spoken_words
+from facediff.synthetic.head.mask import build_mask
+from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, lip_pairs
+from facediff.synthetic.sentences import GERMAN, TEST, TRAIN, VALIDATION, WORDS
 
-pytest.importorskip("espeakng_loader")
+ONLY = ("F1_e01", "F1_t01", "M5_t14")
 
 
-def digests(root: Path) -> dict[str, str]:
+def digests(folder: Path) -> dict[str, str]:
     return {
-        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in root.rglob("*")
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
 
 
-def test_splits_are_disjoint_and_moods_balanced() -> None:
-    splits = [set(puppet.TRAIN_SENTENCES), set(puppet.VAL_SENTENCES), set(puppet.TEST_SENTENCES)]
-    assert sum(map(len, splits)) == len(set.union(*splits)) == 32
-    assert set(puppet.REFERENCE_SENTENCES).isdisjoint(puppet.TEST_SENTENCES)
-    assert puppet.SEEN_IDENTITIES == ("F1", "F2", "F3", "M1", "M2", "M3")
-    plan = clips()
-    assert len({clip.name for clip in plan}) == len(plan) == 6 * 32 + 2 * 29
-    for identity in puppet.SEEN_IDENTITIES:
-        moods = [c.mood for c in plan if c.identity == identity and c.number in puppet.TRAIN_SENTENCES]
-        assert {moods.count(mood) for mood in puppet.MOODS} == {8}
-    for identity in puppet.UNSEEN_IDENTITIES:
-        references = [c for c in plan if c.identity == identity and c.number in puppet.REFERENCE_SENTENCES]
-        assert {c.mood for c in references} == set(puppet.MOODS)
-        assert {c.number for c in plan if c.identity == identity} == {*range(1, 25), *range(28, 33)}
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("puppet") / "corpus"
+    generate(root, only=ONLY, progress=False)
+    return root
 
 
-def test_drawn_speakers_say_the_training_sentences_only() -> None:
-    plan = clips(2)
-    assert plan[: len(clips())] == clips()
-    further = plan[len(clips()) :]
-    assert {clip.identity for clip in further} == {"X01", "X02"}
-    assert [clip.number for clip in further] == 2 * list(puppet.TRAIN_SENTENCES)
-    for identity in ("X01", "X02"):
-        moods = [clip.mood for clip in further if clip.identity == identity]
-        assert {moods.count(mood) for mood in puppet.MOODS} == {8}
+def test_tests_can_tell() -> None:
+    clips = performed_clips(drawn=3)
+    count = Counter(clip.split for clip in clips)
+    assert count["test_a"] >= 60
+    assert count["test_b"] >= 40
+    assert len({clip.name for clip in clips}) == len(clips)
+    assert {clip.identity for clip in clips if clip.split == "test_b"} == set(UNSEEN)
+    assert len(UNSEEN) == 4
+    for first, second in ((TRAIN, TEST), (TRAIN, VALIDATION), (VALIDATION, TEST), (TRAIN, GERMAN)):
+        assert not set(first) & set(second)
+    spoken = {(clip.identity, clip.text) for clip in clips if clip.split == "train"}
+    assert len(spoken) == count["train"]
+    for identity in SEEN:
+        moods = Counter(clip.mood for clip in clips if clip.identity == identity and clip.split == "train")
+        assert max(moods.values()) - min(moods.values()) <= 2
 
 
-def test_drawn_speakers_leave_the_eight_as_they_are(corpus: Path, tmp_path: Path) -> None:
-    generate(tmp_path / "more", only=["F1_e01", "X02_e01"], progress=False, drawn=2)
-    there = digests(tmp_path / "more")
-    assert there["vertices_npy/F1_e01.npy"] == digests(corpus)["vertices_npy/F1_e01.npy"]
-    rows = list(csv.DictReader((tmp_path / "more" / "clips.csv").read_text(encoding="utf-8").splitlines()))
-    assert [row["subject"] for row in rows] == ["F1", "X02"]
-    templates = pickle.loads((tmp_path / "more" / "templates.pkl").read_bytes())  # noqa: S301 - written by ourselves
-    assert list(templates) == [*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES, "X02"]
-    assert (tmp_path / "more" / "PUPPET.ply").read_bytes() == (corpus / "PUPPET.ply").read_bytes()
-    motion = np.load(tmp_path / "more" / "vertices_npy" / "X02_e01.npy").reshape(-1, puppet.N_VERTICES, 3)
-    assert 0.001 < np.abs(motion - templates["X02"]).max() < 0.04
+def test_voices_that_are_kept_out_are_not_trained_with() -> None:
+    voices = {member_of(name).voice for name in (*SEEN, *drawn_names(99))}
+    assert not voices & set(KEPT_OUT)
+    of_test_c = {clip.voice for clip in performed_clips() if clip.split == "test_c"}
+    assert len(of_test_c) >= 2
+    assert not of_test_c & voices
 
 
-def test_corpus_with_drawn_speakers_is_another_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(corpus_module, "clips", lambda drawn=0: clips(drawn)[:1] + clips(drawn)[-drawn:][:drawn])
-    root = tmp_path / "corpus"
-    generate(root, progress=False, drawn=1)
-    assert is_complete(root, drawn=1)
-    assert not is_complete(root)
-    assert not is_complete(root, drawn=2)
+def test_the_same_seed_gives_the_same_bytes_on_two_processes(corpus: Path, tmp_path: Path) -> None:
+    generate(tmp_path / "again", only=ONLY, workers=2, progress=False)
+    assert digests(tmp_path / "again") == digests(corpus)
+    generate(tmp_path / "other", only=ONLY[1:2], seed=1, progress=False)
+    name = f"weights_npy/{ONLY[1]}.npy"
+    assert digests(tmp_path / "other")[name] != digests(corpus)[name]
 
 
-def test_layout(corpus: Path) -> None:
-    with (corpus / "clips.csv").open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [*rows[0]] == ["clip", "subject", "sentence", "mood", "voice", "text"]
-    with (corpus / "templates.pkl").open("rb") as stream:
-        templates = pickle.load(stream)  # noqa: S301 - just written by ourselves
-    assert list(templates) == [*puppet.SEEN_IDENTITIES, *puppet.UNSEEN_IDENTITIES]
-    for row in rows:
-        samples, rate = soundfile.read(corpus / "wav" / f"{row['clip']}.wav", dtype="int16")
-        motion = np.load(corpus / "vertices_npy" / f"{row['clip']}.npy")
-        assert rate == puppet.SAMPLE_RATE
-        assert samples.ndim == 1
-        assert np.abs(samples).max() > 10_000
-        assert motion.dtype == np.float32
-        assert motion.shape[1] == 3 * puppet.N_VERTICES
-        assert len(samples) == len(motion) * puppet.SAMPLE_RATE // puppet.FRAME_RATE
-        assert 40 <= len(motion) <= 100
-        rest = templates[row["subject"]]
-        assert rest.shape == (puppet.N_VERTICES, 3)
-        assert rest.dtype == np.float64
-        assert np.abs(motion.reshape(-1, puppet.N_VERTICES, 3) - rest).max() < 0.04
-        with (corpus / "phonemes" / f"{row['clip']}.csv").open(encoding="utf-8") as stream:
-            phonemes = list(csv.DictReader(stream))
-        assert float(phonemes[0]["start"]) == 0.0
-        assert float(phonemes[-1]["end"]) == pytest.approx(len(motion) / puppet.FRAME_RATE, abs=1e-3)
-    for name in ("lve", "fdd"):
-        index = [int(word) for word in (corpus / "regions" / f"{name}.txt").read_text().split(", ")]
-        assert index == sorted(set(index))
-        assert index[-1] < puppet.N_VERTICES
-    assert len((corpus / "regions" / "inner_lip_pairs.txt").read_text().splitlines()) == 13
+def test_vertices_are_what_weights_decode_to(corpus: Path) -> None:
+    weights = np.load(corpus / "weights_npy" / "F1_t01.npy")
+    vertices = np.load(corpus / "vertices_npy" / "F1_t01.npy").reshape(len(weights), -1, 3)
+    rig = rig_of("F1")
+    assert np.allclose(vertices, rig[0] + np.einsum("tk,kvc->tvc", weights, rig[1:]), atol=1e-6)
+    assert rig.shape == (1 + len(SHAPES), len(build_head().vertices), 3)
 
 
-def test_mesh_file_can_be_read(corpus: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    mesh = trimesh.load(corpus / "PUPPET.ply", process=False)
-    assert mesh.vertices.shape == (puppet.N_VERTICES, 3)
-    assert np.array_equal(mesh.faces, corpus_module.build_face().faces)
-    assert np.array_equal(mesh.visual.vertex_colors[:, :3], corpus_module.build_face().colours)
+def test_an_unknown_clip_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FaceDiffError, match="'F1_e99'"):
+        generate(tmp_path / "new", only=["F1_e01", "F1_e99"], progress=False)
+    assert not list(tmp_path.iterdir())
 
 
-def test_same_seed_same_bytes_and_other_seed_other_motion(corpus: Path, tmp_path: Path) -> None:
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        generate(tmp_path / name, seed=seed, only=["F1_e01"], progress=False)
-    first, second, other = (digests(tmp_path / name) for name in "abc")
-    assert first == second
-    assert first["wav/F1_e01.wav"] == other["wav/F1_e01.wav"]
-    assert first["vertices_npy/F1_e01.npy"] != other["vertices_npy/F1_e01.npy"]
-    assert first["vertices_npy/F1_e01.npy"] == digests(corpus)["vertices_npy/F1_e01.npy"]
+def test_what_a_small_corpus_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(0)
+    still = {name: random.normal(size=(9, 2, 3)) for name in ("lips", "upper_face")}
+    weights = {name: random.uniform(size=9) for name in ("eyeBlinkLeft", "jawOpen")}
+    clip = truth.TruthClip(weights, np.zeros((9, 2)), np.zeros((9, 3)), still, [])
+    one = {name: values[:1] for name, values in weights.items()}
+    short = truth.TruthClip(one, np.zeros((1, 2)), np.zeros((1, 3)), {k: v[:1] for k, v in still.items()}, [])
+    monkeypatch.setattr(truth, "_read", lambda *_: iter([clip, short]))
+    for part in ("weights", "gaze", "head"):
+        (tmp_path / f"{part}_npy").mkdir()
+    values = {row["measure"]: row["value"] for row in truth.measure_truth(tmp_path, ["a"], 25.0)}
+    assert values["lips apart at p, b, m, 95th percentile, mm"] == "none"
+    assert values["glances above 4°, mean size, °"] == "none"
 
 
-@pytest.mark.slow
-def test_workers_make_the_same_bytes(corpus: Path, tmp_path: Path) -> None:
-    generate(tmp_path / "two", only=["F1_e01", "M3_e01"], workers=2, progress=False)
-    assert digests(tmp_path / "two")["vertices_npy/M3_e01.npy"] == digests(corpus)["vertices_npy/M3_e01.npy"]
+def test_the_check_reads_weights_and_measures_the_truth(corpus: Path) -> None:
+    report = check(corpus)
+    assert report.sound, text(report)
+    assert report.n_vertices == len(build_head().vertices)
+    assert {row["split"]: row["present"] for row in report.splits} == {"train": 1, "test_a": 1, "test_b": 1}
+    values = {row["measure"]: row["value"] for row in report.truth}
+    frames, blinks = 0, 0
+    for name in ONLY:
+        shut = np.load(corpus / "weights_npy" / f"{name}.npy")[:, SHAPES.index("eyeBlinkLeft")] > 0.5
+        frames, blinks = frames + len(shut), blinks + int((np.diff(shut.astype(int)) == 1).sum())
+    assert float(values["blinks a minute"]) == pytest.approx(blinks / (frames / 1500), abs=0.06)
+    assert float(values["lips apart at p, b, m, 95th percentile, mm"]) < 2
+    assert "how the truth moves" in text(report)
+
+
+def test_frequencies_and_jumps_are_measured() -> None:
+    times = np.arange(500) / 25.0
+    waves = [np.sin(2 * np.pi * 3.0 * times), np.sin(2 * np.pi * 3.0 * times + 1.0)]
+    assert truth._median_frequency(waves, 25.0) == pytest.approx(3.0, abs=0.1)
+    two = np.sin(2 * np.pi * 3.0 * times) + 0.5 * np.sin(2 * np.pi * 10.0 * times)
+    assert truth._share_above([two[:, None, None]], 25.0, 8.0) == pytest.approx(0.2, abs=0.01)  # 0.25 of 1.25
+    gaze = np.zeros((20, 2))
+    gaze[5:] += [3.0, 4.0]
+    gaze[12:] -= [6.0, 0.0]
+    assert truth._jumps(gaze, 25.0) == pytest.approx([5.0, 6.0])
+
+
+def test_the_data_module_decodes_weights(corpus: Path) -> None:
+    folder = ClipFolder(corpus, len(build_head().vertices))
+    assert folder.names() == sorted(ONLY)
+    template = rig_of("F1")[0]
+    stored = folder.open("F1_t01").offsets(range(5, 9), template)  # from vertices
+    weights = np.load(corpus / "weights_npy" / "F1_t01.npy")
+    decoded = WeightFile(corpus / "weights_npy" / "F1_t01.npy", rig_of("F1")).offsets(range(5, 9), template)
+    assert np.allclose(stored, decoded, atol=1e-6)
+    assert isinstance(folder.open("F1_e01"), WeightFile)
+    with pytest.raises(FaceDiffError, match="F1_e01"):
+        WeightFile(corpus / "weights_npy" / "F1_e01.npy", rig_of("F1")[:-1])
+    data = Puppet(root=str(corpus))
+    assert data.n_vertices == len(template)
+    assert len(weights) == folder.open("F1_t01").frames
+
+
+def test_truth_closes_its_lips_and_another_truth_differs() -> None:
+    clip = next(clip for clip in performed_clips() if clip.name == "M5_t14")
+    spoken = speak_clip(clip)
+    truth, another = perform_clip(clip, spoken)
+    assert len(spoken.samples) == len(truth.weights) * 640
+    rig = rig_of("M5").astype(np.float64)
+    upper, lower = lip_pairs(build_head())
+    vertices = rig[0] + np.einsum("tk,kvc->tvc", truth.weights, rig[1:])
+    gaps = 1000.0 * np.linalg.norm(vertices[:, upper] - vertices[:, lower], axis=-1).max(axis=1)
+    closures = [p for p in spoken.phonemes if p.ipa[:1] in ("p", "b", "m")]
+    assert closures
+    for phoneme in closures:
+        assert gaps[int(0.5 * (phoneme.start + phoneme.end) * 25)] < 0.6, phoneme
+    assert gaps.max() > 4.0
+    assert np.abs(truth.weights - another.weights).max() > 0.1
+    jaw = SHAPES.index("jawOpen")  # which speech decides
+    assert np.abs(truth.weights[:, jaw] - another.weights[:, jaw]).max() < 0.1
+
+
+def test_the_mask_is_the_heads_front_in_the_number_of_vertices_of_scans() -> None:
+    mask, head = build_mask(), build_head()
+    assert mask.operator.shape == (PuppetMask.n_vertices, len(head.vertices))
+    assert np.allclose(mask.operator.sum(axis=1), 1.0)  # the rule moves with whatever it is applied to
+    vertices = mask.carry(head.vertices)
+    corners = vertices[mask.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(normals, axis=1).min() > 0
+    edges = np.sort(np.concatenate([mask.faces[:, [0, 1]], mask.faces[:, [1, 2]], mask.faces[:, [2, 0]]]), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2
+    for side in (*lip_pairs(head), *eyelid_pairs(head)):
+        assert np.linalg.norm(vertices[mask.vertex_of[side]] - head.vertices[side], axis=1).max() < 2.0
+
+
+def test_the_corpus_of_masks_moves_as_the_heads_do(tmp_path: Path) -> None:
+    generate(tmp_path / "masks", only=["X5001_e01", "X5009_t28"], production=MASK, progress=False)
+    data = PuppetMask(root=str(tmp_path / "masks"))
+    assert {split: [clip.name for clip in data.clips(split)] for split in ("train", "test_a", "test_b")} == {
+        "train": ["X5001_e01"],
+        "test_a": [],
+        "test_b": ["X5009_t28"],
+    }
+    assert data.assets().faces.shape[1] == 3
+    clip = data.clips("train")[0]
+    motion, speech = data.corpus.read_motion(clip), data.corpus.read_audio(clip, 0, data.corpus.frames(clip))
+    assert abs(len(speech) / 16_000 - len(motion) / 30) < 0.04
+    weights, head = np.load(tmp_path / "masks" / "weights_npy" / "X5001_e01.npy"), rig_of("X5001")
+    mask, place = build_mask(), np.flatnonzero(build_mask().vertex_of >= 0)
+    own = np.einsum("tk,kvc->tvc", weights, head[1:, place])
+    assert np.abs(motion.numpy()[:, mask.vertex_of[place]] - own).max() < 0.003
+    report = check(tmp_path / "masks")
+    assert report.sound, text(report)
+    assert report.corpus == "puppet_mask"
+
+
+def test_weights_are_packed_as_the_vertices_that_they_decode_to(corpus: Path, tmp_path: Path) -> None:
+    pytest.importorskip("zarr")
+    pack(corpus, tmp_path / "packed.zarr", lossless=True, workers=1)
+    folder, packed = Puppet(root=str(corpus)), Puppet(root=str(tmp_path / "packed.zarr"))
+    assert packed.n_vertices == folder.n_vertices
+    for name in ("F1_e01", "F1_t01"):  # weights, and vertices
+        own, other = (data.corpus.read_motion(data.corpus.clips[name]) for data in (folder, packed))
+        assert np.array_equal(own, other)
+
+
+def test_the_first_edition_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text('{"corpus": "facediff-puppet", "generator": "1.1"}')
+    with pytest.raises(FaceDiffError, match="holds the first edition of the built-in corpus"):
+        Puppet(root=str(tmp_path))
+    source = {"class_path": "facediff.data.puppet.Puppet", "corpus": "puppet"}
+    saved = {"data_source": source, "datamodule_hyper_parameters": {"seed": 3, "edition": 2}}
+    assert corpus_of(tmp_path / "new.ckpt", {DATA_SOURCE_KEY: source, **saved})[1] == {"seed": 3}
+    saved["datamodule_hyper_parameters"] = {"seed": 3, "edition": 1}
+    with pytest.raises(FaceDiffError, match="old.ckpt: edition=1 of .*Puppet is an option of facediff 1.1"):
+        corpus_of(tmp_path / "old.ckpt", {DATA_SOURCE_KEY: source, **saved})
+
+
+def test_further_speech_is_the_same_by_number_and_in_no_sentence_of_the_test() -> None:
+    speech = Puppet(drawn_speakers=2).further_speech()
+    assert not set(UNSEEN) & set(speech.keywords["identities"])
+    one = spoken_words(3, ("F1", "M1"))
+    assert np.array_equal(one, spoken_words(3, ("F1", "M1")))
+    assert not np.array_equal(one, spoken_words(4, ("F1", "M1")))
+    assert 1.5 < len(one) / 16_000 < 8
+    assert len(set(WORDS)) == len(WORDS)
 
 
 def test_manifest_names_every_file(corpus: Path) -> None:
@@ -141,21 +246,21 @@ def test_manifest_names_every_file(corpus: Path) -> None:
 
 
 def test_only_a_whole_corpus_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = tmp_path / "corpus"
-    assert not is_complete(root)
-    generate(root, only=["F1_e01"], progress=False)
-    assert not is_complete(root)
-    monkeypatch.setattr(corpus_module, "clips", lambda drawn=0: clips(drawn)[:2])
-    generate(root, progress=False)
-    assert is_complete(root)
-    assert not is_complete(root, seed=1)
-    stamp = (root / "manifest.json").stat().st_mtime_ns
-    generate(root, progress=False)
-    assert (root / "manifest.json").stat().st_mtime_ns == stamp
-    (root / "wav" / "F1_e02.wav").write_bytes(b"")
-    assert not is_complete(root)
-    (root / "manifest.json").write_text("{")
-    assert not is_complete(root)
+    root, stamps = tmp_path / "corpus", []
+
+    def make(**options: object) -> None:
+        generate(root, progress=False, **options)
+        stamps.append((root / "manifest.json").stat().st_mtime_ns)
+
+    make(only=["F1_e01"])
+    every = performed_clips()
+    monkeypatch.setattr(corpus_module, "performed_clips", lambda *_: every[:2])
+    make()
+    make()
+    (root / "wav" / f"{every[1].name}.wav").write_bytes(b"")
+    make()
+    make(seed=1)
+    assert [first == second for first, second in pairwise(stamps)] == [False, True, False, False]
 
 
 def test_an_interruption_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,35 +269,21 @@ def test_an_interruption_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(corpus_module, "_write_clip", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        generate(tmp_path / "corpus", progress=False)
+        generate(tmp_path / "corpus", only=ONLY, progress=False)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(FaceDiffError, match="not empty"):
-        generate(tmp_path, progress=False)
-    with pytest.raises(FaceDiffError, match="is a file"):
-        generate(tmp_path / "thesis.tex", progress=False)
-    with pytest.raises(FaceDiffError, match="thesis.tex/below: cannot be written"):
-        generate(tmp_path / "thesis.tex" / "below", progress=False)
-    with pytest.raises(FaceDiffError, match="no clip 'F1_e99'"):
-        generate(tmp_path / "new", only=["F1_e99"], progress=False)
-    assert (tmp_path / "thesis.tex").read_text() == "precious"
+    (tmp_path / "manifest.json").write_text('{"name": "my browser extension"}')
+    with pytest.raises(FaceDiffError, match="holds no manifest of the built-in corpus"):
+        generate(tmp_path, only=ONLY, progress=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
 
 
 def test_importing_is_cheap() -> None:
     script = (
-        "import sys, facediff.synthetic as p; heavy = 'torch soundfile soxr espeakng_loader tqdm'.split()\n"
-        "print(p.N_VERTICES, *(name for name in heavy if name in sys.modules))"
+        "import sys, facediff.synthetic; heavy = 'torch soundfile soxr espeakng_loader tqdm'.split()\n"
+        "print(*(name for name in heavy if name in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == [str(puppet.N_VERTICES)]
-
-
-def test_somebody_elses_folder_is_never_replaced(tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "manifest.json").write_text('{"name": "my browser extension"}')
-    with pytest.raises(FaceDiffError, match="holds no manifest of the built-in corpus"):
-        generate(tmp_path / "mine", only=["F1_e01"], progress=False)
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["manifest.json"]
+    assert done.stdout.split() == []

@@ -1,4 +1,4 @@
-"""What is known of the second edition's head: lids, eyeballs, brows, shapes and named places."""
+"""Parts of the built-in head: lids, eyeballs, brows, shapes and named places."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from facediff.editing.shapes import read_shapes
 from facediff.spaces.arkit import ALPHABETICAL
 from facediff.synthetic.head.parts import build_head
 from facediff.synthetic.head.rig import eyelid_pairs
-from facediff.synthetic.known_faces import built_in_shapes, known_face, resting_faces
+from facediff.synthetic.known_faces import built_in_shapes, known_face, resting_heads
 
 MESH = build_head()
 
@@ -28,7 +28,7 @@ def gap(vertices: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("stretch", "open_mm", "shut_mm"), [(1.0, 8.0, 0.8), (1.2, 9.0, 2.0)])
 def test_lids_shut_over_eyeballs(stretch: float, open_mm: float, shut_mm: float) -> None:
-    face = resting_faces(2)["M4"] * stretch  # the stretched one is nobody's
+    face = resting_heads()["M4"] * stretch  # the stretched one is nobody's
     eyes = puppet_eyes(face, MESH.faces)
     assert eyes is not None
     assert eyes.closing is not None
@@ -39,7 +39,7 @@ def test_lids_shut_over_eyeballs(stretch: float, open_mm: float, shut_mm: float)
 
 
 def test_a_speaker_is_recognised_by_the_face() -> None:
-    face = known_face(resting_faces(2)["F5"].astype(np.float32), MESH.faces)
+    face = known_face(resting_heads()["F5"].astype(np.float32), MESH.faces)
     assert face is not None
     assert face.speaker == "F5"
     assert face.distance < 1e-6
@@ -48,7 +48,7 @@ def test_a_speaker_is_recognised_by_the_face() -> None:
 
 
 def test_brows_rise() -> None:
-    brows = brows_of(resting_faces(2)["F1"], MESH.faces, {}, "m")
+    brows = brows_of(resting_heads()["F1"], MESH.faces, {}, "m")
     moved = np.linalg.norm(brows.up, axis=1) > 0.0005
     assert (brows.up[moved, 1] > 0).all()
     assert (MESH.vertices[moved, 1] > 20).all()
@@ -59,7 +59,7 @@ def test_shapes_are_arkits_and_the_speakers_own(tmp_path: Path) -> None:
     neutral, faces, shapes = built_in_shapes("M1")
     assert tuple(shapes) == ALPHABETICAL
     assert np.array_equal(faces, MESH.faces)
-    assert np.allclose(neutral, resting_faces(2)["M1"], atol=1e-7)
+    assert np.allclose(neutral, resting_heads()["M1"], atol=1e-7)
     deltas = np.stack(list(shapes.values())) - neutral
     assert main(["blendshapes", "--write-puppet-shapes", str(tmp_path / "m1"), "--identity", "M1"]) == 0
     for folder in (Path("puppet"), tmp_path / "m1"):
@@ -70,8 +70,8 @@ def test_shapes_are_arkits_and_the_speakers_own(tmp_path: Path) -> None:
 
 
 def test_named_places_lie_where_they_say() -> None:
-    places = puppet_landmarks(2)
-    known = known_topology(resting_faces(2)["M3"])
+    places = puppet_landmarks()
+    known = known_topology(resting_heads()["M3"])
     assert known is not None
     assert known.topology == "puppet"
     assert known.vertices == places

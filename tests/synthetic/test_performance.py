@@ -8,8 +8,8 @@ import pytest
 from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.head.rig import SHAPES
-from facediff.synthetic.motion import ProsodyContours
 from facediff.synthetic.performance import MOODS, FaceMotion, SpeakingHabits, perform
+from facediff.synthetic.prosody import ProsodyContours
 
 RATE = 100.0
 

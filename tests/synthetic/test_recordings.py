@@ -12,8 +12,8 @@ import soundfile
 
 from facediff.data import Puppet
 from facediff.errors import FaceDiffError
+from facediff.synthetic.corpus import generate, performed_clips
 from facediff.synthetic.recordings import phones_of, read_text_grid, recordings_of, speakers_of
-from facediff.synthetic.second_edition import generate_second, performed_clips
 from facediff.synthetic.voices import Delivery, installed_voices, open_voice
 
 PHONES = [(0.0, 0.3, "sil"), (0.3, 0.45, "M"), (0.45, 0.8, "AA1"), (0.8, 0.9, "M"), (0.9, 1.1, "AH0"), (1.1, 1.4, "")]
@@ -131,7 +131,7 @@ def test_a_recording_in_two_formats_is_one_and_capitals_do_not_matter(people: Pa
 
 def test_drawn_speakers_speak_with_the_recordings_of_people(people: Path, tmp_path: Path) -> None:
     data = Puppet(root=str(tmp_path / "corpus"), drawn_speakers=3, recordings=str(people))
-    voices = data.edition.people
+    voices = data.voices
     assert [Path(voice).name for voice in voices] == ["174", "84"]
     clips = [clip for clip in performed_clips(3, voices) if clip.identity.startswith("X")]
     assert [(clip.identity, Path(clip.voice).name) for clip in clips][:3] == [
@@ -139,7 +139,7 @@ def test_drawn_speakers_speak_with_the_recordings_of_people(people: Path, tmp_pa
         ("X01", "a-2"),
         ("X02", "a-1"),
     ]
-    generate_second(tmp_path / "corpus", drawn=3, people=voices, only=[clips[0].name], progress=False)
+    generate(tmp_path / "corpus", drawn=3, people=voices, only=[clips[0].name], progress=False)
     with (tmp_path / "corpus" / "phonemes" / "X01_e01.csv").open(encoding="utf-8") as stream:
         phonemes = list(csv.DictReader(stream))
     assert "".join(row["ipa"] for row in phonemes) == "mɑmʌ"

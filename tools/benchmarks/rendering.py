@@ -99,18 +99,17 @@ def matplotlib_painter(faces: Faces, pixels: int) -> Callable[[Array], object]:
 
 def talking_faces(frames: int) -> dict[str, tuple[Array, Faces, npt.NDArray[np.uint8]]]:
     """Motion (T, V, 3), faces and colours of the built-in face and of an egg of BIWI's size, whose mouths open."""
-    from facediff.synthetic.face import build_face
-    from facediff.synthetic.rig import CONTROLS, Shape, build_rig
+    from facediff.synthetic.head.parts import build_head
+    from facediff.synthetic.known_faces import built_in_rig
 
     opening = np.sin(np.arange(frames) / 2) ** 2
-    weights = np.zeros((frames, len(CONTROLS)))
-    weights[:, CONTROLS.index("jaw_open")] = opening
-    face = build_face()
+    rig = built_in_rig()
+    talking = rig.neutral + opening[:, None, None] * rig.deltas[rig.names.index("jawOpen")]
     egg, egg_faces = head(SIZES[-1])
     moving = motion(egg)[np.rint(opening * (FRAMES // 2)).astype(int)]
     tint = np.rint(255 * np.clip(np.abs(egg), 0, 1)).astype(np.uint8)
     return {
-        "the built-in face": (build_rig(Shape()).pose(weights), face.faces.astype(np.int64), face.colours),
+        "the built-in face": (talking, build_head().faces.astype(np.int64), build_head().colours),
         "an egg of BIWI's size": (moving, egg_faces, tint),
     }
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from facediff.data import SpeechMotionDataModule
 from facediff.data.check.layouts import by_name, instance, list_folder, recognise
 from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
-from facediff.data.puppet import SecondEdition, built_in_mesh, cache_root, made_root
+from facediff.data.puppet import cache_root, made_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import FigureData, find_clips
 from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
@@ -58,9 +58,7 @@ def gather(
     if truth == Path("puppet") and not truth.is_dir():
         built_in = made_root(0)
         if built_in is None:
-            raise FaceDiffError(
-                f"{cache_root(SecondEdition())}: the built-in corpus does not exist yet; `facediff demo` makes it"
-            )
+            raise FaceDiffError(f"{cache_root()}: the built-in corpus does not exist yet; `facediff demo` makes it")
         truth = built_in
     folder, corpus = find_truths(truth)
     manifest = read_manifest(corpus) if corpus else {}
@@ -121,7 +119,7 @@ def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> Speech
 
 
 def _find_mesh(path: Path | None, root: Path, module: SpeechMotionDataModule | None, n_vertices: int) -> Mesh | None:
-    """The mesh given, else the one in the corpus folder, else the first edition's; None without one."""
+    """The mesh given, else the one in the corpus folder; None without one."""
     if path is not None:
         mesh = read_mesh(path)
         if len(mesh.vertices) != n_vertices:
@@ -133,8 +131,6 @@ def _find_mesh(path: Path | None, root: Path, module: SpeechMotionDataModule | N
     for file in files:
         if file.is_file() and len((mesh := read_mesh(file)).vertices) == n_vertices:
             return mesh
-    if module is not None and module.corpus_name == "puppet" and len((first := built_in_mesh()).vertices) == n_vertices:
-        return first
     return None
 
 

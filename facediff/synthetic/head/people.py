@@ -16,7 +16,6 @@ from facediff.synthetic.head.hair import HairStyle, density, hair_points
 from facediff.synthetic.head.layout import MOUTH_Y
 from facediff.synthetic.head.mesh import QuadMesh
 from facediff.synthetic.head.parts import BROW_COLUMNS, EYE_CENTRE, HAIR, SHIRT, SKIN
-from facediff.synthetic.rig import Shape
 
 SKIN_TONES = {
     "pale": (238, 200, 180),
@@ -59,17 +58,40 @@ class Complexion:
 
 
 @dataclass(frozen=True)
-class GroupShape:
-    """What people of a group have in common; every number is about -1 to 1, and 0 changes nothing."""
+class Face:
+    """How a head differs from the average one: what people of a group have in common, and what is left to each.
+
+    Every number is about -1 to 1, and 0 changes nothing.
+    """
 
     sex: float = 0.0  # -1 as women's faces are on average, 1 as men's
     age: float = 0.0  # Older: fuller lower face, thinner lips, longer nose and ears, deeper folds
     weight: float = 0.0  # Fuller cheeks, neck and chin
-
-
-@dataclass(frozen=True)
-class Face(Shape, GroupShape):
-    """How a head differs from the average one: what people of a group have in common, and what is left to each."""
+    width: float = 0.0  # Whole head wider
+    length: float = 0.0  # Lower face longer
+    depth: float = 0.0  # Back of the head fuller
+    jaw: float = 0.0  # Jaw wider at its angle
+    chin_width: float = 0.0  # Chin broader and squarer
+    chin: float = 0.0  # Chin longer and further forward
+    neck: float = 0.0  # Neck thicker
+    nose_length: float = 0.0  # Nose longer downwards
+    nose_width: float = 0.0  # Nose broader at its wings
+    nose_bridge: float = 0.0  # Bridge higher
+    nose_tip: float = 0.0  # Tip further forward
+    nose_up: float = 0.0  # Tip turned up
+    eye_size: float = 0.0  # Eyes larger
+    eye_gap: float = 0.0  # Eyes further apart
+    eye_tilt: float = 0.0  # Outer corners higher
+    brow_height: float = 0.0  # Brows higher
+    brow_ridge: float = 0.0  # Ridge above the eyes stronger
+    brow_tilt: float = 0.0  # Outer ends of the brows higher
+    lips: float = 0.0  # Lips fuller
+    mouth_width: float = 0.0  # Mouth wider
+    mouth_forward: float = 0.0  # Mouth further forward
+    cheekbones: float = 0.0  # Cheekbones stronger
+    cheeks: float = 0.0  # Cheeks fuller
+    forehead: float = 0.0  # Forehead higher and rounder
+    ears: float = 0.0  # Ears larger and further from the head
 
     def __call__(self, points: Array) -> Array:
         """Where points (..., 3) of the average head lie in this person's, both in mm."""

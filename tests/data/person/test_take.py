@@ -16,8 +16,8 @@ from facediff.data.person import import_take
 from facediff.errors import FaceDiffError
 from facediff.spaces import Space
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
+from facediff.synthetic.corpus import perform_clip, performed_clips, speak_clip
 from facediff.synthetic.head.rig import SHAPES
-from facediff.synthetic.second_edition import perform_clip, performed_clips, speak_clip
 
 RATE = 30.0
 

@@ -20,14 +20,13 @@ from facediff.mesh import read_mesh
 from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.visemes import visemes
-from facediff.synthetic.arkit import puppet_shapes
-from facediff.synthetic.known_faces import write_puppet_shapes
+from tests.fakes.small_face import small_shapes, write_small_shapes
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("shapes") / "puppet"
-    write_puppet_shapes(made, edition=1)
+    write_small_shapes(made)
     return made
 
 
@@ -64,8 +63,8 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def test_the_puppets_shapes_are_arkits(folder: Path) -> None:
-    neutral, faces, shapes = puppet_shapes()
+def test_shapes_are_arkits(folder: Path) -> None:
+    neutral, faces, shapes = small_shapes()
     made = read_shapes(folder, neutral)
     assert set(made.names) == set(shapes) == set(ARKIT)
     assert made.still == ("tongueOut",)

@@ -13,7 +13,7 @@ from facediff.editing.blendshapes import SolveOptions, key_frames, solve
 from facediff.editing.bounded import least_squares
 from facediff.editing.shapes import ShapeSet, check_shapes, read_shapes
 from facediff.errors import FaceDiffError
-from facediff.synthetic.arkit import puppet_shapes
+from tests.fakes.small_face import F1, small_shapes
 
 RNG = np.random.default_rng(3)
 NEUTRAL = RNG.normal(0, 0.08, (60, 3))
@@ -52,7 +52,7 @@ def test_shapes_that_cancel_one_another_rest() -> None:
 
 
 def test_weights_that_are_known_come_back_nearer_than_with_a_strong_sparsity() -> None:
-    rest, _, shapes = puppet_shapes(None)
+    rest, _, shapes = small_shapes()
     names = tuple(name for name in shapes if name != "tongueOut")
     known = ShapeSet(names, rest, np.stack([shapes[name] - rest for name in names]))
     waves = np.sin(np.linspace(0, 6, 20)[:, None] * RNG.uniform(0.3, 2, len(names)) + RNG.uniform(0, 6, len(names)))
@@ -108,7 +108,7 @@ def test_keys_are_few_and_within_the_tolerance(tolerance: float) -> None:
 
 @pytest.mark.slow
 def test_built_in_shapes_are_of_the_nearest_speaker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    neutral, _, shapes = puppet_shapes("F2")
+    neutral, _, shapes = small_shapes(F1)
     found = read_shapes(Path("puppet"), neutral + [0.02, 0, 0])
     for name, delta in zip(found.names, found.deltas, strict=True):
         assert delta == pytest.approx(shapes[name] - neutral, abs=1e-9), name
@@ -127,7 +127,7 @@ def test_built_in_shapes_are_of_the_nearest_speaker(tmp_path: Path, monkeypatch:
 
 def test_eyes_turn_about_their_centres() -> None:
     """Each eyeball keeps its distances and looks to the side of its name; all else stays."""
-    neutral, _, shapes = puppet_shapes()
+    neutral, _, shapes = small_shapes()
     for side, nose in (("Left", -1.0), ("Right", 1.0)):
         moved = shapes[f"eyeLookIn{side}"] - neutral
         ball = np.flatnonzero(np.abs(moved).max(axis=1) > 1e-6)

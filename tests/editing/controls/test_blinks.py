@@ -11,7 +11,7 @@ from facediff.animation import Animation
 from facediff.editing.eyes import Eyes
 from facediff.editing.procedural import add_blinks, blink_curve
 from facediff.errors import FaceDiffError
-from facediff.synthetic.face import build_face
+from facediff.synthetic.head.parts import build_head
 
 
 def pulses(curve: np.ndarray) -> list[tuple[int, int]]:
@@ -65,10 +65,10 @@ def test_equal_seeds_give_equal_blinks(make_animation: Callable[..., Animation],
 def test_lids_meet_in_a_still_and_in_a_widened_eye_and_nothing_else_moves(
     make_animation: Callable[..., Animation], eyes: Eyes
 ) -> None:
-    mesh = build_face()
-    ring = mesh.groups["eye_0"]
-    upper, lower = ring[1:8], ring[9:][::-1]
-    for animation in (make_animation(250), make_animation(250, lids_wide=0.5, squint=0.1, outer_brow_up=0.4)):
+    mesh = build_head()
+    ring = mesh.groups["eye_edge"]
+    upper, lower = ring[1:12], ring[13:][::-1]
+    for animation in (make_animation(250), make_animation(250, eyeWide=0.5, eyeSquint=0.1, browOuterUp=0.4)):
         made = add_blinks(animation, eyes, rate=30)
         curve = blink_curve(250, 25.0, rate=30)
         frame = int(curve.argmax())
@@ -83,12 +83,12 @@ def test_lids_meet_in_a_still_and_in_a_widened_eye_and_nothing_else_moves(
 
 
 def test_an_eye_that_is_shut_already_stays_as_it_is(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
-    shut = make_animation(250, lids_close=1.0)
+    shut = make_animation(250, eyeBlink=1.0)
     made = add_blinks(shut, eyes, rate=40)
     np.testing.assert_allclose(made.vertices, shut.vertices, atol=1e-6)
-    half = make_animation(250, lids_close=0.4)
+    half = make_animation(250, eyeBlink=0.4)
     curve = blink_curve(250, 25.0, rate=40)
-    expected = make_animation(250, lids_close=0.4 + curve * 0.6)
+    expected = make_animation(250, eyeBlink=0.4 + curve * 0.6)
     lids = eyes.lids()[0]
     np.testing.assert_allclose(add_blinks(half, eyes, rate=40).vertices[:, lids], expected.vertices[:, lids], atol=1e-6)
 

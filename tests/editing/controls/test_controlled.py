@@ -52,7 +52,7 @@ def test_editing_is_imported_only_where_it_is_asked_for() -> None:
 
 
 def test_all_options_in_their_order(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
-    animation = make_animation(200, jaw_open=0.4, lids_close=0.1)
+    animation = make_animation(200, jawOpen=0.4, eyeBlink=0.1)
     controls = parsed("--expressiveness", "upper_face=1.5", "--blinks", "20", "--gaze", "--sway", "3")
     made = apply_controls(animation, controls, seed=7)
     by_hand = scale_regions(animation, {"upper_face": 1.5}, eyes)
@@ -146,7 +146,7 @@ def test_shape_keys_add_their_displacements(make_animation: Callable[..., Animat
     animation = make_animation(3, frame_rate=2.0)
     keys = [Key(0, "shape.jawOpen", 0.0, "linear"), Key(1, "shape.jawOpen", 1.0), Key(0, "shape.mouthSmileLeft", -0.5)]
     moved = apply_controls(animation, AnimationControls(direction=Direction(keys))).vertices
-    rig = built_in_rig("F1", 1)
+    rig = built_in_rig("F1")
     jaw, smile = (rig.deltas[rig.names.index(name)] for name in ("jawOpen", "mouthSmileLeft"))
     np.testing.assert_allclose(moved - animation.vertices, [t * jaw - 0.5 * smile for t in (0, 0.5, 1)], atol=1e-7)
     with pytest.raises(FaceDiffError, match="shape"):

@@ -15,7 +15,7 @@ from facediff.errors import FaceDiffError
 
 
 def test_one_factor_scales_every_offset(make_animation: Callable[..., Animation]) -> None:
-    animation = make_animation(5, jaw_open=np.linspace(0, 1, 5), outer_brow_up=0.5)
+    animation = make_animation(5, jawOpen=np.linspace(0, 1, 5), browOuterUp=0.5)
     scaled = scale_regions(animation, {"all": 1.7})
     np.testing.assert_allclose(
         scaled.vertices - animation.template, 1.7 * (animation.vertices - animation.template), atol=1e-7
@@ -27,7 +27,7 @@ def test_one_factor_scales_every_offset(make_animation: Callable[..., Animation]
 
 
 def test_a_region_gets_its_own_factor_and_what_is_far_the_rest(make_animation: Callable[..., Animation]) -> None:
-    animation = make_animation(2, jaw_open=0.7, inner_brow_up=1.0, lids_close=0.2)
+    animation = make_animation(2, jawOpen=0.7, browInnerUp=1.0, eyeBlink=0.2)
     factors = {"upper_face": 1.5, "lips": 0.5, "all": 1.1}
     scaled = scale_regions(animation, factors)
     before, after = (t.vertices[1] - t.template for t in (animation, scaled))
@@ -43,7 +43,7 @@ def test_a_region_gets_its_own_factor_and_what_is_far_the_rest(make_animation: C
 
 
 def test_a_region_without_vertices_changes_nothing(make_animation: Callable[..., Animation]) -> None:
-    animation = make_animation(2, jaw_open=0.7)
+    animation = make_animation(2, jawOpen=0.7)
     bare = replace(animation, regions={**animation.regions, "upper_face": np.zeros(0, np.int64)})
     np.testing.assert_allclose(scale_regions(bare, {"upper_face": 3.0}).vertices, animation.vertices, atol=1e-7)
 
@@ -82,8 +82,8 @@ def test_neighbouring_regions_blend_without_a_step() -> None:
 
 
 def test_a_blink_stays_a_blink_where_the_lids_are_known(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
-    shut = make_animation(1, lids_close=1.0, inner_brow_up=0.8)
-    brows = make_animation(1, inner_brow_up=0.8)
+    shut = make_animation(1, eyeBlink=1.0, browInnerUp=0.8)
+    brows = make_animation(1, browInnerUp=0.8)
     blind, seeing = (scale_regions(shut, {"all": 2.0}, known) for known in (None, eyes))
     lids, closing = eyes.lids()
     strong = np.linalg.norm(closing, axis=1) > 0.5 * np.linalg.norm(closing, axis=1).max()

@@ -50,7 +50,7 @@ def test_gaze_is_fixations_and_quick_saccades() -> None:
 
 
 def test_eyeballs_turn_about_their_centres_by_the_angle(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
-    animation = make_animation(250, jaw_open=0.3)
+    animation = make_animation(250, jawOpen=0.3)
     made = add_gaze(animation, eyes, degrees=8, seed=1)
     angles = gaze_curve(250, 25.0, degrees=8, seed=1)
     frame = int(np.abs(angles).sum(1).argmax())
@@ -95,7 +95,7 @@ def test_the_centre_of_a_sphere_is_found_from_a_part_of_it() -> None:
 
 
 def test_sway_moves_the_head_as_one_within_its_bounds(make_animation: Callable[..., Animation]) -> None:
-    animation = make_animation(250, jaw_open=np.linspace(0, 1, 250))
+    animation = make_animation(250, jawOpen=np.linspace(0, 1, 250))
     made = add_sway(animation, degrees=3, seed=5)
     angles, shifts = [], []
     for frame in range(0, 250, 10):
@@ -153,7 +153,7 @@ def test_impossible_angles(degrees: float) -> None:
 def test_an_animation_on_disk_is_changed_on_disk_and_leaves_no_file(
     make_animation: Callable[..., Animation], eyes: Eyes, tmp_path: Path
 ) -> None:
-    animation = make_animation(300, jaw_open=0.5)
+    animation = make_animation(300, jawOpen=0.5)
     np.save(tmp_path / "long.npy", animation.vertices)
     mapped = replace(animation, vertices=np.load(tmp_path / "long.npy", mmap_mode="r"))
 

@@ -19,9 +19,8 @@ from facediff.editing.fit_check import check_fit
 from facediff.editing.retargeting import carry, carry_checked
 from facediff.mesh import Mesh
 from facediff.mesh.mesh import triangle_areas
-from facediff.synthetic.arkit import puppet_shapes
-from facediff.synthetic.rig import Shape
 from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking
+from tests.fakes.small_face import M2, Shape, small_shapes
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +215,7 @@ def test_a_beard_over_the_mouth_is_not_the_face(animation: Animation) -> None:
 
 def test_triangles_without_area_do_not_close_the_mouth() -> None:
     """Decimation and written digits leave some; without them, lips that touch would look like a texture's seam."""
-    vertices, faces, _ = puppet_shapes("M2")
+    vertices, faces, _ = small_shapes(M2)
     vertices = vertices.round(9)
     for _ in range(2):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)

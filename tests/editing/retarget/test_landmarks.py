@@ -32,11 +32,11 @@ from facediff.editing.surface import Surface, nearest
 from facediff.editing.symmetry import Plane, symmetry_plane
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import Shape, build_rig, lip_pairs
-from tests.fakes.heads import LONG, ROUND, STRONG, YOUNG, lower_face, lower_face_marks, talking, turned
+from facediff.synthetic.head.parts import build_head
+from tests.fakes.heads import LONG, ROUND, STRONG, YOUNG, lower_face, lower_face_marks, talking, talking_second, turned
+from tests.fakes.small_face import LANDMARKS, Shape, build_face, build_rig
 
-FACE = build_face()
+FACE, HEAD = build_face(), build_head()
 
 
 def test_names_are_pairs_of_mirror_images_or_lie_in_the_middle() -> None:
@@ -45,36 +45,10 @@ def test_names_are_pairs_of_mirror_images_or_lie_in_the_middle() -> None:
     assert len(set(found.values())) == len(NAMES)
     for name, vertex in found.items():
         if name.endswith("_left"):
-            assert FACE.mirror[vertex] == found[name.removesuffix("_left") + "_right"]
-            assert FACE.vertices[vertex, 0] > 0
+            assert HEAD.mirror[vertex] == found[name.removesuffix("_left") + "_right"]
+            assert HEAD.vertices[vertex, 0] > 0
         elif not name.endswith("_right"):
-            assert FACE.mirror[vertex] == vertex
-
-
-def test_names_of_the_built_in_face_are_where_they_say() -> None:
-    found, points = puppet_landmarks(), FACE.vertices
-    skin = FACE.both("skin")
-    assert found["nose_tip"] == skin[points[skin, 2].argmax()]
-    below = skin[points[skin, 1] < points[found["lower_lip_bottom"], 1] - 0.01]
-    assert points[found["chin"], 2] == points[below, 2].max()
-    for name, edge in (("eye_outer_left", max), ("eye_inner_left", min)):
-        opening = FACE.groups["eye_0"]
-        assert points[found[name], 0] == edge(points[opening, 0])
-    middle = points[[found[name] for name in NAMES if not name.endswith(("_left", "_right"))]]
-    heights = dict(zip((name for name in NAMES if not name.endswith(("_left", "_right"))), middle[:, 1], strict=True))
-    down = ["nose_bridge", "nose_tip", "nose_base", "upper_lip_top", "upper_lip_middle"]
-    down += ["lower_lip_middle", "lower_lip_bottom", "chin"]
-    assert sorted(heights, key=lambda name: -heights[name]) == down
-
-
-def test_the_lips_middles_are_next_to_the_middle_pair_of_the_lips() -> None:
-    upper, lower = lip_pairs(FACE)
-    edges = {
-        tuple(sorted(pair)) for face in FACE.faces.tolist() for pair in zip(face, face[1:] + face[:1], strict=True)
-    }
-    for name, lip in (("upper_lip_middle", upper), ("lower_lip_middle", lower)):
-        middle = lip[FACE.vertices[lip, 0] == 0.0][0]
-        assert tuple(sorted((puppet_landmarks()[name], int(middle)))) in edges
+            assert HEAD.mirror[vertex] == vertex
 
 
 def test_flame_has_every_name_once() -> None:
@@ -85,7 +59,7 @@ def test_flame_has_every_name_once() -> None:
 
 @pytest.mark.parametrize("shape", [Shape(), ROUND, LONG, STRONG, YOUNG])
 def test_a_topology_is_known_in_every_unit_and_pose_and_not_in_another_order(shape: Shape) -> None:
-    points = build_rig(shape).neutral
+    points = shape(HEAD.vertices / 1000)
     found = known_topology(1000 * points @ turned(90, 30, 200).T + 7)
     assert found is not None
     assert (found.topology, found.missing) == ("puppet", [])
@@ -97,21 +71,21 @@ def flame_like() -> np.ndarray:
     """A mesh with FLAME's number of vertices, in which FLAME's landmarks are where the puppet's are."""
     points = np.random.default_rng(1).normal(0, 0.05, (FLAME_VERTICES, 3))
     for name, vertex in puppet_landmarks().items():
-        points[FLAME[name]] = FACE.vertices[vertex]
+        points[FLAME[name]] = HEAD.vertices[vertex] / 1000
     return points
 
 
 def test_meshes_of_two_topologies_have_common_landmarks() -> None:
-    found = common_landmarks(FACE.vertices, flame_like())
+    found = common_landmarks(HEAD.vertices, flame_like())
     assert found is not None
     assert found.names == tuple(NAMES)
     assert found.nearest_vertices.tolist() == [[puppet_landmarks()[name], FLAME[name]] for name in NAMES]
-    assert common_landmarks(FACE.vertices, np.random.default_rng(2).normal(size=(FLAME_VERTICES, 3))) is None
+    assert common_landmarks(HEAD.vertices, np.random.default_rng(2).normal(size=(FLAME_VERTICES, 3))) is None
 
 
 def test_shape_alone_shows_the_mouth_the_eyes_and_the_nose() -> None:
     found = landmarks_by_shape(FACE.vertices, FACE.faces)
-    truth = puppet_landmarks()
+    truth = LANDMARKS
     assert set(found) == {name for name in NAMES if name.startswith(("eye", "mouth")) or name in SEEN}
     away = {name: np.linalg.norm(FACE.vertices[vertex] - FACE.vertices[truth[name]]) for name, vertex in found.items()}
     assert max(away.values()) < 0.006  # metres
@@ -149,11 +123,12 @@ def test_landmarks_come_back_as_they_were(tmp_path: Path) -> None:
 
 
 def test_names_stand_for_vertices_where_the_topology_is_known(tmp_path: Path) -> None:
-    known = known_topology(FACE.vertices)
+    known = known_topology(HEAD.vertices)
+    tip, outer = (puppet_landmarks()[name] for name in ("nose_tip", "eye_outer_left"))
     path = tmp_path / "a.csv"
     path.write_text("animation,mine\nnose_tip,4034\n7,chin\neye_outer_left\n")
     found = read_landmarks(path, known, known)
-    assert found.nearest_vertices.tolist() == [[124, 4034], [7, 159], [53, 53]]
+    assert found.nearest_vertices.tolist() == [[tip, 4034], [7, puppet_landmarks()["chin"]], [outer, outer]]
     assert found.names == ("nose_tip", "chin", "eye_outer_left")
     path.write_text("nose_tip,4034\n")  # a name is no header
     assert len(read_landmarks(path, known)) == 1
@@ -161,7 +136,7 @@ def test_names_stand_for_vertices_where_the_topology_is_known(tmp_path: Path) ->
         read_landmarks(path)
     bare = {"format": "facediff landmarks 1", "landmarks": [{"name": "nose_tip", "target": 4034}]}
     (tmp_path / "a.json").write_text(json.dumps(bare))
-    assert read_landmarks(tmp_path / "a.json", known).nearest_vertices.tolist() == [[124, 4034]]
+    assert read_landmarks(tmp_path / "a.json", known).nearest_vertices.tolist() == [[tip, 4034]]
 
 
 def test_landmarks_of_other_meshes_and_names_that_are_none_are_refused(tmp_path: Path) -> None:
@@ -248,9 +223,9 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
         raise FaceDiffError(f"attempt {len(given)}")
 
     monkeypatch.setattr(retargeting, "correspond", refused)
-    animation = talking()
+    animation = talking_second()
     target = tmp_path / "other.ply"
-    mesh = trimesh.Trimesh(build_rig(LONG).neutral, FACE.faces[::-1], process=False)
+    mesh = trimesh.Trimesh(LONG(HEAD.vertices / 1000), HEAD.faces[::-1], process=False)
     mesh.export(target)
     with pytest.raises(FaceDiffError, match="attempt 2"):
         retargeting.retarget(animation, target, judge=lambda *_: None)
@@ -263,13 +238,13 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
     with pytest.raises(FaceDiffError, match="attempt 1"):  # a person's own landmarks are the last word
         retargeting.retarget(animation, target, None, tmp_path / "own.csv", judge=lambda *_: None)
     assert given[0] is not None
-    assert given[0].nearest_vertices.tolist() == [[124, 5]]
+    assert given[0].nearest_vertices.tolist() == [[puppet_landmarks()["nose_tip"], 5]]
 
 
 @pytest.mark.slow
 def test_six_landmarks_cure_a_mask_that_is_refused_without() -> None:
     head, animation = lower_face(), talking()
-    marks, mine = lower_face_marks(head), puppet_landmarks()
+    marks, mine = lower_face_marks(head), LANDMARKS
     pairs = np.array([[mine[name], vertex] for name, vertex in marks.items()])
 
     def report(landmarks: np.ndarray | None) -> FitReport:
@@ -286,7 +261,7 @@ def test_six_landmarks_cure_a_mask_that_is_refused_without() -> None:
 def test_the_manual_lists_the_names_with_their_vertices() -> None:
     page = (Path(__file__).parents[3] / "docs" / "own_mesh.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| [^|]+ \| (\d+ \| \d+) \|$", page, re.MULTILINE))
-    face = puppet_landmarks(2)  # of the built-in corpus as it is made now
+    face = puppet_landmarks()
     assert rows == {name: f"{face[name]} | {FLAME[name]}" for name in NAMES}
 
 

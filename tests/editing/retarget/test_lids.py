@@ -10,9 +10,8 @@ from facediff.animation import Animation
 from facediff.editing.face_features import Features, find_features
 from facediff.editing.lids import EyeLids, eye_lids, eyeball_depth, lid_edges, swing, with_lids, without_lids
 from facediff.editing.surface import Surface
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import eyelid_pairs
 from tests.fakes.heads import talking
+from tests.fakes.small_face import eyelid_pairs
 
 BLINK = 9  # the frame of `talking` in which the lids are shut
 
@@ -61,7 +60,7 @@ def test_lids_of_taller_eyes_meet_and_do_not_pass(
     source, laid, _ = lids
     blink = animation.vertices[BLINK].astype(np.float64) - source.vertices
     posed = carried(lids, np.stack([0 * blink, 0.5 * blink, blink, 1.4 * blink]))
-    upper, lower = eyelid_pairs(build_face())
+    upper, lower = eyelid_pairs()
 
     def gaps(points: np.ndarray) -> np.ndarray:
         return np.asarray((points[..., upper, 1] - points[..., lower, 1]).mean(axis=-1))

@@ -13,8 +13,7 @@ from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.retargeting import carried_region, carry, carry_displacements, unit_of
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import CONTROLS, Rig, Shape, build_rig, lip_pairs
+from tests.fakes.small_face import CONTROLS, Rig, Shape, build_face, build_rig, lip_pairs
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 LIMIT = 0.02
@@ -55,7 +54,7 @@ def motion(rig: Rig) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def animation(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> Animation:
-    upper, lower = lip_pairs(build_face())
+    upper, lower = lip_pairs()
     return Animation(
         "a",
         (rig.neutral + motion).astype(np.float32),

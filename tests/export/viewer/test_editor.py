@@ -20,13 +20,11 @@ from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, c
 from facediff.errors import FaceDiffError
 from facediff.export.format import linear_colours
 from facediff.speech.phonemes import TimedPhoneme, phonemes_text
-from facediff.synthetic.corpus import rig_of
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import CONTROLS
 from tests.fakes.chromium import Page
 from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
 from tests.fakes.glb_reader import Reader
+from tests.fakes.small_face import CONTROLS, F1, build_face, build_rig
 from tests.fakes.waiting import wait_until
 
 Show = Callable[..., Page]
@@ -381,7 +379,7 @@ def test_lanes_are_magnified_and_several_keys_are_moved_copied_and_pasted(show: 
 
 def test_shapes_brows_and_lids_are_previewed_and_acting_becomes_keys(show: Show, tmp_path: Path) -> None:
     """Within 0.1 mm of what the command makes of the same keys, from the take that was made with other ones."""
-    rig, frames = rig_of("F1"), 60
+    rig, frames = build_rig(F1), 60
     weights = np.zeros((frames, len(CONTROLS)))
     weights[:, 0] = 0.5 + 0.5 * np.sin(np.arange(frames) / 4)
     loud = np.sin(np.arange(frames * 640) / 12) * (np.sin(np.arange(frames * 640) / 2500) > 0)

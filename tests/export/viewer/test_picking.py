@@ -22,19 +22,18 @@ import trimesh
 import uvicorn
 
 from facediff.animation import write_archive
-from facediff.editing.landmarks import NAMES, puppet_landmarks, read_landmarks
+from facediff.editing.landmarks import NAMES, read_landmarks
 from facediff.errors import FaceDiffError
 from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, pick_landmarks, picking_page
 from facediff.mesh import Mesh
 from facediff.mesh.parts import MeshPart
-from facediff.synthetic.face import build_face
-from facediff.synthetic.rig import build_rig
 from facediff.utils.server import LOOPBACK, names_of
 from tests.fakes.chromium import Chromium, Page
 from tests.fakes.heads import LONG, talking
 from tests.fakes.serving import servers
+from tests.fakes.small_face import LANDMARKS, build_face, build_rig
 
-FACE, MARKS = build_face(), puppet_landmarks()
+FACE, MARKS = build_face(), LANDMARKS
 
 
 def other_face() -> Mesh:
