@@ -14,29 +14,22 @@ from torchmetrics import Metric
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import pad
-from facediff.data.conversations import CONVERSATION, channel_regions, conversation_file
-from facediff.data.corpus import EYELID_PAIRS
-from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import ArgumentError, FaceDiffError, choices
 from facediff.metrics import (
     Context,
     EnergyScore,
-    EyelidPairs,
-    LipPairs,
     ProtocolMetrics,
     Region,
     SequenceMetric,
     describe_column,
-    device_name,
     feed,
     protocol,
 )
 from facediff.metrics.by_name import parse_all
 from facediff.metrics.generation import SMOOTHNESS
 from facediff.models.inference import Inference, Style, named
+from facediff.models.scoring import ScoredCorpus, regions_of
 from facediff.spaces.space import metres_per_unit
-from facediff.speech.audio import SAMPLE_RATE
-from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 
 IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
 """Which identity unseen speakers are tested and predicted with. ``style_only``: none, with their reference's style.
@@ -132,36 +125,6 @@ OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
 
 
-def regions_of(assets: Assets) -> dict[str, Region]:
-    """A corpus's regions by name, for metrics."""
-    return {
-        name: Region.from_indices(
-            f"{assets.corpus}/{name if len(indices) < assets.n_vertices else 'all vertices'}",
-            indices,
-            n_vertices=assets.n_vertices,
-        )
-        for name, indices in assets.regions.items()
-    }
-
-
-def eyelid_pairs_of(data: SpeechMotionDataModule) -> EyelidPairs | None:
-    """A corpus's pairs of eyelid vertices, for metrics."""
-    pairs = data.eyelid_pairs()
-    return None if pairs is None else EyelidPairs.from_pairs(f"{data.corpus_name}/eyelids", pairs)
-
-
-def closures_of(data: SpeechMotionDataModule, clip: str) -> list[tuple[int, int]]:
-    """The frames in which a clip's lips close for p, b and m; empty where its phonemes are not known."""
-    file = phonemes_file(data.root, clip)
-    return [] if file is None else closures(read_phonemes(file), data.frame_rate)
-
-
-def _at_its_side(folder: str, batch: Batch, data: SpeechMotionDataModule) -> list[Tensor]:
-    """What a conversation's folder holds of each clip, of the frames that are read of the motion."""
-    arrays = (conversation_file(data.root, folder, clip, data.corpus.stride) for clip in batch.names)
-    return [torch.from_numpy(array) for array in arrays]
-
-
 class Evaluation:
     """Metrics of one protocol, and ``metrics`` chosen by name with their options, for every split and method.
 
@@ -198,10 +161,7 @@ class Evaluation:
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
         self.chosen: dict[str, dict[str, dict[str, Metric]]] = {}
         self._sequences: list[dict[str, Any]] = []
-        self._data: SpeechMotionDataModule | None = None
-        self._assets: Assets | None = None
-        self._mean_faces: MeanFaces | None = None
-        self._speakers: list[str] = []
+        self._corpus: ScoredCorpus | None = None
         self._validation_seeds = range(1)
 
     def prepare(
@@ -212,21 +172,16 @@ class Evaluation:
         Raises:
             FaceDiffError: if the corpus or the model lacks something that a metric needs.
         """
-        assets = model.assets
-        self._assets = assets
-        # Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
-        regions = regions_of(assets.scored)
+        assets, corpus = model.assets, ScoredCorpus(data, model.assets)
+        self._corpus = corpus
         self._check_space(assets)
         scale = self._scale(assets)
         self.requests |= self.protocol.further(scale)
-        of_protocol = regions_of(assets) if self.protocol.channels else regions
+        of_protocol = regions_of(assets) if self.protocol.channels else corpus.regions
         self.splits = list(splits)
         self._sequences = []
-        self._data = data
-        self._mean_faces = None
-        self._check_attributes()
-        self._prepare_energies(model, regions, device)
-        self._speakers = sorted(assets.templates)
+        self._check_attributes(data)
+        self._prepare_energies(model, corpus.regions, device)
         methods = list(METHODS) if self.splits != ["val"] else ["model"]
         self.metrics = {
             split: {
@@ -235,7 +190,7 @@ class Evaluation:
             }
             for split in self.splits
         }
-        context = self._context(model, regions, device, data) if self.requests else Context()
+        context = self._context(model, corpus, device) if self.requests else Context()
         self.chosen = {
             split: {
                 method: {
@@ -243,12 +198,18 @@ class Evaluation:
                     for name, request in self.requests.items()
                     if method == "model" or not OF_THE_MODEL & set(request.needs)
                 }
-                | self._of_channels(device)
-                | self._smoothness(regions, device)
+                | self._of_channels(assets, device)
+                | self._smoothness(corpus.regions, device)
                 for method in methods
             }
             for split in self.splits
         }
+
+    @property
+    def corpus(self) -> ScoredCorpus:
+        """What :meth:`prepare` was given."""
+        assert self._corpus is not None  # noqa: S101 - for the type checker
+        return self._corpus
 
     def _check_space(self, assets: Assets) -> None:
         """Refuse a protocol that needs vertices, or channels, of a corpus that has none."""
@@ -269,26 +230,11 @@ class Evaluation:
             return 1.0
         return metres_per_unit(assets.scored.unit) / metres_per_unit(self.protocol.unit)
 
-    def decoded(self, motion: Tensor, batch: Batch) -> Tensor:
-        """Offsets of a batch's clips, (batch, …, points, dims), as those of what is scored."""
-        assets = self._assets
-        if assets is None or assets.rig is None:
-            return motion
-        names = batch.identity_names
-        return torch.stack([assets.to_scored(own, name) for own, name in zip(motion, names, strict=True)])
-
-    def _templates(self, batch: Batch) -> Tensor:
-        """Neutral faces of a batch's clips."""
-        if self._assets is None or self._assets.rig is None:
-            return batch.template
-        faces = [self._assets.scored.template(name) for name in batch.identity_names]
-        return torch.stack(faces).to(batch.template)
-
-    def _of_channels(self, device: torch.device) -> dict[str, Metric]:
+    def _of_channels(self, assets: Assets, device: torch.device) -> dict[str, Metric]:
         """The formulas of vertices on the channels themselves, of parametric spaces."""
-        if self._assets is None or self._assets.space.is_vertices or self.protocol.channels:
+        if assets.space.is_vertices or self.protocol.channels:
             return {}
-        metrics = self.protocol.build(*(regions_of(self._assets)[name] for name in ("lips", "upper_face")))
+        metrics = self.protocol.build(*(regions_of(assets)[name] for name in ("lips", "upper_face")))
         return {f"{PARAMETERS}{name}": metric.to(device) for name, metric in metrics.scores().items()}
 
     def _smoothness(self, regions: Mapping[str, Region], device: torch.device) -> dict[str, Metric]:
@@ -315,7 +261,7 @@ class Evaluation:
         """Add a validation batch's samples (batch, samples, frames, V, 3), and those of a still face."""
         if batch.repeated:
             return
-        samples, truth = self.decoded(samples, batch), self.decoded(batch.motion, batch)
+        samples, truth = (self.corpus.decoded(each, batch.identity_names) for each in (samples, batch.motion))
         for name, metric in self.energies.items():
             drawn = torch.zeros_like(samples) if name.startswith("still") else samples
             shown = drawn[:, : metric.n_samples].expand(-1, metric.n_samples, -1, -1, -1)
@@ -332,52 +278,21 @@ class Evaluation:
             metric.reset()
         return sum(shares) / len(shares) if shares else None
 
-    def _context(
-        self, model: Inference, regions: Mapping[str, Region], device: torch.device, data: SpeechMotionDataModule
-    ) -> Context:
+    def _context(self, model: Inference, corpus: ScoredCorpus, device: torch.device) -> Context:
         """What the corpus and the model have for metrics, and why they lack the rest."""
-        assets, name = model.assets, type(model).__name__
-        has: dict[str, dict[str, Any]] = {
-            "lips": {"lips": regions["lips"]},
-            "upper_face": {"upper": regions["upper_face"]},
-            "template": {},
-            "speech": {"sample_rate": SAMPLE_RATE, "frames_per_second": assets.frame_rate},
-            "identities": {"n_identities": len(assets.templates)},
-            "time": {"hardware": device_name(device)},
-        }
-        if (pairs := assets.scored.inner_lip_pairs) is not None:
-            has["lip_pairs"] = {"pairs": LipPairs.from_pairs(f"{assets.corpus}/inner lips", pairs)}
-        if "lid_pairs" in self.needs and (lids := eyelid_pairs_of(data)) is not None:
-            has["lid_pairs"] = {"pairs": lids, "frames_per_second": assets.frame_rate}
-        if "gallery" in self.needs:
-            has["gallery"] = {"gallery": speaker_gallery(data, self._speakers, assets)}
-        if (data.root / "phonemes").is_dir():
-            has["closures"] = {}
-        if not assets.space.is_vertices:
-            has["channels"] = {}
-        has |= {need: {} for need in CONVERSATION if (data.root / need).is_dir()}
-        if model.samples:
-            has["samples"] = {}
-        if len(self._styles(model)) > 1:
-            has["conditions"] = {}
-        if "style" in self.needs:
-            still = torch.zeros(1, 1, assets.n_vertices, assets.space.dims, device=model.device)
-            with torch.inference_mode():
-                if model.encode_style(still, torch.ones(1, 1, dtype=torch.bool, device=model.device)).shape[1]:
-                    has["style"] = {}
+        context, name = corpus.context(self.needs, device), type(model).__name__
+        still = torch.zeros(1, 1, corpus.assets.n_vertices, corpus.assets.space.dims, device=model.device)
+        mask = torch.ones(1, 1, dtype=torch.bool, device=model.device)
+        with torch.inference_mode():
+            styled = "style" in self.needs and model.encode_style(still, mask).shape[1] > 0
+        met = {"samples": model.samples, "conditions": len(self._styles(model)) > 1, "style": styled}
         missing = {
-            "lip_pairs": "the corpus has no regions/inner_lip_pairs.txt",
-            "lid_pairs": f"the corpus has no {EYELID_PAIRS}; list pairs of an upper and a lower eyelid vertex there, "
-            "or in the file that data.eyelid_pairs names",
-            "closures": f"{data.root / 'phonemes'}: no such folder",
-            "channels": f"{assets.corpus} has vertices",
-            "partner": f"no partner: {data.root / 'partner'} with <clip>.npy, (frames, channels), is not there",
-            "speaking": f"{data.root / 'speaking'} with <clip>.npy, a boolean for each frame, is not there",
             "samples": f"{name} is deterministic",
             "conditions": "the corpus has no style references of two training identities",
             "style": f"{name} has no style encoder",
         }
-        return Context(has, missing, channel_regions(assets.space))
+        has = {**context.has, **{need: {} for need, fulfilled in met.items() if fulfilled}}
+        return replace(context, has=has, missing={**context.missing, **missing})
 
     @staticmethod
     def _styles(model: Inference) -> dict[int, Reference | Style]:
@@ -411,16 +326,14 @@ class Evaluation:
                 inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
             if "style" in self.needs:
                 inputs["embeddings"] = model.encode_style(motion, batch.mask)
-                inputs["labels"] = self._numbers(batch)
+                inputs["labels"] = self.corpus.numbers(batch)
         self.update(split, "model", motion, batch, identity, inputs)
 
     def score_baselines(self, split: str, batch: Batch) -> None:
         """Add the scores of two faces that do not move: the template, and the mean of the speaker's training clips."""
         self.update(split, "still", torch.zeros_like(batch.motion), batch)
-        if self._mean_faces is None and self._data is not None and self._data.clips("train"):
-            self._mean_faces = MeanFaces(self._data)
-        if self._mean_faces is not None:  # else there is no row, as with shuffled speech
-            faces = self._mean_faces.of(batch.identity_names).to(batch.motion)
+        if self.corpus.data.clips("train"):  # else there is no row, as with shuffled speech
+            faces = self.corpus.mean_faces.of(batch.identity_names).to(batch.motion)
             self.update(split, "mean_face", faces[:, None] * batch.mask[..., None, None], batch)
 
     def _clock(self, model: Inference) -> float:
@@ -428,10 +341,6 @@ class Evaluation:
         if "time" in self.needs and model.device.type == "cuda":
             torch.cuda.synchronize(model.device)
         return time.perf_counter()
-
-    def _numbers(self, batch: Batch) -> list[int]:
-        """The number of each clip's speaker among all speakers."""
-        return [self._speakers.index(name) for name in batch.identity_names]
 
     def update(
         self,
@@ -448,17 +357,17 @@ class Evaluation:
         """
         if batch.repeated:
             return
-        metrics = self.metrics[split][method].to(motion.device)
+        corpus, names, metrics = self.corpus, batch.identity_names, self.metrics[split][method].to(motion.device)
         channels: dict[str, Any] = {"prediction": motion, "truth": batch.motion}
-        motion, truth = self.decoded(motion, batch), self.decoded(batch.motion, batch)
+        motion, truth = corpus.decoded(motion, names), corpus.decoded(batch.motion, names)
         sides = (channels["prediction"], channels["truth"]) if self.protocol.channels else (motion, truth)
         metrics.update(*sides, lengths=batch.frame_lengths, clip_names=batch.names)
         scores: dict[str, Metric] = {**metrics.scores()}
         inputs = dict(inputs or {})
         for name in ("samples", "predictions"):  # several motions of each clip
             if name in inputs:
-                inputs[name] = self.decoded(inputs[name], batch)
-        inputs = self._inputs(motion, truth, batch) | inputs if self.chosen[split][method] else {}
+                inputs[name] = corpus.decoded(inputs[name], names)
+        inputs = corpus.inputs(motion, truth, batch, self.needs) | inputs if self.chosen[split][method] else {}
         for name, metric in self.chosen[split][method].items():
             request = self.requests.get(name)
             of_channels = name.startswith(PARAMETERS) if request is None else request.of_channels
@@ -484,25 +393,19 @@ class Evaluation:
 
     def _attributes(self, clip: str) -> dict[str, str | None]:
         """What scores may be grouped by, such as a clip's emotion."""
-        if self._data is None:
-            return {}
-        names = dict.fromkeys((*self._data.score_attributes, *self.score_by))
-        attributes = self._data.corpus.clips[clip].attributes
+        data = self.corpus.data
+        names = dict.fromkeys((*data.score_attributes, *self.score_by))
+        attributes = data.corpus.clips[clip].attributes
         return {name: attributes.get(name) for name in names}
 
-    def _check_attributes(self) -> None:
+    def _check_attributes(self, data: SpeechMotionDataModule) -> None:
         """Refuse to group scores by what no clip of the splits has."""
-        if self.score_by and self._data is not None:
-            clips = [clip for split in self.splits for clip in self._data.clips(split)]
-            attributes = sorted({name for clip in clips for name in clip.attributes})
-            for name in self.score_by:
-                if name not in attributes:
-                    offered = (
-                        choices(name, attributes)
-                        if attributes
-                        else "its clips have no attributes; list them in clips.csv"
-                    )
-                    raise ArgumentError({"model.score_by": name}, f"no clip has it: {offered}", located=True)
+        clips = [clip for split in self.splits for clip in data.clips(split)] if self.score_by else []
+        attributes = sorted({name for clip in clips for name in clip.attributes})
+        for name in self.score_by:
+            if name not in attributes:
+                offered = choices(name, attributes) if attributes else "list attributes in clips.csv"
+                raise ArgumentError({"model.score_by": name}, f"no clip has it: {offered}", located=True)
 
     def groups(self, split: str) -> list[dict[str, Any]]:
         """One row per method and group of clips with equal attributes ``score_by``; collective under several processes.
@@ -533,26 +436,6 @@ class Evaluation:
             counts = {"frames": sum(row["frames"] for row in members), "sequences": len(members)}
             table.append({"split": split, **line, **means, **counts})
         return table
-
-    def _inputs(self, motion: Tensor, truth: Tensor, batch: Batch) -> dict[str, Any]:
-        """What metrics chosen by name may read of a batch, by the name under which they take it; see `NEEDS`."""
-        inputs: dict[str, Any] = {
-            "prediction": motion,
-            "truth": truth,
-            "lengths": batch.frame_lengths,
-            "clip_names": batch.names,
-            "offsets_from": self._templates(batch),
-            "waveform": batch.audio,
-        }
-        if "identities" in self.needs:
-            inputs["identities"] = self._numbers(batch)
-        if "closures" in self.needs and self._data is not None:
-            inputs["closures"] = [closures_of(self._data, clip) for clip in batch.names]
-        if self._data is not None and "partner" in self.needs:
-            inputs["partner"] = pad(_at_its_side("partner", batch, self._data))[..., None].to(motion.device)
-        if self._data is not None and "speaking" in self.needs:
-            inputs["speaking"] = _at_its_side("speaking", batch, self._data)
-        return inputs
 
     def sequences(self) -> list[dict[str, Any]]:
         """One row per test clip and method with its own scores, of all processes; collective under several.

@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -22,36 +21,21 @@ from torchmetrics import Metric
 
 from facediff.data import Batch, Clip, Sample, SpeechMotionDataModule, collate
 from facediff.data.batch import UNKNOWN_IDENTITY
-from facediff.data.conversations import channel_regions
 from facediff.data.dataset import MotionDataset
-from facediff.data.speakers import MeanFaces, speaker_gallery
 from facediff.errors import FaceDiffError, counted
 from facediff.metrics import (
-    BilabialClosureRate,
-    BlinkRate,
-    BlinkRateRatio,
-    CoverageError,
-    DifferenceRatio,
-    EnergyScore,
-    EyelidDrift,
-    FaceDynamicsDeviation,
-    FrameStep,
-    LipPairs,
-    LipVertexError,
-    MeanEstimateError,
     MeanVertexError,
     MotionLiveliness,
-    NearestSpeakerAccuracy,
     RealTimeFactor,
-    Region,
-    SpectrumDistance,
     SpreadErrorRatio,
     device_name,
+    feed,
+    parse,
 )
-from facediff.metrics.eyes import LidMetric
 from facediff.models.base import AnimationModel
-from facediff.models.evaluation import closures_of, eyelid_pairs_of, regions_of, with_identity
+from facediff.models.evaluation import with_identity
 from facediff.models.inference import named
+from facediff.models.scoring import ScoredCorpus
 from facediff.registry import name_of
 from facediff.utils import ranges
 
@@ -62,6 +46,9 @@ REFERENCES = {
     "another_other_mood": "another speaker's reference in another mood",
 }
 """Whose reference gives the style. Moods are equal or not by the corpus's ``reference_attributes``."""
+
+LABELS = ("hidden", "known")
+"""Whether the model is told who a trained speaker is."""
 
 CHANNEL_GROUPS = ("expression", "jaw", "head", "eyes")
 """Groups of channels whose liveliness is measured."""
@@ -101,7 +88,7 @@ GENERATION_METRICS: dict[str, str] = {
     "true_nearest_speaker": "nearest speaker is right, truth",
     **{
         f"mve_{label}_{whose}": f"MVE with {title} / own, identity {label}"
-        for label in ("hidden", "known")
+        for label in LABELS
         for whose, title in REFERENCES.items()
         if whose != "own"
     },
@@ -114,6 +101,57 @@ GENERATION_METRICS: dict[str, str] = {
 }
 """Names of the metrics in files, and their titles; in parentheses what the truth itself, or a model that draws
 from the truth's distribution, would get."""
+
+
+OF_EACH = {
+    "liveliness_upper_face": "motion_liveliness:region=upper_face",
+    "liveliness_lips": "motion_liveliness:region=lips",
+    "spectrum_upper_face": "spectrum_distance:region=upper_face",
+    "difference_ratio_upper_face": "difference_ratio:region=upper_face",
+    "difference_ratio_lips": "difference_ratio:region=lips",
+    "frame_step_upper_face": "frame_step:region=upper_face",
+    "frame_step_lips": "frame_step:region=lips",
+    "lve": "lip_vertex_error",
+    "mve": "mean_vertex_error",
+    "fdd": "face_dynamics_deviation",
+    "fdd_signed": "face_dynamics_deviation:sign=signed",
+    "blink_ratio": "blink_rate_ratio",
+    "blinks_a_minute": "blink_rate",
+    "true_blinks_a_minute": "blink_rate:of=truth",
+    "eyelid_drift": "eyelid_drift",
+    "closed": "bilabial_closure_rate",
+    "truly_closed": "bilabial_closure_rate:of=truth",
+}
+"""What is taken of each sample by itself, as metrics by name."""
+
+OF_SAMPLES = {
+    "lve_mean": "mean_estimate_error",
+    "lve_best": "coverage_error",
+    "energy_lips": "energy_score:region=lips",
+    "energy_upper_face": "energy_score:region=upper_face",
+    "spread_face": "spread_error_ratio",
+    "spread_upper_face": "spread_error_ratio:region=upper_face",
+    "spread_lips": "spread_error_ratio:region=lips",
+    "variance_upper_face": "spread_error_ratio:region=upper_face,squared=true",
+    "variance_lips": "spread_error_ratio:region=lips,squared=true",
+}
+"""What is taken of all samples of a clip together."""
+
+NEAREST_SPEAKER = "nearest_speaker_accuracy:components=64"
+OF_OWN_REFERENCE = {"nearest_speaker": NEAREST_SPEAKER}
+OF_BASELINES = {
+    "still": {
+        "still_lve": "lip_vertex_error",
+        "still_fdd": "face_dynamics_deviation",
+        "still_fdd_signed": "face_dynamics_deviation:sign=signed",
+    },
+    "mean_face": {"mean_face_lve": "lip_vertex_error"},
+    "truth": {"true_nearest_speaker": NEAREST_SPEAKER},
+}
+"""What is taken of two faces that do not move, and of the truth itself."""
+
+NEEDED = {"nearest_speaker": ("gallery",), "blink_ratio": ("lid_pairs",), "closures": ("closures", "lip_pairs")}
+"""Metrics that a corpus may have no files for, and what they need."""
 
 
 @dataclass(frozen=True)
@@ -145,35 +183,30 @@ class SamplingOptions:
             raise FaceDiffError(f"--samples {self.samples}: the spread of a model needs two samples; give 2 or more")
 
 
-class EvaluationCorpus:
+class EvaluationCorpus(ScoredCorpus):
     """What measuring needs of a corpus in addition to its clips; made once for all models and splits."""
 
     def __init__(self, data: SpeechMotionDataModule) -> None:
-        self.data = data
-        self.assets = data.assets()
-        # Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
-        self.regions = regions_of(self.assets.scored)
-        self.channels = {
-            name: region for name, region in channel_regions(self.assets.space).items() if name in CHANNEL_GROUPS
+        compared, assets = data.compared_speakers, data.assets()
+        known = sorted(name for name in assets.templates if compared is None or name in compared)
+        super().__init__(data, assets, known)
+        tables = (OF_EACH, OF_SAMPLES, *OF_BASELINES.values(), OF_OWN_REFERENCE)
+        self.needs = {need for table in tables for text in table.values() for need in parse(text).needs}
+        context = self.context(self.needs, torch.device("cpu"))
+        # Of a model without noise all samples are one.
+        self.given = replace(context, has={**context.has, "samples": {}})
+        lacking = [(name, need) for name, needs in NEEDED.items() for need in needs if need not in self.given.has]
+        self.missing = {name: self.given.missing[need] for name, need in lacking}
+        self.channels = {name: region for name, region in context.channels.items() if name in CHANNEL_GROUPS}
+
+    def metrics(self, table: Mapping[str, str], device: torch.device, **options: Any) -> dict[str, Metric]:  # noqa: ANN401
+        """The metrics of a table that the corpus has all for, with further options."""
+        requests = {name: parse(text) for name, text in table.items()}
+        return {
+            name: replace(request, options={**request.options, **options}).build(self.given).to(device)
+            for name, request in requests.items()
+            if set(request.needs) <= self.given.has.keys()
         }
-        compared = data.compared_speakers
-        self.speakers = sorted(name for name in self.assets.templates if compared is None or name in compared)
-        self.mean_faces = MeanFaces(data)
-        self.missing: dict[str, str] = {}
-        self.gallery = None
-        try:
-            if not self.assets.scored.space.is_vertices:
-                raise FaceDiffError("no rig decodes the channels, and speakers are told apart by their faces")
-            self.gallery = speaker_gallery(data, self.speakers, self.assets)
-        except FaceDiffError as error:
-            self.missing["nearest_speaker"] = str(error)
-        self.eyelids = eyelid_pairs_of(data)
-        if self.eyelids is None:
-            self.missing["blink_ratio"] = "the corpus lists no eyelid pairs; name a file of them by data.eyelid_pairs"
-        pairs = self.assets.scored.inner_lip_pairs
-        self.lips = None if pairs is None else LipPairs.from_pairs(f"{self.assets.corpus}/inner lips", pairs)
-        if self.lips is None or not (data.root / "phonemes").is_dir():
-            self.missing["closures"] = "the corpus has no phonemes/, or no regions/inner_lip_pairs.txt"
 
     def references(self, clip: Clip, own: str) -> dict[str, Clip]:
         """A clip's references by whose they are; ``own`` is the name of the usual one."""
@@ -213,98 +246,48 @@ class Measurement:
 
     def __init__(self, model: AnimationModel, corpus: EvaluationCorpus, sampling: SamplingOptions) -> None:
         self.model, self.corpus, self.sampling = model, corpus, sampling
-        lips, upper = corpus.regions["lips"], corpus.regions["upper_face"]
         # Without noise all samples are one: their spread is zero, and the energy score is the distance itself.
         self.drawn = sampling.samples if model.samples else 1
         self.compared = max(2, self.drawn)
-        count = self.compared
-        areas: dict[str, Region | None] = {"face": None, "upper_face": upper, "lips": lips}
-        self.of_samples: dict[str, Metric] = {
-            "lve_mean": MeanEstimateError(lips, n_samples=count),
-            "lve_best": CoverageError(lips, n_samples=count),
-            "energy_lips": EnergyScore(lips, n_samples=count),
-            "energy_upper_face": EnergyScore(upper, n_samples=count),
-            **{f"spread_{name}": SpreadErrorRatio(area, n_samples=count) for name, area in areas.items()},
-            "variance_upper_face": SpreadErrorRatio(upper, n_samples=count, squared=True),
-            "variance_lips": SpreadErrorRatio(lips, n_samples=count, squared=True),
+        device, count = model.device, self.compared
+        self.metrics: dict[str, dict[str, Metric]] = {
+            "samples": corpus.metrics(OF_SAMPLES, device, n_samples=count),
+            "each": corpus.metrics(OF_EACH, device),  # each sample by itself
+            **{face: corpus.metrics(table, device) for face, table in OF_BASELINES.items()},
+            "own_reference": corpus.metrics(OF_OWN_REFERENCE, device),
+            "references": {
+                f"{label}_{whose}": MeanVertexError().to(device) for label in LABELS for whose in REFERENCES
+            },
+            "default_style": corpus.metrics({"lve_default": "lip_vertex_error"}, device),
         }
-        # Each sample by itself, and the same of two faces that do not move.
-        self.of_each: dict[str, Metric] = {
-            "liveliness_upper_face": MotionLiveliness(upper),
-            "liveliness_lips": MotionLiveliness(lips),
-            "spectrum_upper_face": SpectrumDistance(upper),
-            "difference_ratio_upper_face": DifferenceRatio(upper),
-            "difference_ratio_lips": DifferenceRatio(lips),
-            "frame_step_upper_face": FrameStep(upper),
-            "frame_step_lips": FrameStep(lips),
-            "lve": LipVertexError(lips),
-            "mve": MeanVertexError(),
-            "fdd": FaceDynamicsDeviation(upper),
-            "fdd_signed": FaceDynamicsDeviation(upper, sign="signed"),
-        }
-        if corpus.eyelids is not None:
-            rate = corpus.assets.frame_rate
-            self.of_each |= {
-                "blink_ratio": BlinkRateRatio(corpus.eyelids),
-                "blinks_a_minute": BlinkRate(corpus.eyelids, frames_per_second=rate),
-                "true_blinks_a_minute": BlinkRate(corpus.eyelids, frames_per_second=rate, of="truth"),
-                "eyelid_drift": EyelidDrift(corpus.eyelids),
-            }
-        if corpus.lips is not None and "closures" not in corpus.missing:
-            self.of_each |= {
-                "closed": BilabialClosureRate(corpus.lips),
-                "truly_closed": BilabialClosureRate(corpus.lips, of="truth"),
-            }
-        # Of the channels themselves, of motion in parameters.
-        self.of_channels: dict[str, Metric] = {
-            f"param_liveliness_{name}": MotionLiveliness(region) for name, region in corpus.channels.items()
-        }
-        if corpus.channels:
-            self.of_channels |= {"param_mve": MeanVertexError(), "param_spread": SpreadErrorRatio(n_samples=count)}
-        self.of_baselines: dict[str, Metric] = {
-            "still_lve": LipVertexError(lips),
-            "mean_face_lve": LipVertexError(lips),
-            "still_fdd": FaceDynamicsDeviation(upper),
-            "still_fdd_signed": FaceDynamicsDeviation(upper, sign="signed"),
-        }
-        self.of_references: dict[str, Metric] = {
-            f"{label}_{whose}": MeanVertexError() for label in ("hidden", "known") for whose in REFERENCES
-        }
-        self.of_references["lve_default"] = LipVertexError(lips)
-        if corpus.gallery is not None:
-            nearest = partial(NearestSpeakerAccuracy, corpus.gallery, components=64)
-            self.of_references["nearest_speaker"] = nearest()
-            self.of_baselines["true_nearest_speaker"] = nearest()
-        self.speed = RealTimeFactor(device_name(model.device))
-        for metrics in (self.of_samples, self.of_each, self.of_channels, self.of_baselines, self.of_references):
-            for metric in metrics.values():
-                metric.to(model.device)
+        if corpus.channels:  # of the channels themselves, of motion in parameters
+            of_each = {f"param_liveliness_{name}": MotionLiveliness(region) for name, region in corpus.channels.items()}
+            self.metrics["channels"] = {**of_each, "param_mve": MeanVertexError()}
+            self.metrics["channel_samples"] = {"param_spread": SpreadErrorRatio(n_samples=count)}
+            for group in ("channels", "channel_samples"):
+                self.metrics[group] = {name: metric.to(device) for name, metric in self.metrics[group].items()}
+        self.speed = RealTimeFactor(device_name(device))
+
+    def _update(self, group: str, inputs: Mapping[str, Any]) -> None:
+        for metric in self.metrics.get(group, {}).values():
+            feed(metric, inputs)
 
     @torch.inference_mode()
     def add(self, clip: Clip, sample: Sample) -> None:
         """Generate motion for a clip, and score it."""
-        batch = self.model.with_person_styles(collate([sample]).to(self.model.device))
-        motion, truth = self._samples(batch), batch.motion[0]
-        for name, metric in self.of_channels.items():
-            if name == "param_spread":
-                metric.update(motion.expand(self.compared, -1, -1, -1), truth)
-            else:
-                for drawn in motion:
-                    metric.update(drawn, truth)
-        motion, truth = self._scored(motion, clip), self._scored(truth, clip)
-        template = self.corpus.assets.scored.template(clip.identity).to(truth)
-        for metric in self.of_samples.values():
-            metric.update(motion.expand(self.compared, -1, -1, -1), truth)
-        closures = closures_of(self.corpus.data, clip.name) if "closed" in self.of_each else []
-        for drawn in motion:
-            for metric in self.of_each.values():
-                if isinstance(metric, BilabialClosureRate):
-                    metric.update(drawn, truth, closures=closures, offsets_from=template)
-                elif isinstance(metric, LidMetric):
-                    metric.update(drawn, truth, offsets_from=template)
-                else:
-                    metric.update(drawn, truth)
-        self._add_baselines(clip, truth)
+        batch, corpus = self.model.with_person_styles(collate([sample]).to(self.model.device)), self.corpus
+        motion, truth = self._samples(batch)[None], batch.motion
+        for every, each in (("channel_samples", "channels"), ("samples", "each")):
+            if each == "each":  # of vertices, where a rig decodes them
+                motion, truth = (corpus.decoded(side, batch.identity_names) for side in (motion, truth))
+            inputs = corpus.inputs(truth, truth, batch, corpus.needs)
+            self._update(every, {**inputs, "samples": motion.expand(-1, self.compared, -1, -1, -1)})
+            for drawn in motion.unbind(1):
+                self._update(each, {**inputs, "prediction": drawn})
+        mean = corpus.decoded(corpus.mean_faces.of([clip.identity]).to(batch.motion)[:, None], [clip.identity])
+        faces = {"still": torch.zeros_like(truth), "mean_face": mean.expand_as(truth), "truth": truth}
+        for face, motion in faces.items():
+            self._update(face, {**inputs, "prediction": motion})
         self._add_references(clip, sample)
 
     def _samples(self, batch: Batch) -> Tensor:
@@ -314,39 +297,27 @@ class Measurement:
             first = self.model.sample_clip(batch, seeds[:1])
         return torch.cat([first, self.model.sample_clip(batch, seeds[1:])]) if self.drawn > 1 else first
 
-    def _scored(self, motion: Tensor, clip: Clip) -> Tensor:
-        """Offsets of a clip (*frames, points, dims) as those of what is scored."""
-        return self.corpus.assets.to_scored(motion, clip.identity)
-
     def warm_up(self, sample: Sample) -> None:
         """Generate once without a measurement: the first call makes what later ones find."""
         with torch.inference_mode():
             self.model.sample_clip(collate([sample]).to(self.model.device), [self.sampling.seed])
 
-    def _add_baselines(self, clip: Clip, truth: Tensor) -> None:
-        face = self._scored(self.corpus.mean_faces.of([clip.identity]).to(truth), clip).expand_as(truth)
-        for name, metric in self.of_baselines.items():
-            if name == "true_nearest_speaker":
-                metric.update(truth, self._number(clip))
-            else:
-                metric.update(face if name.startswith("mean_face") else torch.zeros_like(truth), truth)
-
     def _add_references(self, clip: Clip, sample: Sample) -> None:
         """Score motion with other references, with the label of a trained speaker and without."""
-        views = dict(self._views(clip, sample))
+        views, corpus = dict(self._views(clip, sample)), self.corpus
         batch = collate(list(views.values())).to(self.model.device)
-        default = self._with_default_style(clip, sample)
+        default, names = self._with_default_style(clip, sample), batch.identity_names
+        truth = corpus.decoded(batch.motion, names)
         for seed in range(self.sampling.seed, self.sampling.seed + (self.sampling.references if self.drawn > 1 else 1)):
             if default is not None:
-                motion = self.model.generate(default, seed=seed)[0]
-                sides = (self._scored(motion, clip), self._scored(default.motion[0], clip))
-                self.of_references["lve_default"].update(*sides)
-            truth = self._scored(batch.motion[0], clip)
-            for name, generated in zip(views, self.model.generate(batch, seed=seed), strict=True):
-                motion = self._scored(generated, clip)
-                self.of_references[name].update(motion, truth)
-                if name == "hidden_own" and "nearest_speaker" in self.of_references:
-                    self.of_references["nearest_speaker"].update(motion, self._number(clip))
+                motion = corpus.decoded(self.model.generate(default, seed=seed), default.identity_names)
+                self._update("default_style", {"prediction": motion, "truth": truth[:1]})
+            generated = corpus.decoded(self.model.generate(batch, seed=seed), names)
+            for place, name in enumerate(views):
+                self.metrics["references"][name].update(generated[place], truth[place])
+                if name == "hidden_own":
+                    numbers = corpus.numbers(batch)[:1]
+                    self._update("own_reference", {"prediction": generated[place], "identities": numbers})
 
     def _with_default_style(self, clip: Clip, sample: Sample) -> Batch | None:
         """A clip with the style that its identity has where none is named; None if it has none, or the clip itself."""
@@ -372,13 +343,10 @@ class Measurement:
                 views.append((f"known_{whose}", styled))
         return views
 
-    def _number(self, clip: Clip) -> list[int]:
-        return [self.corpus.speakers.index(clip.identity)]
-
     def result(self) -> dict[str, float | None]:
         """The value of every metric, in the order of :data:`GENERATION_METRICS`; None where there is none."""
         raw: dict[str, float] = {}
-        everything = {**self.of_samples, **self.of_each, **self.of_channels, **self.of_baselines, **self.of_references}
+        everything = {name: metric for group in self.metrics.values() for name, metric in group.items()}
         for name, metric in {**everything, "real_time_factor": self.speed}.items():
             if metric.update_called:
                 with suppress(ValueError):  # no value on any sequence
@@ -401,7 +369,7 @@ class Measurement:
             "lve_default_still": ratio("lve_default", "still_lve"),
             **{
                 f"mve_{label}_{whose}": ratio(f"{label}_{whose}", f"{label}_own")
-                for label in ("hidden", "known")
+                for label in LABELS
                 for whose in REFERENCES
             },
             "mve_hidden_own": raw.get("hidden_own"),
@@ -567,13 +535,14 @@ def measure(
             for metric, value in measurement.result().items():
                 values[split][metric].append(value)
             drawn = measurement.drawn
+    gallery = corpus.given.has.get("gallery")
     return GenerationScores(
         corpus=corpus.assets.corpus,
         synthetic=corpus.assets.synthetic,
         checkpoints=list(models),
         sampler=", ".join(sorted(described)),
         samples=drawn,
-        speakers=len({*corpus.gallery.speakers}) if corpus.gallery is not None else 0,
+        speakers=len({*gallery["gallery"].speakers}) if gallery else 0,
         clips={split: len(places) for split, places in chosen.items()},
         values=values,
         missing=corpus.missing,
