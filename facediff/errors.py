@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -53,6 +54,21 @@ def lacking(cls: object) -> str:
     """
     names = sorted(getattr(cls, "__abstractmethods__", ()))
     return f"the class lacks {', '.join(names)}; define what it lacks" if names else ""
+
+
+def import_failure(error: BaseException) -> str:
+    """Why a module cannot be imported, with the file and the line that are to be corrected.
+
+    Args:
+        error: what importing it has raised, a mistake in its grammar too.
+    """
+    reason = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
+    file, line = getattr(error, "filename", None), getattr(error, "lineno", None)
+    if not isinstance(error, SyntaxError):
+        frames = [(f.f_code.co_filename, number) for f, number in traceback.walk_tb(error.__traceback__)]
+        frames = [frame for frame in frames if "importlib" not in frame[0]]  # the machinery that runs a module
+        file, line = frames[-1] if frames else (None, None)
+    return f"{file}, line {line}: {reason}" if file else reason
 
 
 def printable(text: object) -> str:

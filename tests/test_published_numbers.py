@@ -23,7 +23,7 @@ from facediff.models.losses import huber
 from facediff.models.losses_fused import fused_losses
 from facediff.models.samplers import DdpmSampler, NoiseProcess
 from facediff.models.speaker_encoders import TcnGruTransformer
-from facediff.registry import defaults
+from facediff.utils.hints import defaults
 
 CORPORA: dict[str, type[SpeechMotionDataModule]] = {"biwi": Biwi, "vocaset": Vocaset, "mead3d": Mead3D}
 

@@ -14,8 +14,8 @@ import torch
 from omegaconf import OmegaConf
 
 from facediff import registry
+from facediff.hyperparameters import component_class, describe, plain
 from facediff.models.decoders import GruDecoder
-from facediff.registry import component_class, describe, plain
 
 
 class Colour(enum.Enum):

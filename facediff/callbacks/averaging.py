@@ -12,7 +12,7 @@ from torch import Tensor
 
 from facediff.data import SpeechMotionDataModule
 from facediff.models.base import AnimationModel
-from facediff.registry import checks_arguments
+from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
 
 

@@ -30,8 +30,8 @@ from lightning.pytorch.trainer.states import RunningStage
 from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, job_text, logger_versions, run_folder
 from facediff.errors import FaceDiffError
 from facediff.models.checkpoint import read_checkpoint
-from facediff.registry import checks_arguments
 from facediff.utils.files import atomic
+from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
 

@@ -23,9 +23,9 @@ from facediff import registry
 from facediff.data import SpeechMotionDataModule, collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
-from facediff.registry import checks_arguments
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import sha256
+from facediff.utils.hints import checks_arguments
 from facediff.utils.hub import model_hash, split_face
 from facediff.utils.provenance import Provenance, recipe_of
 from facediff.version import __version__

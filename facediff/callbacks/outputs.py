@@ -17,8 +17,8 @@ from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_med
 from facediff.models import AnimationModel
 from facediff.models.evaluation import METHODS
 from facediff.models.inference import Prediction
-from facediff.registry import checks_arguments
 from facediff.utils.files import atomic
+from facediff.utils.hints import checks_arguments
 from facediff.utils.plain_files import write_json, write_rows
 from facediff.utils.ranges import Range
 from facediff.utils.tables import format_table

@@ -36,10 +36,10 @@ from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, cho
 from facediff.metrics import SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
-from facediff.registry import checks_arguments
 from facediff.render import VIEWS, Camera, Renderer, comparison, contact_sheet, portrait, save_image, write_video
 from facediff.speech.audio import fit_length, samples_for
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
 
 Picture = npt.NDArray[np.uint8]

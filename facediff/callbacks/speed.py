@@ -14,9 +14,9 @@ from facediff.data import SpeechMotionDataModule
 from facediff.data.dataset import CachedFeatures
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
-from facediff.registry import checks_arguments
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
+from facediff.utils.hints import checks_arguments
 from facediff.utils.progress import track
 
 Backend = Callable[..., Any]

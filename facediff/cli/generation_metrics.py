@@ -30,7 +30,7 @@ def generation_metrics(
     references: Annotated[ranges.Samples, Option(metavar="N")] = 2,
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
-    expressivity: Annotated[str | None, Option(metavar="E")] = None,
+    expressivity: Annotated[ranges.Expressivity | None, Option(metavar="E")] = None,
     low_latency: bool = False,
     splits: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None,
     max_clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
@@ -98,7 +98,7 @@ def generation_metrics(
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
-    factor = None if expressivity is None else ranges.EXPRESSIVITY.read("--expressivity", expressivity)
+    factor = None if expressivity is None else expressivity
     sampling = SamplingOptions(samples, references, sampler, steps, seed, factor, low_latency)
     device = usable_device(device)
     reference = {} if stored is None else means_of(stored, f"--against {against}")

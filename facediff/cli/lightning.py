@@ -23,8 +23,9 @@ from facediff import registry
 from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of
 from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, choices, printable
-from facediff.registry import defaults, plain
+from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
+from facediff.utils.hints import defaults
 from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 if TYPE_CHECKING:
@@ -192,7 +193,7 @@ def import_corpus(
     from facediff.data import SpeechMotionDataModule
     from facediff.data.batch import DATA_SOURCE_KEY
     from facediff.data.check.layouts import by_name
-    from facediff.utils.plain_options import is_path
+    from facediff.utils.hints import is_path
 
     named = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")
     if chosen is not None and "." in chosen:
@@ -220,7 +221,7 @@ def import_model(arguments: Sequence[str]) -> str | None:
         the class; None if none is named.
     """
     from facediff.cli.data import find_own_module
-    from facediff.utils.plain_options import is_path
+    from facediff.utils.hints import is_path
 
     named = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
     chosen = next((name for name in named if is_path(name)), None)

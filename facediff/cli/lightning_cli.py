@@ -45,9 +45,10 @@ from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
 from facediff.spaces import Space
 from facediff.utils.files import atomic
+from facediff.utils.hints import defaults, mismatch
 from facediff.utils.limits import brief
 from facediff.utils.progress import on_terminal
-from facediff.utils.ranges import Range, mismatch
+from facediff.utils.ranges import Range
 
 LINKS = ("n_vertices", "identities", "frame_rate", "space", "faces")
 """Constructor arguments of a model that the data module knows; not every model has ``faces``."""
@@ -283,9 +284,9 @@ def options_of(path: str) -> list[str]:
     module, _, name = path.rpartition(".")
     if module.startswith("facediff.registry."):
         kind = registry.COMPONENTS[module.rpartition(".")[2]]
-        return list(registry.defaults(kind.get(name)))
+        return list(defaults(kind.get(name)))
     component = getattr(sys.modules.get(module), name, None)
-    return list(registry.defaults(component)) if isinstance(component, type) else []
+    return list(defaults(component)) if isinstance(component, type) else []
 
 
 def subclasses(base: type) -> list[str]:

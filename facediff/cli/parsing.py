@@ -22,12 +22,14 @@ import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
+from facediff.utils import hints
+from facediff.utils.hints import extras_of, range_of, shown
 from facediff.utils.option import Option
-from facediff.utils.ranges import Range, extras_of, range_of, shown
+from facediff.utils.ranges import Range
 from facediff.utils.renamed import current_option
 
 MISSING = inspect.Parameter.empty
@@ -113,12 +115,12 @@ class Parameter:
 
     def read(self, word: str) -> Any:  # noqa: ANN401 - the type of the hint
         """One word of the command line as a value."""
-        if self.range is not None and self.is_number:
+        if self.is_number:
             try:
-                return self.range.read(self.flag, word, whole=self.value_type is int)
-            except FaceDiffError as error:
+                return hints.read(Annotated[self.value_type, self.range or Range()], word)
+            except ValueError as error:
                 bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
-                raise FaceDiffError(f"{error}{bare}") from error
+                raise FaceDiffError(f"{self.flag} {shown(word)}: expected {error}{bare}") from error
         if not word.strip():
             raise FaceDiffError(f"{self.flag} {shown(word)}: is empty; expected {self.expected()}")
         if get_origin(self.value_type) is Literal:

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from typing import Annotated, Any
 
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.utils.ranges import Range, mismatch
+from facediff.utils.hints import mismatch
+from facediff.utils.ranges import Range
 
 Batches = Annotated[int, Range(0)] | Annotated[float, Range(0, 1)] | None
 Interval = Annotated[int, Range(1)] | Annotated[float, Range(0, 1, above=True)] | str | dict[str, int] | None

@@ -24,10 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.registry import UnknownComponentError, augmentation, checks_arguments
+from facediff.registry import UnknownComponentError, augmentation
 from facediff.speech.audio import fit_length
 from facediff.speech.pitch import SIZE, Wave, shifted, signal, spectra, stretched
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
 
 Share = Annotated[float, Range(0, 1)]

@@ -22,8 +22,8 @@ from torch.nn.utils.rnn import pad_sequence
 from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.rigs import LinearRig
+from facediff.utils.hints import is_name
 from facediff.utils.limits import FRAME_RATES, check_number, quoted
-from facediff.utils.plain_options import is_name
 
 UNKNOWN_IDENTITY = -1
 

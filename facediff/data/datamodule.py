@@ -48,11 +48,12 @@ from facediff.data.mixing import mixed_loader
 from facediff.data.packed.stores import address_of, is_packed
 from facediff.data.storage import ChannelFolder, ClipStorage
 from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.hyperparameters import keeps_arguments, plain, read_options
 from facediff.registry import corpus as corpora
-from facediff.registry import defaults, find_class, keeps_arguments, plain
+from facediff.registry import find_class
 from facediff.spaces import VERTICES, Space
+from facediff.utils.hints import defaults, is_name
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
-from facediff.utils.plain_options import is_name, read_options
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors, open_checkpoint
 

@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from facediff.editing.hearing import heard
 from facediff.errors import OptionError
-from facediff.registry import UnknownComponentError, acting, checks_arguments
+from facediff.registry import UnknownComponentError, acting
 from facediff.speech.prosody import ProsodicEvent, ProsodyTracker
 from facediff.speech.voice_activity import HOP, Wave
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:

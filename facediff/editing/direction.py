@@ -20,9 +20,10 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, choices
 from facediff.spaces.arkit import ARKIT
 from facediff.utils import ranges
+from facediff.utils.hints import shown
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_table, write_json, write_rows
-from facediff.utils.ranges import Range, shown
+from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from facediff.animation import Animation

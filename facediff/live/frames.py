@@ -19,9 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.registry import UnknownComponentError, checks_arguments, receiver
+from facediff.registry import UnknownComponentError, receiver
 from facediff.spaces.rotations import convert
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import checks_arguments
 
 Array = npt.NDArray[np.float32]
 

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
 from facediff.errors import ArgumentError, FaceDiffError
+from facediff.hyperparameters import keeps_arguments
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.channel_weights import ChannelWeights, channel_weights
@@ -34,7 +35,6 @@ from facediff.models.inference import Prediction, noise_stream
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.motion_space import PrincipalComponents, Projection
 from facediff.models.pretrained import publish
-from facediff.registry import keeps_arguments
 from facediff.spaces import Space
 from facediff.speech.windows import WindowPlan
 from facediff.utils.licences import merged, network_licences

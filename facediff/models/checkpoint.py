@@ -11,7 +11,7 @@ asks for it:
    (:mod:`facediff.utils.torch_files`); the content is tensors and plain data (``weights_only=True``).
 2. The model, its components and the data module are classes that are registered, or imported already.
 3. Their options are plain values of the types that the constructors ask for
-   (:mod:`facediff.utils.plain_options`): nothing that could be imported, opened as a config, fetched from another
+   (:mod:`facediff.hyperparameters`): nothing that could be imported, opened as a config, fetched from another
    machine or resolved as ``${…}``.
 4. The assets are what :meth:`Assets.from_state` accepts.
 5. The model is built within a budget that follows from its weights, and the weights fit it.
@@ -41,15 +41,16 @@ from torch.nn.modules.module import (
 from facediff.data import SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
 from facediff.errors import FaceDiffError, choices
+from facediff.hyperparameters import Components, read_options, unknown_class
 from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
 from facediff.models.earlier_versions import without_removed_options
 from facediff.models.pretrained import read_model
 from facediff.registry import COMPONENTS, corpus, find_class, model
 from facediff.spaces import Space
+from facediff.utils.hints import is_name, is_plain_text
 from facediff.utils.hub import model_path, split_face
 from facediff.utils.licences import require_cleared
 from facediff.utils.limits import quoted
-from facediff.utils.plain_options import Components, is_name, is_plain_text, read_options, unknown_class
 from facediff.utils.torch_files import EXPECTED, load_tensors, open_checkpoint
 
 if TYPE_CHECKING:

@@ -21,14 +21,15 @@ from torch import Tensor, nn
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, pad
 from facediff.errors import FaceDiffError, OptionError, counted
+from facediff.hyperparameters import component_class, describe, plain
 from facediff.models.inference import Inference, Style
 from facediff.models.layers import frame_mask
-from facediff.registry import COMPONENTS, component_class, corpus, defaults, describe, plain
+from facediff.registry import COMPONENTS, corpus
 from facediff.spaces import Space
 from facediff.speech.voice_activity import OFF, USUAL_GATE
+from facediff.utils.hints import defaults, is_name, is_plain_text
 from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
 from facediff.utils.limits import quoted
-from facediff.utils.plain_options import is_name, is_plain_text
 
 PROVENANCE_KEY = "facediff_provenance"
 """Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""

@@ -178,7 +178,7 @@ class SamplingOptions:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        ranges.check_fields(self)
+        ranges.check_options(self)
         if self.samples < 2:
             raise FaceDiffError(f"--samples {self.samples}: the spread of a model needs two samples; give 2 or more")
 

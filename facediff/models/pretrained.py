@@ -31,11 +31,11 @@ from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
 from facediff.models.model_card import Facts, card, check_languages, read_scores
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
+from facediff.utils.hints import is_plain_text
 from facediff.utils.hub import ASSETS, CARD, CONFIG, WEIGHTS
 from facediff.utils.licences import Licence, commercial_use, known_licence, merged
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import json_text, load_json
-from facediff.utils.plain_options import is_plain_text
 from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
 from facediff.version import __version__
 

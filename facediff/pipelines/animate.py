@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
-from facediff.errors import FaceDiffError, OptionError
-from facediff.utils import SAMPLE_RATE, ranges
+from facediff.errors import OptionError
+from facediff.utils import SAMPLE_RATE, hints, ranges
 from facediff.utils.files import holds_glb, scratch_folder, valid_text
 from facediff.utils.hub import is_audio2face
 from facediff.utils.progress import track
@@ -548,13 +548,12 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
             raise OptionError(
                 "guidance",
                 "expected each condition once with its scale, such as style=1.5,speech=1.2",
-                ranges.shown(text),
+                hints.shown(text),
             )
         try:
-            scales[name.strip()] = ranges.GUIDANCE_SCALE.read(name.strip(), number.strip())
-        except FaceDiffError as error:
-            expected = ranges.GUIDANCE_SCALE.numbers()
-            raise OptionError("guidance", f"expected {expected}", f"{name.strip()} {number.strip()}") from error
+            scales[name.strip()] = hints.read(ranges.GuidanceScale, number.strip())
+        except ValueError as error:
+            raise OptionError("guidance", f"expected {error}", f"{name.strip()} {number.strip()}") from error
     return scales
 
 

@@ -65,7 +65,7 @@ class Bootstrap:
     seed: ranges.Seed = 0
 
     def __post_init__(self) -> None:
-        ranges.check_fields(self)
+        ranges.check_options(self)
 
     def scores(self, values: Array, weights: Array) -> Array | None:
         """The score of every resample: a ratio of sums, so that a sequence keeps the weight of its frames.

@@ -21,7 +21,8 @@ from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, W
 from facediff.runtime.styles import RuntimeStyle, encode_style, style_from
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, MotionWindow, SpeechWindows, WindowPlan
-from facediff.utils.ranges import Expressivity, Seed, mismatch
+from facediff.utils.hints import mismatch
+from facediff.utils.ranges import Expressivity, Seed
 from facediff.version import __version__
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from facediff.errors import FaceDiffError
+from facediff.utils.hints import is_name
 from facediff.utils.limits import brief, quoted
-from facediff.utils.plain_options import is_name
 
 Kind = Literal["vertices", "arkit", "flame", "linear"]
 Joint = Literal["head", "neck", "jaw", "left_eye", "right_eye"]

@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, OptionError, needs_extra
-from facediff.registry import UnknownComponentError, checks_arguments, voice_gate
+from facediff.registry import UnknownComponentError, voice_gate
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import checks_arguments
 from facediff.utils.numerics import RecursiveFilter
 from facediff.utils.ranges import Range
 

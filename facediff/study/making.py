@@ -76,7 +76,7 @@ class StudyOptions:
     video: Literal["mp4", "webm"] = "mp4"
 
     def __post_init__(self) -> None:
-        ranges.check_fields(self)
+        ranges.check_options(self)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 from facediff.errors import FaceDiffError, OptionError
+from facediff.utils.hints import is_plain_text
 from facediff.utils.limits import quoted
-from facediff.utils.plain_options import is_plain_text
 
 Commercial = Literal["allowed", "unknown", "forbidden"]
 """Whether terms allow commercial use, from the mildest to the strictest."""

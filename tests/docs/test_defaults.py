@@ -12,6 +12,7 @@ import yaml
 
 from facediff import registry
 from facediff.callbacks.previews import SamplingPreview
+from facediff.utils.hints import defaults
 
 DOCS = Path(__file__).parents[2] / "docs"
 Owner = Callable[..., Any]
@@ -33,7 +34,7 @@ def stated(options: str, values: str) -> dict[str, str]:
 
 def compare(owner: Owner, promised: Mapping[str, str]) -> None:
     """Texts of the manual with defaults of the code, of which a name on the hub may be cut short."""
-    own = registry.defaults(owner)
+    own = defaults(owner)
     for option, text in promised.items():
         if isinstance(own[option], str):
             assert own[option].rpartition("/")[2] == ("" if text == "nothing" else text), option
@@ -46,7 +47,7 @@ def test_defaults_of_augmentations(name: str) -> None:
     (options,) = [row[2] for row in rows("voices.md", "| augmentation |") if row[0] == f"`{name}`"]
     promised = dict(re.findall(r"(\w+)=([^,`]+)", options))
     compare(registry.augmentation.get(name), promised)
-    assert promised.keys() == registry.defaults(registry.augmentation.get(name)).keys()
+    assert promised.keys() == defaults(registry.augmentation.get(name)).keys()
 
 
 @pytest.mark.parametrize("name", ["energy", "webrtc"])
@@ -58,7 +59,7 @@ def test_defaults_of_voice_gates(name: str) -> None:
         if not meaning.startswith("`") or meaning.startswith(f"`{name}`")
     }
     compare(registry.voice_gate.get(name), promised)
-    assert promised.keys() == registry.defaults(registry.voice_gate.get(name)).keys()
+    assert promised.keys() == defaults(registry.voice_gate.get(name)).keys()
 
 
 @pytest.mark.parametrize(
@@ -73,7 +74,7 @@ def test_defaults_of_whole_tables(page: str, head: str, owner: Owner) -> None:
     for options, default, *_ in rows(page, head):
         promised |= stated(options, default)
     compare(owner, promised)
-    assert promised.keys() == registry.defaults(owner).keys()
+    assert promised.keys() == defaults(owner).keys()
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_defaults_of_published_methods(heading: str, name: str, count: int) -> N
     for options, published, *more in rows("methods.md", "| option |", f"\n## {heading}\n"):
         other = re.search(r"`(\w+)` (?:\(the default\)|is the default)", more[0])
         promised |= stated(options, f"`{other[1]}`" if other else published)
-    own = registry.defaults(registry.model.get(name))
+    own = defaults(registry.model.get(name))
     compared = {
         option: text for option, text in promised.items() if own.get(option) is not None and re.fullmatch(r"\S+", text)
     }
@@ -107,7 +108,7 @@ def test_defaults_of_published_methods(heading: str, name: str, count: int) -> N
 @pytest.mark.parametrize("name", registry.corpus.names())
 def test_defaults_of_corpora(name: str) -> None:
     """As method.md and data.md say: whole clips, and up to 100 frames of another clip of the same speaker."""
-    own = registry.defaults(registry.corpus.get(name))
+    own = defaults(registry.corpus.get(name))
     promised = {"window": None, "windows_per_clip": 1, "reference": "same_subject", "reference_frames": 100}
     promised |= {"batch_size": 8 if name.startswith("Puppet") else 1, "augmented_share": 1.0}
     promised |= {"Mead3D": {"split": "sentence"}, "BEAT": {"split": "order"}}.get(name, {})

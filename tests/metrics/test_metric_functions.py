@@ -14,6 +14,7 @@ from torch import Tensor
 import facediff.metrics as fm
 from facediff import registry
 from facediff.metrics import Clip, LipMetric, SequenceMetric, functional
+from facediff.utils.hints import defaults
 
 NAMES = registry.metric.names()
 
@@ -125,7 +126,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_definition_without_options_stays(name: str) -> None:
-    found = registry.defaults(registry.metric.get(name))
+    found = defaults(registry.metric.get(name))
     promised = DEFAULTS.get(name, {}) | {"sync_on_compute": True, "process_group": None}
     promised |= {
         option: value for option, value in {"length_rule": "min", "check_finite": True}.items() if option in found

@@ -28,7 +28,8 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.samplers import NoiseProcess
 from facediff.registry import alias_path
-from facediff.utils.ranges import Range, mismatch
+from facediff.utils.hints import defaults, mismatch
+from facediff.utils.ranges import Range
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 for kind in registry.KINDS.values():
@@ -217,7 +218,7 @@ def test_wild_arguments_of_a_component(
         model: AnimationModel = registry.model.get(name)(**{**SIZES, **TINY, **MODELS[name], **chosen})
         return model
 
-    options = [name for name in registry.defaults(entry.implementation) if name != "config"]
+    options = [name for name in defaults(entry.implementation) if name != "config"]
     assert not options or draw(entry.implementation, build, use_model, f"model.{kind}", values, options) == []
 
 

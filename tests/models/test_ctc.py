@@ -13,8 +13,8 @@ import torch
 
 from facediff import registry
 from facediff.errors import FaceDiffError
+from facediff.hyperparameters import describe
 from facediff.models.audio_encoders import CtcEncoder
-from facediff.registry import describe
 
 LENGTHS = torch.tensor([16_000, 9_600])
 """One second, and 0.6 s: 50 and 30 steps."""

@@ -15,7 +15,7 @@ from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.earlier_versions import REMOVED, SHORT_NAMES, without_removed_options
-from facediff.registry import defaults
+from facediff.utils.hints import defaults
 from tests.fakes.tiny import Tiny
 
 

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.errors import FaceDiffError
+from facediff.hyperparameters import describe
 from facediff.models.audio_encoders import HubertEncoder, standardise
 from facediff.models.layers import interpolate_frames
-from facediff.registry import describe
 
 Change = Callable[[Path], object]
 

@@ -44,7 +44,7 @@ class Paper:
     font: str = FONT  # family of all letters
 
     def __post_init__(self) -> None:
-        ranges.check_fields(self)
+        ranges.check_options(self)
         if (across := self.pixels(self.width)) > WIDEST:
             raise FaceDiffError(
                 f"--width {self.width:g} --dpi {self.dpi}: a figure {across} pixels wide; expected {WIDEST} at most, "

@@ -64,7 +64,8 @@ from facediff.models.speaker_encoders import (
 )
 from facediff.speech.windows import LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS, MotionWindow
 from facediff.utils import ranges
-from facediff.utils.ranges import Range, mismatch
+from facediff.utils.hints import defaults, mismatch
+from facediff.utils.ranges import Range
 from facediff.utils.renamed import warn_of_keyword
 
 NumericScale = Annotated[float, Range(1e-6, 1e6)]
@@ -351,14 +352,14 @@ class DualPathDiffusion(AnimationModel):
         first: dict[str, Any] = self.hparams["sampler"]["init_args"]
         options = dict(first if self._sampler_options is None else self._sampler_options)
         if name is not None:
-            shared = {"spacing", "last_noise", "first_noise"} & first.keys() & registry.defaults(chosen).keys()
+            shared = {"spacing", "last_noise", "first_noise"} & first.keys() & defaults(chosen).keys()
             options = {key: first[key] for key in sorted(shared)}
         options |= {} if steps is None else {"steps": steps}
-        count = options.get("steps", registry.defaults(chosen).get("steps"))
+        count = options.get("steps", defaults(chosen).get("steps"))
         if count is not None and options.get("first_noise") and options.get("last_noise"):
             share = count / min(self._usual_steps, MANY_STEPS)
             options["last_noise"] = ended_earlier(first["first_noise"], first["last_noise"], share)
-            if "spread" in registry.defaults(chosen) and self.motion_space.preconditioning is not None:
+            if "spread" in defaults(chosen) and self.motion_space.preconditioning is not None:
                 wider = widened(first["first_noise"], first["last_noise"], share)
                 options["spread"] = min(2.0, wider * first.get("spread", 1.0))
         try:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from facediff.data import Batch, Reference
 from facediff.errors import ArgumentError, FaceDiffError, OptionError
+from facediff.hyperparameters import component_class
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.checkpoint_content import MotionScale
@@ -39,9 +40,8 @@ from facediff.models.graphs import (
 from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.models.speech_networks import Wav2Vec2Encoder
-from facediff.registry import component_class
 from facediff.speech.windows import FrameClock, Rule
-from facediff.utils.plain_options import fits, parameters
+from facediff.utils.hints import fits, options_of
 
 Alignment = Literal["auto", "pairs", "interpolated"]
 """How speech at 50 steps a second meets motion: as ``pairs`` of steps for each frame, as the projects do on BIWI at 25
@@ -387,7 +387,7 @@ def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEn
         ArgumentError: if its channels are not stated, and it does not know them by itself.
     """
     encoder_class = component_class(factory)
-    if dim is None and not fits(None, parameters(encoder_class)["dim"]):
+    if dim is None and not fits(options_of(encoder_class)["dim"].annotation, None):
         raise ArgumentError(
             {"audio_dim": dim}, f"{encoder_class.__name__} does not state its channels by itself; give them, e.g. 64"
         )

@@ -25,6 +25,7 @@ from facediff.data import Assets
 from facediff.data.batch import ASSETS_KEY
 from facediff.data.corpus import read_templates
 from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.hyperparameters import component_class
 from facediff.metrics import Region
 from facediff.models.checkpoint import check_weights
 from facediff.models.checkpoint_content import IMPORTED
@@ -38,12 +39,12 @@ from facediff.models.published.recognition import (
     Recogniser,
     dataset_facts,
 )
-from facediff.registry import component_class
 from facediff.spaces.layouts import layout
+from facediff.utils import hints
+from facediff.utils.hints import is_name, options_of
 from facediff.utils.licences import Licence, merged, network_licences
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
-from facediff.utils.plain_options import as_hinted, fits, in_words, is_name, parameters
 from facediff.utils.tensorflow_files import read_bundle
 from facediff.utils.torch_files import read_arguments, read_state_dict
 
@@ -443,8 +444,8 @@ def with_options(method: str, converted: dict[str, Any], chosen: Mapping[str, An
     Raises:
         FaceDiffError: if there is no such option, or a value does not fit it.
     """
-    own = parameters(registry.model.get(method))
-    encoders = parameters(component_class(converted["audio_encoder"])) if "audio_encoder" in converted else {}
+    own = options_of(registry.model.get(method))
+    encoders = options_of(component_class(converted["audio_encoder"])) if "audio_encoder" in converted else {}
     for name in ("n_vertices", "identities", "frame_rate", "space", "audio_encoder"):
         own.pop(name, None)
     for name in ("dim", "config", "source"):
@@ -452,15 +453,15 @@ def with_options(method: str, converted: dict[str, Any], chosen: Mapping[str, An
     for name, text in chosen.items():
         if name == "frame_rate" and chooses_rate(method):
             continue
-        hints = own if name in own else encoders
-        if name not in hints:
+        if name not in own and name not in encoders:
             raise OptionError.naming(
                 f"{{option}} {name}: {method} has no such option: {choices(name, [*own, *encoders])}"
             )
         value = read_value(text)
-        if not fits(value, hints[name]):
-            raise OptionError.naming(f"{{option}} {name}={text}: expected {in_words(hints[name])}")
-        value = as_hinted(value, hints[name])
+        hint = (own if name in own else encoders)[name].annotation
+        if not hints.fits(hint, value, stored=True):
+            raise OptionError.naming(f"{{option}} {name}={text}: expected {hints.describe(hint)}")
+        value = hints.convert(hint, value)
         if name in own:
             converted = {**converted, name: value}
         else:

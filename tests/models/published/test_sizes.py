@@ -13,6 +13,7 @@ import torch
 
 from facediff import registry
 from facediff.models.audio_encoders import MelEncoder
+from facediff.utils.hints import defaults
 
 STYLE_ENCODER = {"style_dim": 128, "style_layers": 4, "style_heads": 4, "style_positions": "published"}
 PUBLISHED: dict[str, dict[str, Any]] = {
@@ -53,7 +54,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_options_that_are_not_named_are_as_published(name: str) -> None:
-    own = registry.defaults(registry.model.get(name))
+    own = defaults(registry.model.get(name))
     assert {option: own[option] for option in PUBLISHED[name]} == PUBLISHED[name]
 
 
