@@ -43,7 +43,7 @@ class Keeping(Kept):
 @pytest.fixture(autouse=True)
 def receivers(monkeypatch: pytest.MonkeyPatch) -> None:
     """No receivers but the one of this file."""
-    kind = Kind("receiver", "", "tests", aliases=False)
+    kind = Kind("receiver", "", "tests")
     kind.register("keep")(Keeping)
     for place in ("facediff.registry", "facediff.live.frames", "facediff.live.options"):
         monkeypatch.setattr(f"{place}.receiver", kind)

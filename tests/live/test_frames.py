@@ -33,7 +33,7 @@ class Noted(Receiver):
 @pytest.fixture
 def noted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kind of receivers with one of a third party's."""
-    kind = Kind("receiver", "", "tests", aliases=False)
+    kind = Kind("receiver", "", "tests")
     kind.register("noted")(Noted)
     monkeypatch.setattr(registry, "receiver", kind)
     monkeypatch.setattr("facediff.live.frames.receiver", kind)

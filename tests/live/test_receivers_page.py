@@ -18,7 +18,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "live.md"
 @pytest.fixture
 def own_kind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The page registers a receiver: not for other tests."""
-    kind = Kind("receiver", "", "tests", aliases=False)
+    kind = Kind("receiver", "", "tests")
     monkeypatch.setattr(registry, "receiver", kind)
     monkeypatch.setattr("facediff.live.frames.receiver", kind)
     return
