@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from facediff.errors import FaceDiffError, choices
+from facediff.utils.hints import mismatch
 from facediff.utils.limits import quoted
-from facediff.utils.ranges import Range, mismatch
+from facediff.utils.ranges import Range
 
 Record = TypeVar("Record")
 
