@@ -81,11 +81,7 @@ class RatioMetric(Denominator):
         return ratio
 
     def compute(self) -> Tensor:
-        """The score over all sequences so far, a float64 scalar.
-
-        Raises:
-            ValueError: if no process had any sequence, or the denominator is zero on all of them.
-        """
+        """The score over all sequences so far, a float64 scalar."""
         if int(self.counts[1]) == 0:
             self.refuse_to_compute(0)
         self.check_denominator(self.parts[1])

@@ -94,10 +94,6 @@ class StyleRetrievalAccuracy(ExactMetric):
             embeddings: (batch, dim), floating point.
             labels: whole numbers (batch,): whose style it is.
             clip_names: one name per embedding, for messages.
-
-        Raises:
-            ValueError: if shapes do not fit, or an embedding holds NaN or infinity, or is zero and has no direction to
-                compare by cosine. Nothing is added then.
         """
         if embeddings.ndim != 2 or int(self.width) not in (0, embeddings.shape[1]):
             raise ValueError(
@@ -127,11 +123,7 @@ class StyleRetrievalAccuracy(ExactMetric):
             return int(_is_query(self._gathered()[1]).sum())
 
     def compute(self) -> Tensor:
-        """The accuracy over all embeddings so far, a float64 scalar.
-
-        Raises:
-            ValueError: if no label is carried by two embeddings, or processes hold embeddings of different sizes.
-        """
+        """The accuracy over all embeddings so far, a float64 scalar."""
         flat, labels = self._gathered()
         queries = _is_query(labels)
         if len(flat) != len(labels) * int(self.width) or not bool(queries.any()):

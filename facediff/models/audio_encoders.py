@@ -88,11 +88,7 @@ class AudioEncoder(nn.Module, ABC):
         return None
 
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
-        """What the frozen part makes of speech, and each clip's valid steps.
-
-        Raises:
-            NotImplementedError: if the encoder has no frozen part.
-        """
+        """What the frozen part makes of speech, and each clip's valid steps."""
         raise NotImplementedError(f"{type(self).__name__} has no frozen part")
 
     def steps_of(self, samples: int) -> int:
@@ -347,10 +343,6 @@ class HubertEncoder(FrozenEncoder):
         layer_drop: probability of skipping a Transformer layer in training; frozen layers are never skipped.
         config: the model's configuration as plain data; if given, the weights are not read from ``source`` but left
             for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
-
-    Raises:
-        FaceDiffError: if ``source`` cannot be read.
-        MissingExtraError: if transformers is not installed.
     """
 
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
@@ -547,10 +539,6 @@ class CtcEncoder(FrozenEncoder):
         source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
         config: the recogniser's configuration as plain data; if given, the weights are not read from ``source`` but
             left for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
-
-    Raises:
-        FaceDiffError: if ``source`` cannot be read, or is no such recogniser.
-        MissingExtraError: if transformers is not installed.
     """
 
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere
@@ -628,10 +616,6 @@ def load_typed(
         what: what is expected, in errors.
         encoder: the audio encoder that needs it, in errors.
         option: the option that ``source`` comes from, in errors.
-
-    Raises:
-        FaceDiffError: if ``source`` cannot be read, or is of another type.
-        MissingExtraError: if transformers is not installed.
     """
     with needs_extra("transformers", "train", f"the {encoder} audio encoder"):
         import transformers
@@ -691,11 +675,7 @@ def unreadable(source: str, what: str, error: Exception, option: str = SOURCE) -
 
 
 def load_pretrained(network: Any, source: str, what: str, option: str = SOURCE) -> Any:  # noqa: ANN401 - one of transformers' models
-    """A complete network from a directory or from the hub.
-
-    Raises:
-        FaceDiffError: if it cannot be read, or some of its weights are not there.
-    """
+    """A complete network from a directory or from the hub."""
     from transformers.utils import logging
 
     check_source(source, option)

@@ -41,9 +41,6 @@ def without_removed_options(content: Any, source: object) -> Any:  # noqa: ANN40
 
     Returns:
         a copy, in which nothing else has changed.
-
-    Raises:
-        FaceDiffError: if an option has another value than the one that is left.
     """
     if isinstance(content, list):
         return [without_removed_options(item, source) for item in content]

@@ -43,9 +43,6 @@ def conditioned(
     """Copies of a batch, one per identity that unseen speakers are conditioned on, with that identity's name.
 
     A clip of a training identity comes once. ``identities`` are in the order of the identity index.
-
-    Raises:
-        FaceDiffError: if the policy is ``adapted`` and a speaker is unseen, or an identity has no style reference.
     """
     seen = [clip for clip, index in enumerate(batch.identity.tolist()) if index >= 0]
     unknown = [clip for clip in range(len(batch)) if clip not in seen]
@@ -129,9 +126,6 @@ class Evaluation:
     """Metrics of one protocol, and ``metrics`` chosen by name with their options, for every split and method.
 
     No part of the model's module tree: weight averaging copies that tree before the regions are known.
-
-    Raises:
-        FaceDiffError: if there is no such metric or option.
     """
 
     def __init__(
@@ -167,11 +161,7 @@ class Evaluation:
     def prepare(
         self, model: Inference, splits: Sequence[str], device: torch.device, data: SpeechMotionDataModule
     ) -> None:
-        """Make empty metrics for a corpus, on the device where processes reduce them.
-
-        Raises:
-            FaceDiffError: if the corpus or the model lacks something that a metric needs.
-        """
+        """Make empty metrics for a corpus, on the device where processes reduce them."""
         assets, corpus = model.assets, ScoredCorpus(data, model.assets)
         self._corpus = corpus
         self._check_space(assets)

@@ -224,11 +224,7 @@ class ConditionalDenoiser:
         return prediction
 
     def motion(self, sample: State, wanted: slice = slice(None)) -> WantedMotion:  # noqa: B008
-        """Scaled motion of the sampler's result in some frames; where folded, the only map to the vertices.
-
-        Raises:
-            FaceDiffError: if the sampler did not end at the last prediction.
-        """
+        """Scaled motion of the sampler's result in some frames; where folded, the only map to the vertices."""
         if not isinstance(self.space, FoldedSpace):
             return sample[:, wanted]
         # y alone does not say where the vertices are. But the last step of a linear sampler returns the last prediction

@@ -460,11 +460,7 @@ FORMAT = "facediff generation metrics 1"
 
 
 def means_of(content: object, source: object) -> dict[str, dict[str, float | None]]:
-    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave.
-
-    Raises:
-        FaceDiffError: if it is anything else.
-    """
+    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave."""
     means: dict[str, dict[str, float | None]] = {}
     try:
         if not isinstance(content, dict) or content["format"] != FORMAT:
@@ -499,9 +495,6 @@ def measure(
         sampling: how they are asked for motion.
         most_clips: clips of a split, evenly spread; all if None.
         step: called after each clip of each model.
-
-    Raises:
-        FaceDiffError: if a split has no clip, a model is of another corpus, or the sampler does not fit.
     """
     sampling = sampling or SamplingOptions()
     corpus = EvaluationCorpus(data)

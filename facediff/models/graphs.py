@@ -133,9 +133,6 @@ def update_table(sampler: Sampler) -> list[list[float]]:
     For each step: the factors of the noisy motion, of the latest prediction and the two before it, and of new noise,
     which is 0 where none is drawn. A last row may have one number more, the factor of the first prediction.
 
-    Raises:
-        FaceDiffError: if the sampler is not linear.
-
     Example:
         >>> from facediff.models.samplers import DdimSampler, NoiseProcess
         >>> update_table(DdimSampler(process=NoiseProcess(), steps=4))[-1]

@@ -129,10 +129,6 @@ class Inference(ABC):
             expressivity: as :meth:`choose_expressivity` takes it, for this call alone; the model's own if None.
             progress: wraps the iteration over sampling steps, or over the seconds of long speech.
 
-        Raises:
-            FaceDiffError: if the identity or the condition is unknown, the reference does not fit the topology, the
-                speech is shorter than a frame, or the model has no such expressivity.
-
         Example:
             >>> model = facediff.models.load_model(Path("demo/puppet.ckpt"))  # doctest: +SKIP
             >>> speech = torch.from_numpy(facediff.speech.audio.read_speech(Path("speech.wav")))  # doctest: +SKIP
@@ -171,9 +167,6 @@ class Inference(ABC):
             seeds: one for each sample.
             expressivity: as :meth:`animate` takes it.
             progress: as :meth:`animate` takes it.
-
-        Raises:
-            FaceDiffError: as :meth:`animate`.
         """
         clip = self.clip_of(audio, identity, style, condition)
         with self.expressed(expressivity):
@@ -224,9 +217,6 @@ class Inference(ABC):
             seeds: one for each sample.
             plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
             expressivity: as :meth:`animate` takes it.
-
-        Raises:
-            FaceDiffError: as :meth:`animate`.
         """
         # The speech is not known yet; a clip of one silent frame carries the face and the style.
         frame = torch.zeros(samples_for(1, self.frame_rate), device=self.device)
@@ -251,9 +241,6 @@ class Inference(ABC):
             seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the other clips.
             expressivity: as :meth:`animate` takes it.
             progress: wraps the iteration over steps, or over the seconds of long speech, e.g. in a progress bar.
-
-        Raises:
-            FaceDiffError: if the model has no such expressivity.
         """
         with self.expressed(expressivity):
             return self._generate(batch, seed, progress)
@@ -289,11 +276,7 @@ class Inference(ABC):
         return self.clock.frames(samples)
 
     def check_condition(self, condition: str | None) -> None:
-        """Refuse to be conditioned on a speaker that the model was not trained on.
-
-        Raises:
-            FaceDiffError: naming the known identities.
-        """
+        """Refuse to be conditioned on a speaker that the model was not trained on."""
         if condition is not None and condition not in self.assets.identities:
             raise FaceDiffError(
                 f'condition: the model was not trained on "{condition}": {choices(condition, self.assets.identities)}'
@@ -315,9 +298,6 @@ class Inference(ABC):
             style: as :meth:`animate` takes it.
             condition: as :meth:`animate` takes it.
             frames: how many the speech lasts; as :meth:`frames_of` counts them if None.
-
-        Raises:
-            FaceDiffError: as :meth:`animate`.
         """
         template = self.assets.template(identity)
         self.check_condition(condition)
@@ -349,11 +329,7 @@ class Inference(ABC):
         return collate([sample]).to(self.device)
 
     def default_style(self, identity: str) -> Reference | Style:
-        """The stored reference of an identity.
-
-        Raises:
-            FaceDiffError: if it has none.
-        """
+        """The stored reference of an identity."""
         if identity not in self.assets.references:
             raise OptionError.naming(
                 f"style: the checkpoint holds no reference motion of {identity}; give one with {{style}}"
@@ -375,9 +351,6 @@ class Inference(ABC):
         Args:
             name: the sampler's registered name; the present one if None.
             steps: its denoising steps; its own default if None.
-
-        Raises:
-            FaceDiffError: if the model does not sample, or there is no such sampler.
         """
         how = "samples in its own way only" if self.samples else "does not sample"
         raise OptionError.naming(f"{type(self).__name__} {how}: omit {{sampler}} and {{steps}}")
@@ -398,9 +371,6 @@ class Inference(ABC):
 
         Args:
             expressivity: from 0 to 2; one number, or one for each vertex.
-
-        Raises:
-            FaceDiffError: if it is not 1 and the model makes no samples, or it is out of range.
         """
         if not isinstance(expressivity, Tensor) and expressivity == 1:
             return
@@ -410,11 +380,7 @@ class Inference(ABC):
 
     @contextmanager
     def expressed(self, expressivity: Expressivity | None) -> Iterator[None]:
-        """Within it, motion has another expressivity; None leaves it as it is.
-
-        Raises:
-            FaceDiffError: as :meth:`choose_expressivity`.
-        """
+        """Within it, motion has another expressivity; None leaves it as it is."""
         before = self.expressivity
         if expressivity is not None:
             self.choose_expressivity(expressivity)
@@ -429,9 +395,6 @@ class Inference(ABC):
 
         Args:
             scales: by condition; 1 follows it as the model has learnt to.
-
-        Raises:
-            FaceDiffError: if the model knows no motion without such a condition, or a scale is out of range.
         """
         raise FaceDiffError(f"guidance: {type(self).__name__} cannot be guided; omit the option")
 
@@ -521,11 +484,7 @@ class Inference(ABC):
         """The audio encoder, which is told how loud a stream is."""
 
     def graphs(self) -> Graphs:
-        """The model as graphs that run without PyTorch, with its present sampler; see :mod:`facediff.models.graphs`.
-
-        Raises:
-            FaceDiffError: if it cannot be exported.
-        """
+        """The model as graphs that run without PyTorch, with its present sampler; see :mod:`facediff.models.graphs`."""
         raise FaceDiffError(
             f"{type(self).__name__}: has no graphs and cannot be exported; a model that can overrides graphs()"
         )
@@ -556,9 +515,6 @@ class SpeechStream(SpeechWindows[Motion]):
         clip: one clip; its identity and style are used, its speech and its motion are not used.
         seeds: one for each sample.
         plan: the windows; the model's own if None.
-
-    Raises:
-        FaceDiffError: if the plan does not fit the frame rate.
     """
 
     def __init__(
@@ -575,11 +531,7 @@ class SpeechStream(SpeechWindows[Motion]):
         self._tail: list[Tensor] | None = None  # what the latest window hands over to the next
 
     def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
-        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames.
-
-        Raises:
-            FaceDiffError: if the stream was finished.
-        """
+        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames."""
         return super().feed(samples.float().cpu().numpy() if isinstance(samples, Tensor) else samples)
 
     @torch.inference_mode()

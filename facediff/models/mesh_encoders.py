@@ -63,11 +63,7 @@ class MeshEncoderFactory(Protocol):
 
 
 def check_points(motion: Tensor, n_vertices: int, dims: int) -> None:
-    """Refuse motion (batch, frames, points, dims) on another mesh, or of another space.
-
-    Raises:
-        ValueError: if the number of points is another one; a larger one would be encoded without an error.
-    """
+    """Refuse motion (batch, frames, points, dims) on another mesh, or of another space."""
     if motion.shape[2:] != (n_vertices, dims):
         raise ValueError(
             f"motion has {tuple(motion.shape[2:])} points, but the mesh encoder was made for {n_vertices, dims}"
@@ -252,9 +248,6 @@ class SpiralMeshEncoder(MeshEncoder):
 
         Args:
             topology: a mesh hierarchy of :attr:`mesh_options`.
-
-        Raises:
-            FaceDiffError: if it is of another mesh or other options.
         """
         sizes = [level.n_vertices for level in topology.levels]
         expected = [self.n_vertices, *(step.sizes[1] for step in self.steps)]
@@ -281,11 +274,7 @@ class SpiralMeshEncoder(MeshEncoder):
         self._attached = True
 
     def forward(self, motion: Motion) -> Frames:
-        """The feature of each frame.
-
-        Raises:
-            FaceDiffError: if the encoder has not been given a mesh.
-        """
+        """The feature of each frame."""
         check_points(motion, self.n_vertices, 3)
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")

@@ -59,11 +59,7 @@ class Facts:
 
 
 def read_scores(path: Path) -> list[dict[str, str]]:
-    """The rows of a table of scores.
-
-    Raises:
-        FaceDiffError: if the file is none that ``facediff test`` has written.
-    """
+    """The rows of a table of scores."""
     remedy = f"expected {SCORES} as `facediff test` writes it"
     rows = list(read_rows(path, remedy=remedy))
     if not rows or not {"split", "method", "protocol", "frames"} <= rows[0].keys():
@@ -89,11 +85,7 @@ def is_score(column: str) -> bool:
 
 
 def check_languages(languages: Iterable[str]) -> None:
-    """Refuse what is no code of a language.
-
-    Raises:
-        FaceDiffError: naming it.
-    """
+    """Refuse what is no code of a language."""
     for code in languages:
         if not re.fullmatch(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})*", code):
             raise FaceDiffError(f"--languages {quoted(code)}: expected codes such as en or zh-CN, separated by commas")
@@ -103,18 +95,143 @@ def card(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) ->
     """The text of a model card: metadata in YAML, then Markdown."""
     import yaml
 
-    head = yaml.safe_dump(metadata(model, licences, facts), sort_keys=False, allow_unicode=True, width=100)
-    parts = [
-        introduction(model, facts),
-        how_to_use(model, facts),
-        licence_section(licences),
-        data_section(model, facts),
-        training_section(model),
-        score_section(model, facts),
-        limits_section(model),
-        files_section(facts),
+    assets, provenance, data, options = model.assets, model.provenance, model.data_options, dict(model.hparams)
+    about = [
+        ("vertices", f"{model.n_vertices}, in {text(assets.unit)}"),
+        ("frames a second", f"{model.frame_rate:g}"),
+        ("identities", ", ".join(text(name) for name in model.identities)),
+        (
+            "weights",
+            f"{sum(weight.numel() for weight in model.parameters()) / 1e6:.2f} million, stored in "
+            f"{'16' if facts.half else '32'} bits",
+        ),
+        *((kind.replace("_", " "), f"`{name}`") for kind, name in components(model).items()),
     ]
-    return f"---\n{head}---\n\n" + "\n\n".join(parts) + "\n"
+    corpus_rows = [
+        ("corpus", text(assets.corpus)),
+        ("kind", "synthetic, made by a program" if assets.synthetic else "captured from real people"),
+        ("speakers trained on", str(len(model.identities))),
+        ("faces known", str(len(assets.templates))),
+        ("languages", ", ".join(languages_of(model, facts)) or "not stated"),
+    ]
+    origin = "the authors' checkpoint, imported" if IMPORTED in provenance else "nothing; trained from its first step"
+    training = [
+        ("adapted from", text(provenance.get("parent") or origin)),
+        ("epochs", provenance.get("epochs", "not known")),
+        ("optimiser steps", provenance.get("steps", "not known")),
+        ("seed", provenance.get("seed", "not known")),
+        ("learning rate", f"{options.get('learning_rate', 'not known')}, {options.get('lr_schedule', '')}"),
+        ("weight decay", str(options.get("weight_decay", "not known"))),
+        ("clips a batch", str(data.get("batch_size", "not known"))),
+        ("training window", "whole clips" if data.get("window") is None else f"{data['window']} frames"),
+        ("weights stored", "the averaged ones, where training averaged them"),
+    ]
+    labels = [
+        (text(label.of), text(label.name), label.commercial, text(label.source) or "not stated") for label in licences
+    ]
+    files = [(f"`{name}`", f"{facts.sizes.get(name, 0) / 1e6:.2f} MB", what) for name, what in FILES.items()]
+    body = BODY.format(
+        title=text(facts.name),
+        name=facts.name,
+        method=type(model).__name__,
+        corpus=text(assets.corpus),
+        identity=model.identities[0],
+        vertices=model.n_vertices,
+        config=CONFIG,
+        synthetic=SYNTHETIC if assets.synthetic else "",
+        people=OF_PROGRAMS if assets.synthetic else OF_PEOPLE,
+        verdict=VERDICTS[commercial_use(licences)],
+        about=table(("", ""), about),
+        labels=table(("of", "licence", "commercial use", "where it stands"), labels) if labels else "",
+        data=table(("", ""), corpus_rows),
+        training=table(("", ""), training),
+        scores=score_section(model, facts),
+        files=table(("file", "size", "content"), files),
+    )
+    head = yaml.safe_dump(metadata(model, licences, facts), sort_keys=False, allow_unicode=True, width=100)
+    return f"---\n{head}---\n\n{body}"
+
+
+BODY = """# {title}
+
+Speech in, a talking 3D face out: a model of the method `{method}` of facediff, trained on the corpus **{corpus}**.
+{synthetic}
+{about}
+
+## How to use it
+
+```bash
+pip install "facediff[all]"
+facediff animate speech.wav --checkpoint {name} --identity {identity} -o speech.mp4
+```
+
+```python
+import facediff
+
+model = facediff.load("{name}")
+model.animate("speech.wav", identity="{identity}").save("speech.glb")
+```
+
+In place of the name, give this folder's path, or `user/name` (or `user/name@revision`) of the hub. The folder holds
+numbers and plain text only; nothing in it is run.
+
+## Licences
+
+{verdict} The strictest decides; read the terms themselves, this is no legal advice.
+
+{labels}
+
+## Data
+
+{data}
+
+## Training
+
+{training}
+
+Every option is in `{config}`.
+
+## Scores
+
+{scores}
+
+## Intended use
+
+Research and production of facial animation from recorded or synthesised speech: games, avatars, studies of methods.
+Do not use it to imitate a person without their consent, or to deceive.
+
+## Limits
+
+- {people}
+- It animates faces of its own topology ({vertices} vertices); other meshes need `--target-mesh`.
+- It moves the face alone: blinks, gaze and head motion are as far learnt as the corpus has them.
+- Speech in other languages, singing, noise and children's voices were not tested.
+- Unseen speakers get the style of a reference clip; their likeness is below that of trained identities.
+
+## Files
+
+{files}
+"""
+SYNTHETIC = """
+> **Synthetic data.** A program made the faces and their motion. Scores on this corpus compare models; they say nothing
+> about real people.
+"""
+OF_PROGRAMS = "It has learnt from a program's motion: it shows how such a model works, not how people move."
+OF_PEOPLE = "Its identities are real people: do not make them say what they have not agreed to say."
+VERDICTS = {
+    "allowed": "Commercial use is **allowed** by every licence that this model inherits.",
+    "forbidden": "Commercial use is **forbidden** by at least one licence that this model inherits.",
+    "unknown": "Whether commercial use is allowed is **unknown**; treat it as not allowed until you know.",
+}
+FILES = {
+    WEIGHTS: "weights, without anything that only training needs",
+    CONFIG: "the model's class and options, licence labels; plain values",
+    ASSETS: "templates, triangles, regions and reference motions that animation needs",
+}
+UNTESTED = (
+    "None are known. `facediff test --ckpt_path FOLDER` measures them where the corpus is, and `facediff publish "
+    "--scores test_scores.csv` puts them here."
+)
 
 
 def metadata(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) -> dict[str, Any]:
@@ -171,35 +288,6 @@ def conditions(row: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in row.items() if name not in ("split", "method") and not is_score(name)}
 
 
-# The sections.
-
-
-def introduction(model: CheckpointContent, facts: Facts) -> str:
-    """What the model is, in a few lines."""
-    assets = model.assets
-    count = sum(parameter.numel() for parameter in model.parameters())
-    lines = [
-        f"# {text(facts.name)}",
-        "",
-        f"Speech in, a talking 3D face out: a model of the method `{type(model).__name__}` of "
-        f"facediff, trained on {'the synthetic' if assets.synthetic else 'the'} corpus **{text(assets.corpus)}**.",
-    ]
-    if assets.synthetic:
-        lines += [
-            "",
-            "> **Synthetic data.** A program made the faces and their motion. Scores on this corpus compare models; "
-            "they say nothing about real people.",
-        ]
-    rows = [
-        ("vertices", f"{model.n_vertices}, in {text(assets.unit)}"),
-        ("frames a second", f"{model.frame_rate:g}"),
-        ("identities", ", ".join(text(name) for name in model.identities)),
-        ("weights", f"{count / 1e6:.2f} million, stored in {'16' if facts.half else '32'} bits"),
-        *((kind.replace("_", " "), f"`{name}`") for kind, name in components(model).items()),
-    ]
-    return "\n".join([*lines, "", table(("", ""), rows)])
-
-
 def components(model: CheckpointContent) -> dict[str, str]:
     """The names of the model's components by kind."""
     options = {kind: model.hparams.get(kind) for kind in COMPONENTS}
@@ -210,84 +298,10 @@ def components(model: CheckpointContent) -> dict[str, str]:
     }
 
 
-def how_to_use(model: CheckpointContent, facts: Facts) -> str:
-    """The two ways to use it."""
-    identity = model.identities[0]
-    return f"""## How to use it
-
-```bash
-pip install "facediff[all]"
-facediff animate speech.wav --checkpoint {facts.name} --identity {identity} -o speech.mp4
-```
-
-```python
-import facediff
-
-model = facediff.load("{facts.name}")
-model.animate("speech.wav", identity="{identity}").save("speech.glb")
-```
-
-In place of the name, give this folder's path, or `user/name` (or `user/name@revision`) of the hub. The folder holds
-numbers and plain text only; nothing in it is run."""
-
-
-def licence_section(licences: Sequence[Licence]) -> str:
-    """The labels, and what the strictest of them says."""
-    rows = [
-        (text(label.of), text(label.name), label.commercial, text(label.source) or "not stated") for label in licences
-    ]
-    verdict = {
-        "allowed": "Commercial use is **allowed** by every licence that this model inherits.",
-        "forbidden": "Commercial use is **forbidden** by at least one licence that this model inherits.",
-        "unknown": "Whether commercial use is allowed is **unknown**; treat it as not allowed until you know.",
-    }[commercial_use(licences)]
-    shown = table(("of", "licence", "commercial use", "where it stands"), rows) if rows else ""
-    advice = "The strictest decides; read the terms themselves, this is no legal advice."
-    return f"## Licences\n\n{verdict} {advice}\n\n{shown}"
-
-
-def data_section(model: CheckpointContent, facts: Facts) -> str:
-    """What it was trained on."""
-    assets = model.assets
-    languages = ", ".join(languages_of(model, facts)) or "not stated"
-    rows = [
-        ("corpus", text(assets.corpus)),
-        ("kind", "synthetic, made by a program" if assets.synthetic else "captured from real people"),
-        ("speakers trained on", str(len(model.identities))),
-        ("faces known", str(len(assets.templates))),
-        ("languages", languages),
-    ]
-    return f"## Data\n\n{table(('', ''), rows)}"
-
-
-def training_section(model: CheckpointContent) -> str:
-    """How it was trained."""
-    provenance = model.provenance
-    imported = IMPORTED in provenance
-    origin = "the authors' checkpoint, imported" if imported else "nothing; trained from its first step"
-    options = dict(model.hparams)
-    data = model.data_options
-    rows = [
-        ("adapted from", text(provenance.get("parent") or origin)),
-        ("epochs", provenance.get("epochs", "not known")),
-        ("optimiser steps", provenance.get("steps", "not known")),
-        ("seed", provenance.get("seed", "not known")),
-        ("learning rate", f"{options.get('learning_rate', 'not known')}, {options.get('lr_schedule', '')}"),
-        ("weight decay", str(options.get("weight_decay", "not known"))),
-        ("clips a batch", str(data.get("batch_size", "not known"))),
-        ("training window", "whole clips" if data.get("window") is None else f"{data['window']} frames"),
-        ("weights stored", "the averaged ones, where training averaged them"),
-    ]
-    return f"## Training\n\n{table(('', ''), rows)}\n\nEvery option is in `{CONFIG}`."
-
-
 def score_section(model: CheckpointContent, facts: Facts) -> str:
     """The scores with everything that decides them."""
     if not facts.scores:
-        return (
-            "## Scores\n\nNone are known. `facediff test --ckpt_path FOLDER` measures them where the corpus is, and "
-            "`facediff publish --scores test_scores.csv` puts them here."
-        )
+        return UNTESTED
     first, names = facts.scores[0], scored(facts.scores)
     called = {name: label.format(model="this model") for name, label in METHODS.items()}
     header = ["split", "method", *(name.upper() for name in names), "frames", "sequences"]
@@ -314,38 +328,7 @@ def score_section(model: CheckpointContent, facts: Facts) -> str:
         "The other rows are baselines: a face that never moves, the speaker's mean face, and this model with the "
         "speech of another clip. docs/metrics.md of facediff defines every score.",
     ]
-    return "## Scores\n\n" + table(header, rows) + "\n\n" + "\n".join(note for note in notes if note)
-
-
-def limits_section(model: CheckpointContent) -> str:
-    """What it is for, and what it cannot do."""
-    synthetic = (
-        "- It has learnt from a program's motion: it shows how such a model works, not how people move.\n"
-        if model.assets.synthetic
-        else "- Its identities are real people: do not make them say what they have not agreed to say.\n"
-    )
-    return f"""## Intended use
-
-Research and production of facial animation from recorded or synthesised speech: games, avatars, studies of methods.
-Do not use it to imitate a person without their consent, or to deceive.
-
-## Limits
-
-{synthetic}- It animates faces of its own topology ({model.n_vertices} vertices); other meshes need `--target-mesh`.
-- It moves the face alone: blinks, gaze and head motion are as far learnt as the corpus has them.
-- Speech in other languages, singing, noise and children's voices were not tested.
-- Unseen speakers get the style of a reference clip; their likeness is below that of trained identities."""
-
-
-def files_section(facts: Facts) -> str:
-    """The files and their sizes."""
-    about = {
-        WEIGHTS: "weights, without anything that only training needs",
-        CONFIG: "the model's class and options, licence labels; plain values",
-        ASSETS: "templates, triangles, regions and reference motions that animation needs",
-    }
-    rows = [(f"`{name}`", f"{facts.sizes.get(name, 0) / 1e6:.2f} MB", what) for name, what in about.items()]
-    return f"## Files\n\n{table(('file', 'size', 'content'), rows)}"
+    return table(header, rows) + "\n\n" + "\n".join(note for note in notes if note)
 
 
 # Helpers.

@@ -130,9 +130,6 @@ def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -
 
     Returns:
         what ``config.json`` holds.
-
-    Raises:
-        FaceDiffError: if the model holds anything but tensors and plain values.
     """
     content = content_of(model)
     weights = content.pop("state_dict")
@@ -216,9 +213,6 @@ def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
     Args:
         folder: the folder.
         weights: whether the weights are read too.
-
-    Raises:
-        FaceDiffError: if a file is missing, damaged, or of a later format.
     """
     path = folder / CONFIG
     config = load_json(path, remedy=REMEDY)
@@ -248,11 +242,7 @@ def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
 
 
 def as_plain(value: Any, tensors: dict[str, Tensor], name: str) -> Any:  # noqa: ANN401 - plain data of any form
-    """Plain data for JSON; a tensor goes to ``tensors``, and its place holds a mark with its name and its type.
-
-    Raises:
-        FaceDiffError: if it holds anything else.
-    """
+    """Plain data for JSON; a tensor goes to ``tensors``, and its place holds a mark with its name and its type."""
     if isinstance(value, Tensor):
         key, number = name, 2
         while key in tensors or "/" in key or "\\" in key:
@@ -271,11 +261,7 @@ def as_plain(value: Any, tensors: dict[str, Tensor], name: str) -> Any:  # noqa:
 
 
 def with_tensors(value: Any, arrays: Mapping[str, np.ndarray[Any, Any]], path: Path) -> Any:  # noqa: ANN401
-    """Undo :func:`as_plain`.
-
-    Raises:
-        FaceDiffError: naming the tensor that is missing or of another size than stated.
-    """
+    """Undo :func:`as_plain`."""
     if isinstance(value, list):
         return [with_tensors(part, arrays, path) for part in value]
     if not isinstance(value, dict):

@@ -70,9 +70,6 @@ class NoiseProcess:
         variances: the noise variance α_n of each step, float32.
         signal: ᾱ_n = Π_{k≤n} (1 − α_k), the share of the clean motion's variance that is left after step n.
 
-    Raises:
-        FaceDiffError: if there is no such schedule.
-
     Example:
         >>> process = NoiseProcess(steps=4)
         >>> [round(float(kept), 3) for kept in process.signal]
@@ -206,9 +203,6 @@ def visited(
             where the spacing itself ends.
         first_noise: noise from which ``log_snr`` is spread; the process's last step stays the first visited. A process
             ends where motion has long been hidden, and half of the steps would be spent on the way from there.
-
-    Raises:
-        FaceDiffError: if fewer steps than that have as much noise as the last one is to have.
     """
     if spacing == "steps" and last_noise is None and first_noise is None:
         # From the end of the process, since sampling starts from pure noise; the clean end itself is no step.
@@ -340,9 +334,6 @@ class Sampler(ABC):
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
         signal: ᾱ at each of them, and 1 for the clean end.
 
-    Raises:
-        FaceDiffError: if the number of steps is impossible.
-
     Example:
         >>> sampler = DdimSampler(process=NoiseProcess(), steps=4)
         >>> sampler.timesteps
@@ -433,9 +424,6 @@ class DdimSampler(Sampler):
             ratio.
         last_noise: noise left at the last of them, as a deviation in the unit of scaled motion.
         first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
-
-    Raises:
-        FaceDiffError: if the number of steps or eta is impossible.
     """
 
     linear: ClassVar[bool] = True
@@ -511,9 +499,6 @@ class DpmSolverSampler(Sampler):
         first_noise: noise from which ``log_snr`` is spread, in the same unit; the process's own last if None.
         spread: how much louder the noise is where the first step goes on from it, and how much further from the first
             prediction, the mean, the result is; above 1 lets few steps vary more.
-
-    Raises:
-        FaceDiffError: if the number of steps or the order is impossible.
     """
 
     linear: ClassVar[bool] = True

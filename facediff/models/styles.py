@@ -56,9 +56,6 @@ def read_styles(
         identity: whose face is animated.
         model: gives the style vectors.
         template: neutral face of the speaker whose motion the .npy files hold, or ``median``.
-
-    Raises:
-        FaceDiffError: if the model has no styles, a style cannot be read, or the weights make no mean.
     """
     import torch
 
@@ -100,9 +97,6 @@ def style_from(
         identity: whose face is animated; also whose motion an array holds, unless a template is given.
         model: gives the style vectors.
         template: as :func:`read_styles` takes it.
-
-    Raises:
-        FaceDiffError: as :func:`read_styles`, or if it is nothing of that kind.
     """
     from facediff.data import Reference
     from facediff.models import Style
@@ -158,9 +152,6 @@ def extract_style(clips: Sequence[StyleLike], identity: str, model: AnimationMod
         clips: motions, as :func:`read_style` takes them, or :func:`style_from` other things than words.
         identity: whose motion it is, where a file's name does not say it.
         model: gives the style vectors; S is 0 if it was trained without styles.
-
-    Raises:
-        FaceDiffError: if a clip cannot be read, or is a style vector already.
     """
     import torch
 
@@ -193,9 +184,6 @@ def read_style(
         identity: whose face is animated.
         model: the trained model.
         template: neutral face of the speaker whose motion an array holds, or ``median``.
-
-    Raises:
-        FaceDiffError: if there is no such file or clip, or it is no style for this checkpoint.
     """
     own = model.own_styles()
     if own:
@@ -224,11 +212,7 @@ def read_style(
 def style_of(
     opened: StyleFile, identity: str, model: AnimationModel, *, template: str | Path | None = None
 ) -> Reference | Style:
-    """The style in a motion or a vector, however it was obtained; the arguments are those of :func:`read_style`.
-
-    Raises:
-        FaceDiffError: if it is no style for this checkpoint.
-    """
+    """The style in a motion or a vector, however it was obtained; the arguments are those of :func:`read_style`."""
     import torch
 
     from facediff.animation import metres_per_unit
@@ -283,11 +267,7 @@ def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
 
 
 def style_of_channels(recorded: ParameterClip, identity: str, model: AnimationModel) -> Reference:
-    """Motion in parameters as a reference of a model of channels, as offsets from the person's rest.
-
-    Raises:
-        FaceDiffError: if the model takes vertices, or the motion lacks one of its channels.
-    """
+    """Motion in parameters as a reference of a model of channels, as offsets from the person's rest."""
     import torch
 
     from facediff.animation.parameter_styles import channels_of
@@ -357,11 +337,7 @@ def face_of_array(
 
 
 def given_face(template: str | Path, opened: StyleFile, assets: Assets) -> Tensor:
-    """The neutral face (V, 3) that was given for a motion: a mesh, an array, or ``median``.
-
-    Raises:
-        FaceDiffError: naming the file, if it is none of these or of another topology.
-    """
+    """The neutral face (V, 3) that was given for a motion: a mesh, an array, or ``median``."""
     import numpy as np
     import torch
 
@@ -396,9 +372,6 @@ def check_face(path: Path, offsets: Tensor, assets: Assets, whose: str | None) -
         offsets: (T, V, 3) from the template.
         assets: of the checkpoint.
         whose: the speaker that the motion is taken for; None where the template came with the motion.
-
-    Raises:
-        FaceDiffError: if the motion is another face's, or the head moves.
     """
     stillness = stillness_of([reference.motion.float().numpy() for reference in assets.references.values()])
     if stillness is None or not stillness.another_face(offsets.numpy()):

@@ -76,10 +76,6 @@ def read_said(folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder,
         teacher: the encoder whose features are to be reproduced.
         most: recordings; of more, so many are drawn.
         seed: of the draw.
-
-    Raises:
-        FaceDiffError: if the folder holds no recording with words, one is damaged or longer than 15 s, its text is
-            empty or is not what it says, or the corpus's speakers cannot say texts.
     """
     expected = "expected NAME.wav or .flac, each with its words in NAME.txt, or NAME.de.txt if they are German"
     if not folder.is_dir():
@@ -100,11 +96,7 @@ def read_said(folder: Path, data: SpeechMotionDataModule, teacher: AudioEncoder,
 
 
 def read_words(path: Path) -> str:
-    """The words of a text file, in one line.
-
-    Raises:
-        FaceDiffError: if it is no text in UTF-8, too long, or without a letter.
-    """
+    """The words of a text file, in one line."""
     if path.stat().st_size > 4 * MOST_CHARACTERS:  # bytes of a character
         raise FaceDiffError(f"{path}: is longer than {MOST_CHARACTERS} characters; cut the recording and its text")
     try:

@@ -114,11 +114,7 @@ class SampleGraph(ModelPart[DualPathModel]):
 
 
 def graphs_of(model: DualPathModel) -> Graphs:
-    """A dual-path model with its present sampler as graphs and numbers.
-
-    Raises:
-        FaceDiffError: if its sampler is not linear, conditions are guided, or the network sees the neutral face.
-    """
+    """A dual-path model with its present sampler as graphs and numbers."""
     if model.network.template_token is not None:
         raise FaceDiffError("template_token: a model that sees the neutral face cannot be exported; train one without")
     if [*model.views()] != [()]:

@@ -378,11 +378,7 @@ class DualPathDiffusion(AnimationModel):
         self.choose_sampler(steps=min(self.low_latency_steps, self.sampler.steps))
 
     def choose_expressivity(self, expressivity: Expressivity) -> None:
-        """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with.
-
-        Raises:
-            FaceDiffError: if it is out of range, or not one number for each vertex.
-        """
+        """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with."""
         # One number for each vertex lets the lips follow the mean while the brows are sampled.
         numbers = expressivity.flatten().tolist() if isinstance(expressivity, Tensor) else [expressivity]
         if isinstance(expressivity, Tensor) and expressivity.shape != (self.n_vertices,):
@@ -407,11 +403,7 @@ class DualPathDiffusion(AnimationModel):
         return [name for name in CONDITIONS if shares[name] > 0]
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
-        """Follow conditions more (above 1) or less from now on; checkpoints keep what the model was made with.
-
-        Raises:
-            FaceDiffError: if a scale is out of range, or the model was trained without hiding such a condition.
-        """
+        """Follow conditions more (above 1) or less from now on; checkpoints keep what the model was made with."""
         for name, scale in scales.items():
             if name not in CONDITIONS:
                 raise FaceDiffError(f'guidance: there is no condition "{name}": {choices(name, CONDITIONS)}')

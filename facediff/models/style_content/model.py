@@ -224,11 +224,7 @@ class StyleContentDisentanglement(AnimationModel):
                 )
 
     def adopt(self, assets: Assets) -> None:
-        """Take over a corpus's assets, and which vertices are the face.
-
-        Raises:
-            FaceDiffError: if they do not fit, or no region says what the face is.
-        """
+        """Take over a corpus's assets, and which vertices are the face."""
         super().adopt(assets)
         visible = self.network.visible
         if visible is not None:
