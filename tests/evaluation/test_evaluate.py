@@ -145,28 +145,6 @@ def test_regions_come_from_masks_and_weights(tmp_path: Path) -> None:
     assert read_region("upper_face", 3, source="all").count == 3
 
 
-@pytest.mark.parametrize("option", [["--lip-pairs", "1-2"], ["--frame-rate", "25"]])
-def test_an_option_of_metrics_needs_a_metric(option: list[str], shared_files: Files) -> None:
-    with pytest.raises(FaceDiffError, match=option[0]):
-        evaluate(shared_files.method(), shared_files.root, *option)
-
-
-def test_metrics_with_options_or_mistakes(shared_files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--bootstrap", "0", "--json", "-", "--metric", "lip_vertex_error:squared=false"]
-    words += ["--metric", "lip_opening_correlation", "--lip-pairs", "1-2,7-11"]
-    assert evaluate(shared_files.method(), shared_files.root, *words) == 0
-    scores = {each["metric"]: each["value"] for each in json.loads(capsys.readouterr().out)["methods"][0]["scores"]}
-    assert scores["lip_vertex_error:squared=false"] > 0
-    assert -1 <= scores["lip_opening_correlation"] <= 1
-    for words, named in (
-        (["--metric", "lip_opening_correlation"], "--lip-pairs"),
-        (["--metric", "lip_vertex_eror"], "lip_vertex_error"),
-        (["--metric", "lip_vertex_error:square=false"], "squared"),
-    ):
-        with pytest.raises(FaceDiffError, match=named):
-            evaluate(shared_files.method(), shared_files.root, *words)
-
-
 def test_a_difference_stands_under_its_own_score(shared_files: Files) -> None:
     report = shared_files.evaluate("ours", "theirs", protocols=["paper"], bootstrap=0)
     first, *others = report.comparisons  # the second method has no value of the first score

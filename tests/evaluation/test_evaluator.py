@@ -19,7 +19,7 @@ from facediff.errors import FaceDiffError
 from facediff.evaluation import EvaluationReport, text
 from facediff.metrics import LipPairs, parse
 from facediff.speech.phonemes import closures, read_phonemes
-from tests.evaluation.conftest import LENGTHS, LIPS, VERTICES, Files, write_corpus
+from tests.evaluation.conftest import LENGTHS, LIPS, Files, write_corpus
 
 PAIRS = [(1, 2), (7, 11)]
 OF_A_MODEL = {
@@ -207,24 +207,6 @@ def test_what_is_missing_is_asked_for_by_name(corpus: Files, metric: str, missin
     assert all(name in str(error.value) for name in [metric, *names])
 
 
-@pytest.mark.parametrize(
-    ("words", "names"),
-    [
-        ("lip_vertex_eror", ["lip_vertex_error"]),
-        ("lip_vertex_error:square=true", ["square", "squared"]),
-        ("lip_vertex_error:squared=maybe", ["squared", "maybe", "true or false"]),
-        ("lip_vertex_error:squared", ["squared=VALUE"]),
-        ("temporal_misalignment:smoothing=wide", ["smoothing", "wide", "number"]),
-        ("temporal_misalignment:at=paths", ["at", "path"]),
-        ("lip_vertex_error:length_rule=mix", ["length rule", "min"]),
-    ],
-)
-def test_wrong_words_are_refused_with_what_was_expected(corpus: Files, words: str, names: list[str]) -> None:
-    with pytest.raises(FaceDiffError) as error:
-        scored(corpus, words)
-    assert all(name in str(error.value) for name in names)
-
-
 def test_options_have_the_kind_of_their_defaults() -> None:
     request = parse("sample_diversity: n_samples=4, pairing=all, region=lips")
     assert (request.name, dict(request.options)) == (
@@ -233,18 +215,6 @@ def test_options_have_the_kind_of_their_defaults() -> None:
     )
     assert parse("temporal_misalignment:frames_per_second=25").options == {"frames_per_second": 25.0}
     assert parse("temporal_misalignment:frames_per_second=none").options == {"frames_per_second": None}
-
-
-def test_regions_are_options_too(corpus: Files) -> None:
-    found = values(scored(corpus, "identity_diversity", "identity_diversity:region=lips", identity="all"))
-    assert found["identity_diversity"] != found["identity_diversity:region=lips"]
-    with pytest.raises(FaceDiffError, match="upper_face"):
-        scored(corpus, "identity_diversity:region=uper_face", identity="all")
-
-
-def test_the_mesh_is_checked(corpus: Files) -> None:
-    with pytest.raises(FaceDiffError, match=rf"mouth_opening_difference: .*{VERTICES}"):
-        scored(corpus, "mouth_opening_difference", lip_pairs=LipPairs.from_pairs("far", [(0, 99)]))
 
 
 class PlainError(Metric):

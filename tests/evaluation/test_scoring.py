@@ -265,16 +265,6 @@ def test_mistakes_are_told_in_one_sentence(shared_files: Files, options: dict[st
         shared_files.evaluate(**options)
 
 
-def test_empty_and_doubled_folders(files: Files, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(FaceDiffError, match="empty: holds no .npy file"):
-        files.evaluate(truth=tmp_path / "empty")
-    patterns = ["{subject}_{sentence}_condition_{identity}", "again_{subject}_{sentence}_{identity}"]
-    shutil.copy(files.method() / "A_e01_condition_A.npy", files.method() / "again_A_e01_A.npy")
-    with pytest.raises(FaceDiffError, match="is the same clip and condition as"):
-        files.evaluate(patterns=patterns)
-
-
 def test_another_corpus_gives_other_numbers(shared_files: Files, tmp_path: Path) -> None:
     other = write_corpus(tmp_path / "other", seed=5)
     assert scores_of(other.evaluate()) != scores_of(shared_files.evaluate())

@@ -133,11 +133,6 @@ def test_every_method_generates_channels(name: str, channels: TinyChannels) -> N
         assert model.eval().generate(batch, seed=0).shape == batch.motion.shape
 
 
-def test_spirals_refuse_channels(make_model: Make) -> None:
-    with pytest.raises(FaceDiffError, match="mesh_encoder=spiral"):
-        make_model(**SIZES, mesh_encoder=registry.mesh_encoder.spiral)
-
-
 def test_a_model_of_another_space_is_refused(make_model: Make, channels: TinyChannels) -> None:
     with pytest.raises(FaceDiffError, match="space"):
         make_model(n_vertices=6).adopt(channels.assets())

@@ -28,7 +28,7 @@ from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.samplers import NoiseProcess
 from facediff.registry import alias_path
-from facediff.utils.hints import defaults, mismatch
+from facediff.utils.hints import defaults
 from facediff.utils.ranges import Range
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
@@ -267,14 +267,6 @@ def test_arguments_that_do_not_go_together(options: dict[str, object], named: st
         registry.model.get("DualPathDiffusion")(**{**SIZES, **TINY, **MODELS["DualPathDiffusion"], **fixed, **options})
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301 - own bytes
     assert caught.value.sentence("--").startswith("--model.")
-
-
-def test_numbers_of_numpy_are_numbers() -> None:
-    assert mismatch(Annotated[int, Range(1, 3)], np.int64(3)) is None
-    assert mismatch(float, np.float32(0.5)) is None
-    assert mismatch(int | None, True) is not None
-    assert mismatch(int, np.float64(3)) is not None
-    assert mismatch(Annotated[list[int], Range(1)], np.array([1, 2])) is None
 
 
 def test_a_schedule_that_loses_the_signal_is_refused() -> None:

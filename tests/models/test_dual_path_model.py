@@ -14,7 +14,6 @@ from facediff import registry
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, losses
-from facediff.models.inference import ClipNoise
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -89,19 +88,6 @@ def test_ablations_leave_their_part_out(make_model: Make) -> None:
     assert len(make_model(style_tokens="single").network.style_tokens.projections) == 1
 
 
-def test_the_first_frame_wanted_may_still_be_named(model: DualPathDiffusion, tiny: Tiny) -> None:
-    batch = collate([tiny.dataset("val")[0]])
-
-    def sampled(**wanted: object) -> torch.Tensor:
-        noise = [ClipNoise(batch.names, batch.frame_lengths.tolist(), [0], model.device) for _ in range(2)]
-        return model.sample(model.conditions(batch), *noise, **wanted)  # type: ignore[arg-type]
-
-    with pytest.warns(DeprecationWarning, match="wanted"):
-        later = sampled(first=3)
-    torch.testing.assert_close(later, sampled(wanted=slice(3, None)))
-    assert later.shape[1] == sampled().shape[1] - 3
-
-
 def test_the_neutral_face_is_a_token_of_what_it_has_of_its_own(make_model: Make, tiny: Tiny) -> None:
     model = make_model(template_token=True)
     model.adopt(tiny.assets().with_motion_scale(1.0))
@@ -120,48 +106,6 @@ def test_the_neutral_face_is_a_token_of_what_it_has_of_its_own(make_model: Make,
     torch.testing.assert_close(plain.eval().generate_clips(own), plain.generate_clips(other))
     with pytest.raises(FaceDiffError, match="template_token"):
         model.graphs()
-
-
-def test_conditions_are_computed_once_and_not_per_step(
-    model: DualPathDiffusion, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[str] = []
-    for kind in ("audio_encoder", "style_encoder", "identity_encoder", "fusion"):
-        module = getattr(model.network, kind)
-        original = module.forward
-
-        def counted(*args: object, kind: str = kind, original: Callable[..., object] = original) -> object:
-            calls.append(kind)
-            return original(*args)
-
-        monkeypatch.setattr(module, "forward", counted)
-    model.generate(collate([tiny.dataset("val")[0]]))
-    assert [calls.count(k) for k in ("audio_encoder", "style_encoder", "identity_encoder", "fusion")] == [1, 1, 1, 3]
-
-
-def test_a_style_reference_and_an_identity_matter(model: DualPathDiffusion, tiny: Tiny) -> None:
-    batch = collate([tiny.dataset("val")[0]])
-
-    def motion(**changes: object) -> torch.Tensor:
-        with torch.inference_mode():
-            return model.generate(replace(batch, **changes), seed=3)
-
-    assert torch.equal(motion(), motion())
-    assert not torch.allclose(motion(), motion(reference=2 * batch.reference))
-    assert not torch.allclose(motion(), motion(identity=1 - batch.identity))
-    assert not torch.allclose(motion(), motion(audio=batch.audio.flip(1)))
-    # The truth itself is never looked at.
-    assert torch.equal(motion(), motion(motion=torch.randn_like(batch.motion)))
-
-
-def test_scale_none_leaves_the_motion_as_it_is(make_model: Make, tiny: Tiny) -> None:
-    model = make_model(motion_scale="none")
-    model.adopt(tiny.assets())
-    assert model.scale == 1.0
-    untrained = make_model()
-    untrained.adopt(tiny.assets())
-    with pytest.raises(FaceDiffError, match="never been trained"):
-        _ = untrained.scale
 
 
 def test_a_tiny_model_overfits_one_clip(make_model: Make, tiny: Tiny) -> None:
@@ -197,14 +141,6 @@ def test_animate_is_seeded_and_knows_unseen_people(model: DualPathDiffusion) -> 
     assert model.animate(speech, identity="C").identity == "unknown"
     with pytest.raises(FaceDiffError, match='there is no "Z"; the checkpoint has A, B, C'):
         model.animate(speech, identity="Z")
-
-
-def test_other_steps_keep_the_samplers_other_options(make_model: Make) -> None:
-    model = make_model(sampler=partial(registry.sampler.ddim, steps=3, eta=0.7))
-    model.choose_sampler(steps=9)
-    assert (model.sampler.steps, model.sampler.eta) == (9, 0.7)
-    model.choose_sampler("dpm_solver")
-    assert (type(model.sampler).__name__, model.sampler.steps) == ("dpm_solver", 5)
 
 
 def test_another_sampler_keeps_spacing_and_last_noise_where_its_steps_allow(make_model: Make) -> None:
@@ -261,10 +197,3 @@ def test_samples_of_few_steps_are_taken_further_from_the_mean(make_model: Make) 
     for steps, factor in ((2, 2.0), (10, 1.9)):  # at most twice
         model.choose_sampler(steps=steps)
         assert model.sampler.spread == pytest.approx(factor)
-
-
-def test_sizes_that_do_not_fit_are_named(make_model: Make, tiny: Tiny) -> None:
-    with pytest.raises(FaceDiffError, match=r"vertices are \{30\} in the model and \{24\} in the corpus"):
-        make_model(n_vertices=30).adopt(tiny.assets())
-    with pytest.raises(FaceDiffError, match="identities"):
-        make_model(identities=["B", "A"]).adopt(tiny.assets())

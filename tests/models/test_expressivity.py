@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, collate
-from facediff.errors import FaceDiffError
-from facediff.models import DualPathDiffusion, StyleContentDisentanglement
+from facediff.models import DualPathDiffusion
 from facediff.models.folding import FoldedSpace, VertexSpace
 from facediff.speech.windows import WindowPlan
-from tests.fakes.tiny import SEEN, VERTICES, Tiny
+from tests.fakes.tiny import VERTICES, Tiny
 
 Ready = Callable[..., DualPathDiffusion]
 SPACES = ("folded", "vertices", "components")
@@ -129,17 +128,6 @@ def test_windows_and_streams_are_linear_too(ready: Ready, space: str) -> None:
     assert model.expressivity == 0.1
 
 
-def test_mean_of_windows_has_no_jump_where_they_meet(ready: Ready) -> None:
-    model = ready()
-    model.windows = WindowPlan(seconds=1.2, overlap=0.4, before=10, after=0, above=0)
-    mean = model.animate(speech(3.2), identity="A", expressivity=0.0).vertices
-    steps = mean.diff(dim=0).flatten(1).norm(dim=1)
-    hop = model.windows.in_frames(model.frame_rate).hop
-    joint = torch.zeros(len(steps), dtype=torch.bool)
-    joint[hop - 1 :: hop] = True
-    assert steps[joint].max() < 1.2 * steps[~joint].max()
-
-
 def test_every_vertex_may_have_its_own_expressivity(ready: Ready, batch: Batch) -> None:
     model = ready()
     mean, whole = (model.generate(batch, seed=1, expressivity=e) for e in (0.0, 1.0))
@@ -147,54 +135,6 @@ def test_every_vertex_may_have_its_own_expressivity(ready: Ready, batch: Batch) 
     found = model.generate(batch, seed=1, expressivity=shares)
     expected = mean + shares[:, None] * (whole - mean)
     torch.testing.assert_close(found[batch.mask], expected[batch.mask], rtol=0, atol=1e-6)
-
-
-def test_expressivity_zero_needs_two_evaluations_whatever_the_sampler(
-    ready: Ready, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model, calls, clip = ready(), [], collate([tiny.dataset("val")[0]])
-    core = model.network.core
-    monkeypatch.setattr(model.network, "core", lambda *given: calls.append(len(given[0])) or core(*given))
-    model.generate_samples(clip, [1, 2, 3])
-    assert calls == [3] * model.sampler.steps
-    calls.clear()
-    model.choose_expressivity(0.0)
-    assert model.generate_samples(clip, [1, 2, 3]).shape[0] == 3
-    assert calls == [1, 1]
-    calls.clear()
-    model.choose_expressivity(0.5)
-    model.generate_samples(clip, [1, 2, 3])
-    assert calls == [1, 1, *[3] * model.sampler.steps]
-
-
-@pytest.mark.parametrize("wrong", [-0.1, 2.1, float("nan"), torch.ones(3), torch.full((VERTICES,), 3.0), True, "1"])
-def test_impossible_expressivity_is_refused(ready: Ready, batch: Batch, wrong: object) -> None:
-    model = ready()
-    with pytest.raises(FaceDiffError, match="expressivity"):
-        model.generate(batch, expressivity=wrong)  # type: ignore[arg-type]
-    assert model.expressivity == 1.0
-
-
-def test_expressivity_is_an_option_of_the_model(make_model: Callable[..., DualPathDiffusion]) -> None:
-    assert make_model().expressivity == 1.0
-    made = make_model(expressivity=0.5)
-    assert made.expressivity == made.hparams["expressivity"] == 0.5
-    with pytest.raises(FaceDiffError, match="expressivity"):
-        make_model(expressivity=2.5)
-
-
-def test_a_deterministic_model_takes_no_expressivity_but_one(tiny: Tiny) -> None:
-    model = StyleContentDisentanglement(
-        n_vertices=VERTICES, identities=SEEN, frame_rate=25.0, mesh_encoder=registry.mesh_encoder.linear, basis_size=4
-    )
-    model.choose_expressivity(1.0)
-    with model.expressed(None), model.expressed(1):
-        pass
-    for expressivity in (0.5, torch.ones(VERTICES)):
-        with pytest.raises(FaceDiffError, match="expressivity"):
-            model.choose_expressivity(expressivity)
-    with pytest.raises(FaceDiffError, match="guidance"):
-        model.choose_guidance({"style": 1.5})
 
 
 def test_what_is_chosen_for_a_while_is_forgotten(ready: Ready) -> None:

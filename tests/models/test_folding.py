@@ -15,7 +15,6 @@ from facediff import registry
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, folding
-from facediff.models.dual_path import network
 from facediff.models.folding import ConditionalDenoiser, Fold, FoldedSpace, VertexSpace, WeightCache, fold
 from tests.fakes.tiny import Tiny
 
@@ -46,11 +45,6 @@ def test_fold_multiplies_float32_weights_in_float64() -> None:
     exact = (first.weight.double() @ last.weight.double()).float()
     assert made.product.dtype == torch.float32
     torch.testing.assert_close(made.product, exact, rtol=1e-6, atol=1e-9)
-
-
-def test_fold_without_bias_has_offset_zero() -> None:
-    first, last = ends(3, 8)
-    assert not fold(first.weight.detach(), last.weight.detach(), None).offset.any()
 
 
 CHANGES: dict[str, Callable[[nn.Linear, nn.Linear], object]] = {
@@ -95,12 +89,6 @@ def test_weight_cache_filled_in_inference_mode_serves_outside_of_it() -> None:
     assert not made.product.is_inference()
     weight = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
     (made.product @ weight).sum().backward()
-
-
-def test_weight_cache_keeps_the_value_of_one_key() -> None:
-    cache: WeightCache[int] = WeightCache()
-    weights = [torch.ones(2, 2)]
-    assert [cache.get(weights, key, lambda key=key: key) for key in (1, 1, 2)] == [1, 1, 2]
 
 
 def test_fold_root_does_not_depend_on_the_signs_of_eigenvectors(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,14 +219,6 @@ def test_folded_sampling_gives_the_same_mean_and_covariance_for_new_noise(ready:
     assert ((first - second).abs() / error).max() < 4.5
 
 
-def test_sampling_space_is_folded_by_default(ready: Make, batch: Batch) -> None:
-    folded, plain = ready(), ready(sampling_space="vertices")
-    assert folded.hparams["sampling_space"] == "folded"
-    assert isinstance(choose(folded, batch).space, FoldedSpace)
-    assert isinstance(choose(plain, batch).space, VertexSpace)
-    assert plain.generate(batch).shape == folded.generate(batch).shape == batch.motion.shape
-
-
 def test_sampling_space_is_vertices_without_linear_ends(ready: Make, batch: Batch) -> None:
     model, same = ready(), ready(sampling_space="vertices")
     for one in (model, same):
@@ -308,29 +288,6 @@ def test_folded_sampling_follows_changed_weights(ready: Make, batch: Batch) -> N
         for parameter in one.network.parameters():
             parameter.data.copy_(parameter.data + 0.05 * torch.randn(parameter.shape))
     assert torch.equal(model.generate(batch), fresh.generate(batch))
-
-
-def test_fold_is_computed_once(ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[int] = []
-    real = network.fold
-    monkeypatch.setattr(network, "fold", lambda *maps: (calls.append(1), real(*maps))[1])
-    model = ready()
-    for seed in range(3):
-        model.generate(batch, seed=seed)
-    assert len(calls) == 1
-
-
-def test_folded_sampling_touches_vertices_once(ready: Make, batch: Batch) -> None:
-    model = ready(sampler=partial(registry.sampler.ddpm, steps=9))
-    calls = {"embed": 0, "unembed": 0}
-    for name in calls:
-
-        def count(*_: object, name: str = name) -> None:
-            calls[name] += 1
-
-        getattr(model.network, name).register_forward_hook(count)
-    model.generate(batch)
-    assert calls == {"embed": 0, "unembed": 1}
 
 
 def test_mixed_precision_motion_is_float32_and_near(ready: Make, batch: Batch) -> None:

@@ -9,7 +9,6 @@ from functools import partial
 import pytest
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
 
 from facediff import registry
 from facediff.data import Batch, collate
@@ -126,14 +125,6 @@ def test_guidance_of_one_changes_nothing(ready: Ready, batch: Batch) -> None:
     assert torch.equal(model.generate(batch, seed=3), expected)
 
 
-def test_guidance_is_no_part_of_the_loss(ready: Ready, batch: Batch) -> None:
-    """Validation takes the loss of a model that is guided when it animates."""
-    found = [
-        ready(style_guidance=scale).losses(batch, torch.Generator().manual_seed(0))["loss"] for scale in (1.0, 3.0)
-    ]
-    assert torch.equal(*found)
-
-
 def test_guided_clips_samples_and_streams_agree(ready: Ready, tiny: Tiny, batch: Batch) -> None:
     model = ready(style_guidance=1.8, speech_guidance=1.3)
     alone = model.generate(collate([tiny.dataset("train")[0]]), seed=2)[0]
@@ -187,17 +178,6 @@ def test_shares_of_hidden_conditions_are_as_chosen(ready: Ready) -> None:
     assert ready(identity_dropout=0, style_dropout=0).hide(3)[1:] == (None, None)
 
 
-def test_without_guidance_training_draws_what_it_always_drew(ready: Ready) -> None:
-    model = ready(speech_dropout=0, style_dropout=0)
-    torch.manual_seed(5)
-    expected = torch.rand(9) < 0.3
-    torch.manual_seed(5)
-    hidden = model.hide(9)
-    assert torch.equal(hidden.identity, expected)
-    assert hidden.speech is hidden.style is None
-    assert model.network.no_speech is model.network.no_style is None
-
-
 def test_a_hidden_identity_is_a_strangers(ready: Ready, batch: Batch) -> None:
     model = ready(speech_dropout=0, style_dropout=0)
     model.training = True  # and not its parts, whose dropout would differ
@@ -233,34 +213,6 @@ def test_where_no_style_is_given_motion_is_that_of_a_hidden_style(ready: Ready, 
     stranger = next(name for name in model.assets.references if name not in model.assets.identities)
     assert model.default_style(stranger) is model.assets.references[stranger]
     assert ready(style_dropout=0).default_style("A").clip == tiny.assets().references["A"].clip
-
-
-def test_a_hidden_style_of_a_model_on_a_gpu_is_on_the_processor_as_all_styles_are(ready: Ready) -> None:
-    model = ready()
-    with FakeTensorMode():  # a GPU that need not be there
-        model.network.no_style = nn.Parameter(torch.zeros(len(model.network.no_style), device="cuda"))
-        assert model.default_style("A").vector.device.type == "cpu"
-
-
-@pytest.mark.parametrize(
-    ("options", "scales", "named"),
-    [
-        ({"style_dropout": 0}, {"style": 1.5}, "style_dropout"),
-        ({"speech_dropout": 0}, {"speech": 1.5}, "speech_dropout"),
-        ({"identity_dropout": 0}, {"identity": 1.5}, "identity_dropout"),
-        ({"style_encoder": registry.style_encoder.none}, {"style": 1.5}, "style"),
-        ({}, {"styl": 1.5}, "styl"),
-        ({}, {"style": 11}, "style"),
-        ({}, {"style": float("nan")}, "style"),
-    ],
-)
-def test_impossible_guidance_is_refused(
-    ready: Ready, options: dict[str, object], scales: dict[str, float], named: str
-) -> None:
-    model = ready(**options)
-    with pytest.raises(FaceDiffError, match=named):
-        model.choose_guidance(scales)
-    assert set(model.guidance.values()) == {1.0}
 
 
 def test_guidance_of_the_constructor_needs_the_dropout(make_model: Callable[..., DualPathDiffusion]) -> None:

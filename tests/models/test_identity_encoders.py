@@ -38,20 +38,3 @@ def test_unseen_speaker_gets_the_mean(encoder: HierarchicalIdentity) -> None:
     result = encoder(torch.tensor([-1, 1])).detach().numpy()
     np.testing.assert_allclose(result[0], np.mean([expected(encoder, i) for i in range(4)], axis=0), atol=1e-10)
     np.testing.assert_allclose(result[1], expected(encoder, 1), atol=1e-10)
-
-
-def test_level_weights_sum_to_one(encoder: HierarchicalIdentity) -> None:
-    weights = encoder.level_weights()
-    assert weights.shape == (4, 3)
-    assert (weights > 0).all()
-    torch.testing.assert_close(weights.sum(1), torch.ones(4).double())
-
-
-def test_width_follows_the_level() -> None:
-    assert HierarchicalIdentity(dim=8, n_identities=2).token_dims == (8, 8, 8)
-    assert HierarchicalIdentity(dim=8, n_identities=2, level_dim=5)(torch.tensor([0])).shape == (1, 15)
-
-
-def test_identity_that_does_not_exist_is_an_error(encoder: HierarchicalIdentity) -> None:
-    with pytest.raises(IndexError):
-        encoder(torch.tensor([4]))

@@ -12,7 +12,6 @@ from facediff.models.layers import (
     Attention,
     FeedForward,
     RotaryEmbedding,
-    frame_mask,
     interpolate_frames,
     recurrent_nodes,
 )
@@ -92,25 +91,6 @@ def test_rotary_attention_notices_order_and_plain_attention_does_not() -> None:
         assert same != rotary
 
 
-def test_attention_refuses_impossible_heads() -> None:
-    with pytest.raises(ValueError, match="dim 10 with num_heads 4"):
-        Attention(10, 10, 4)
-    with pytest.raises(ValueError, match="dim 6 with num_heads 2.*even"):
-        Attention(6, 6, 2, rotary=True)
-
-
-def test_rotary_frequencies_are_no_weights() -> None:
-    """They follow from the sizes, so checkpoints do not have them; a model moves them along all the same."""
-    rotary = RotaryEmbedding(8, base=100.0)
-    assert not rotary.state_dict()
-    assert [name for name, _ in rotary.named_buffers()] == ["frequencies"]
-    np.testing.assert_allclose(rotary.frequencies.numpy(), 100.0 ** -(np.arange(4) / 4), rtol=1e-6)
-
-
-def test_frame_mask() -> None:
-    assert frame_mask(torch.tensor([0, 2, 3]), 3).int().tolist() == [[0, 0, 0], [1, 1, 0], [1, 1, 1]]
-
-
 def interpolated(values: Tensor, frames: int) -> Array:
     """Steps and frames are cells of the same stretch of time, each with its value at its centre."""
     steps = len(values)
@@ -132,12 +112,6 @@ def test_interpolation_against_numpy(frames: tuple[int, int]) -> None:
         expected = interpolated(features[row, : lengths[row]], frames[row])
         np.testing.assert_allclose(result[row, : frames[row]].numpy(), expected, atol=1e-4)
         assert not result[row, frames[row] :].any()
-
-
-def test_interpolation_to_the_same_length_changes_nothing() -> None:
-    features = torch.randn(1, 9, 2)
-    nine = torch.tensor([9])
-    torch.testing.assert_close(interpolate_frames(features, nine, nine), features)
 
 
 def test_feed_forward_against_numpy() -> None:

@@ -15,9 +15,9 @@ from facediff import registry
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion, StyleContentDisentanglement
-from facediff.models.inference import SpeechStream, WindowOverlap, crossfaded
+from facediff.models.inference import SpeechStream, WindowOverlap
 from facediff.speech.audio import samples_for
-from facediff.speech.windows import FramePlan, SpeechLevel, WindowPlan
+from facediff.speech.windows import SpeechLevel, WindowPlan
 from tests.fakes.tiny import SEEN, VERTICES, Tiny
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
@@ -127,21 +127,6 @@ def test_stream_gives_every_frame_whatever_the_length(ready: Ready, frames: int)
             more()
 
 
-def test_window_limit_of_infinity_gives_one_pass(ready: Ready) -> None:
-    model = ready()
-    model.windows = replace(PLAN, above=float("inf"))
-    vertices = model.animate(speech(3), identity="A").vertices
-    clip = model.clip_of(speech(3), "A", None)
-    assert torch.equal(vertices, model.generate_clips(clip)[0] + clip.template[0])
-
-
-def test_stream_cannot_take_frames_back(ready: Ready) -> None:
-    stream = ready().stream(identity="A")
-    given = stream.feed(speech(4)).shape[1]
-    with pytest.raises(FaceDiffError, match=f"frames: 5 are fewer than the {given} that have been given out"):
-        stream.finish(5)
-
-
 def test_stream_memory_does_not_grow_with_the_speech(ready: Ready) -> None:
     model = ready()
     stream = model.stream(identity="A")
@@ -208,11 +193,6 @@ def test_window_overlap_blends_each_step_with_its_own() -> None:
         assert torch.equal(overlap_blend.features[step], blended[:, -2:])
 
 
-def test_crossfade_of_equals_changes_nothing() -> None:
-    motion = torch.randn(1, 9, 5, 3)
-    torch.testing.assert_close(crossfaded(motion[:, :4], motion), motion)
-
-
 def test_samples_are_what_their_seeds_give_and_the_speech_is_encoded_once(ready: Ready) -> None:
     model = ready(sampler=partial(registry.sampler.ddpm, steps=5))
     heard = []
@@ -270,59 +250,3 @@ def test_audio_encoder_hears_a_piece_as_loud_as_in_the_whole(ready: Ready) -> No
         nine = encoder(9 * whole[None, :16000], length, torch.tensor([25]))
     torch.testing.assert_close(nine, louder, rtol=1e-3, atol=1e-3)
     assert encoder._level is None
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"seconds": 0.0}, "window: 0 s is impossible"),
-        ({"seconds": 1.0, "overlap": 0.6}, "overlap: 0.6 s is impossible"),
-        ({"overlap": 0.0}, "overlap: 0 s is impossible"),
-        ({"overlap": float("nan")}, "overlap: nan s is impossible"),
-        ({"before": float("inf")}, "window: the speech before and after"),
-        ({"above": float("nan")}, "window: the speech before and after"),
-        ({"before": -0.01}, "window: the speech before and after"),
-        ({"before": float("nan")}, "window: the speech before and after"),
-        ({"after": -0.01}, "window: the speech before and after"),
-        ({"after": float("inf")}, "window: the speech before and after"),
-        ({"after": float("nan")}, "window: the speech before and after"),
-        ({"above": -0.01}, "window: the speech before and after"),
-        ({"seconds": -1.0}, "window: -1 s is impossible"),
-        ({"seconds": 600.1}, r"window: 600\.1 s is impossible"),
-        ({"overlap": -0.1}, r"overlap: -0\.1 s is impossible"),
-        ({"seconds": 1.0, "overlap": 0.51}, r"overlap: 0\.51 s is impossible"),
-        ({"seconds": float("nan")}, "window: nan s is impossible"),
-    ],
-)
-def test_window_plan_refuses_impossible_lengths(change: dict[str, float], sentence: str) -> None:
-    with pytest.raises(FaceDiffError, match=sentence):
-        WindowPlan(**change)
-
-
-def test_window_plan_takes_lengths_up_to_its_limits() -> None:
-    plan = WindowPlan(seconds=600.0, overlap=300.0, before=0.0, after=0.0, above=0.0)
-    assert plan.look_ahead == 600.0
-    assert plan.in_frames(25.0) == FramePlan(15_000, 7500, 0, 0)
-    assert WindowPlan(seconds=0.2, overlap=0.01).in_frames(20.0) == FramePlan(4, 1, 40, 10)
-
-
-@pytest.mark.parametrize("rate", [24.0, 25.0, 30.0, 60.0])
-def test_window_plan_may_share_half_of_a_window(rate: float) -> None:
-    """Also where half of it is rounded up and all of it down."""
-    for hundredths in range(20, 300):
-        plan = WindowPlan(seconds=hundredths / 100, overlap=hundredths / 200).in_frames(rate)
-        assert abs(plan.frames - hundredths / 100 * rate) <= 0.5
-        assert abs(plan.overlap - hundredths / 200 * rate) < 1
-        assert 0 < 2 * plan.overlap <= plan.frames
-
-
-def test_window_plan_refuses_too_few_frames(ready: Ready) -> None:
-    with pytest.raises(FaceDiffError, match="too few frames at 25 a second"):
-        ready().stream(identity="A", plan=WindowPlan(seconds=0.1, overlap=0.05))
-
-
-def test_stream_refuses_speech_without_a_frame(ready: Ready) -> None:
-    stream = ready().stream(identity="A")
-    stream.feed(torch.zeros(100))
-    with pytest.raises(FaceDiffError, match="shorter than one frame"):
-        stream.finish()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 import torch
 
 from facediff import registry
-from facediff.errors import FaceDiffError
 from facediff.models.dual_path.model import DualPathDiffusion
 from facediff.models.inference import SpeechStream, WindowNoise
 from facediff.speech.voice_activity import QUICK_GATE, Openness, read_gate
@@ -162,24 +160,3 @@ def test_low_latency_waits_less_than_the_goal_at_every_rate(rate: float) -> None
     assert gate is not None
     # A frame's middle lies half a frame after its start: the gate must be certain of it by then.
     assert Openness(gate, rate).look_ahead <= waited - 0.5 / rate
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"past": -0.1}, "past"),
-        ({"ahead": -0.1}, "ahead"),
-        ({"past": float("inf")}, "past"),
-        ({"overlap": LOW_LATENCY.seconds}, "overlap"),
-    ],
-)
-def test_impossible_pasts_are_refused(change: dict[str, float], field: str) -> None:
-    with pytest.raises(FaceDiffError, match=field):
-        replace(LOW_LATENCY, **change)
-
-
-def test_low_latency_excludes_lengths_of_windows() -> None:
-    from facediff.animation.options import AnimationOptions
-
-    with pytest.raises(FaceDiffError, match="low_latency"):
-        AnimationOptions(checkpoint="a.ckpt", window=1.0, low_latency=True)

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -19,14 +18,11 @@ from lightning.pytorch import Callback, Trainer
 from facediff import registry
 from facediff.callbacks import EmaWithWarmup
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
-from facediff.callbacks.dashboard import provenance_of
 from facediff.cli.app import main
-from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
 from facediff.models.dual_path.network import TRUNK
 from facediff.models.styles import read_styles, vector_of
-from facediff.utils.checksums import sha256
 from tests.fakes.channels import TinyChannels, write_channels
 from tests.fakes.tiny import VERTICES, Tiny, tiny_model_options, write_tiny
 
@@ -171,28 +167,6 @@ def test_faces_take_each_others_styles(roots: dict[str, Path], trained: Path, tm
     np.testing.assert_array_equal(vector_of(read_styles(str(vector), "B", model), model), np.load(vector))
 
 
-def test_scores_of_a_face_name_the_checkpoint(roots: dict[str, Path], trained: Path) -> None:
-    data, trainer = Halved(root=str(roots["halved"])), cast(Trainer, SimpleNamespace(ckpt_path=f"{trained}:halved"))
-    assert provenance_of(trainer, load_model(f"{trained}:halved"), data).checkpoint == sha256(trained)
-
-
-def test_a_name_of_no_face_is_refused(trained: Path) -> None:
-    with pytest.raises(FaceDiffError, match="halved"):
-        load_model(f"{trained}:halvd")
-    with pytest.raises(FaceDiffError, match="one face"):
-        read_checkpoint_of_one_face(trained)
-
-
-def read_checkpoint_of_one_face(trained: Path) -> None:
-    own = load_model(f"{trained}:halved")
-    path = trained.with_name("one.ckpt")
-    content = {"hyper_parameters": dict(own.hparams), "state_dict": own.state_dict()}
-    own.on_save_checkpoint(content)
-    AtomicCheckpointIO().save_checkpoint(content, path)
-    assert load_model(path).n_vertices == VERTICES // 2
-    load_model(f"{path}:halved")
-
-
 def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> None:
     whole = load_model(trained)
     assert isinstance(whole, ManyFaces)
@@ -263,28 +237,3 @@ def test_a_new_face_costs_a_head(roots: dict[str, Path], trained: Path, tmp_path
     assert bool(after.network.unembed.weight.any())  # it starts from zero
     assert float(after.motion_space.sizes[0]) == pytest.approx(float(before.motion_space.sizes[0]), rel=1e-4)
     assert after.animate(torch.zeros(8000), identity="A").vertices.shape[1:] == (VERTICES // 2, 3)
-
-
-@pytest.mark.parametrize("words", [["--corpus", "Tiny"], ["--mode", "joint"], ["--person", "C"]])
-def test_options_that_do_not_go_with_a_new_face_are_refused(
-    trained: Path, words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["adapt", "--checkpoint", str(trained), "--face", "Puppet", "-o", "x.ckpt", *words]) == 2
-    assert "--face" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "further",
-    [{"mask": {"batch_size": 2}}, {"mask": {"corpus": "Pupet"}}, {"mask": {"corpus": "Puppet", "sed": 1}}],
-)
-def test_further_corpora_that_are_none_are_refused(roots: dict[str, Path], further: dict[str, Any]) -> None:
-    with pytest.raises(ArgumentError, match=r"further_corpora\.mask"):
-        Tiny(root=str(roots["tiny"]), further_corpora=further)
-
-
-def test_corpora_that_are_not_those_of_the_faces_are_refused(roots: dict[str, Path], make_trainer: MakeTrainer) -> None:
-    data = corpora(roots)
-    with pytest.raises(FaceDiffError, match="data.further_corpora"):
-        make_trainer().fit(many_faces(data), Tiny(root=str(roots["tiny"])))
-    with pytest.raises(FaceDiffError, match=r"data\.further_corpora.*ManyFaces"):
-        make_trainer().fit(DualPathDiffusion(**tiny_model_options()), data)

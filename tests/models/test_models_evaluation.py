@@ -133,22 +133,9 @@ def test_no_clip_is_scored_in_the_style_of_its_own_motion(tiny: Tiny) -> None:
     assert with_usual_styles(batch.select([0]), lambda name: reference) == []
 
 
-def test_metrics_that_read_the_clips_time_take_whole_clips() -> None:
-    """Leaving out frames would compare the motion with what is said elsewhere."""
-    assert parse("s_lip_vertex_error").moment == "speaking"
-    for name in ("s_bilabial_closure_rate", "l_frame_speech_lip_correlation", "s_clip_speech_lip_correlation"):
-        with pytest.raises(FaceDiffError, match="omit the prefix"):
-            parse(name)
-
-
 @pytest.mark.parametrize("name", ["frame_step", "step_distance:region=jaw", "blink_rate", "blink_rate_ratio"])
 def test_metrics_of_frames_in_order_take_whole_clips(name: str) -> None:
     """A step across frames that are left out is no step of the motion."""
     assert parse(name).moment == "all"
     with pytest.raises(FaceDiffError, match="omit the prefix"):
         parse(f"l_{name}")
-
-
-def test_wrong_names_are_refused_with_the_nearest(make_model: Make) -> None:
-    with pytest.raises(FaceDiffError, match="lip_vertex_error"):
-        _ = make_model(metrics=["lip_vertex_eror"]).evaluation

@@ -12,7 +12,6 @@ import torch
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.adaptation import with_extra_identities
 from facediff.models.dual_path.graphs import StepGraph
@@ -199,8 +198,3 @@ def test_stream_equals_the_file(model: DualPathDiffusion) -> None:
     stream = model.stream(identity="A", seeds=[2])
     parts = torch.cat([stream.feed(speech), stream.finish()], 1) + model.assets.templates["A"]
     assert torch.equal(model.animate(speech, identity="A", seed=2).vertices, parts[0])
-
-
-def test_it_needs_a_dynamic_style(make_model: Callable[..., DualPathDiffusion]) -> None:
-    with pytest.raises(FaceDiffError, match="style_from_speech"):
-        make_model(style_from_speech=True, style_encoder=registry.style_encoder.none)

@@ -25,7 +25,7 @@ from facediff.models.style_content.losses import (
     pair_up,
     relative_distance,
 )
-from facediff.models.style_content.network import StyleContentDecoder, WindowedTransformer
+from facediff.models.style_content.network import StyleContentDecoder
 from tests.fakes.style_content import make
 from tests.fakes.tiny import VERTICES, Tiny
 
@@ -98,44 +98,6 @@ class TestDecoder:
         mean, shapes = torch.randn(21), torch.randn(2, 21)
         decoder.start_from(mean, shapes)
         torch.testing.assert_close(decoder.basis(torch.tensor([2.0, -1.0, 0.0, 0.0])), mean + 2 * shapes[0] - shapes[1])
-
-
-class TestSpeech:
-    def test_the_middle_frame_asks_as_full_attention_would(self) -> None:
-        """The answer to the middle query is the middle row of the answer to all frames of the window."""
-        torch.manual_seed(0)
-        part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=7, num_heads=2, num_layers=2)
-        features = torch.randn(2, 11, 6)
-        got = part(features)
-        padded = nn.functional.pad(features, (0, 0, 3, 3))
-        for frame in range(11):
-            x = part.embed(padded[:, frame : frame + 7]) + part.positions
-            for layer in part.layers:
-                x = layer(x, x)
-            everything = part.out(part.query(x, x))
-            torch.testing.assert_close(got[:, frame], everything[:, 3], rtol=1e-5, atol=1e-5)
-
-    def test_attention_itself_against_its_formula(self) -> None:
-        torch.manual_seed(0)
-        layer = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=5, num_heads=2).query
-        query, context = torch.randn(3, 1, 8), torch.randn(3, 5, 8)
-        attention, norm = layer.attention, layer.norm
-        q = attention.query(norm(query)).view(3, 1, 2, 4).transpose(1, 2)
-        k, v = (t.view(3, 5, 2, 4).transpose(1, 2) for t in attention.key_value(norm(context)).chunk(2, -1))
-        mixed = ((q @ k.transpose(2, 3)) / 2.0).softmax(-1) @ v
-        want = query + attention.out(mixed.transpose(1, 2).flatten(2))
-        want = want + layer.feed_forward(want)
-        torch.testing.assert_close(layer(query, context), want)
-
-    def test_only_the_window_is_heard(self) -> None:
-        torch.manual_seed(0)
-        part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=4, num_heads=2)
-        features = torch.randn(1, 12, 6)
-        changed = features.clone()
-        changed[:, 6] += 5.0
-        heard = (part(features) - part(changed)).abs().amax((0, 2)) > 0
-        # Frame t hears t − 2 … t + 1.
-        assert heard.nonzero().flatten().tolist() == [5, 6, 7, 8]
 
 
 class TestObjectives:
@@ -451,11 +413,3 @@ def test_the_basis_starts_from_principal_components(tiny: Tiny) -> None:
     for shape, spread, axis in zip(shapes.double().numpy(), spreads, axes, strict=False):
         assert np.linalg.norm(shape) == pytest.approx(spread, rel=1e-4)
         assert abs(shape @ axis) == pytest.approx(spread, rel=1e-4)
-
-
-def test_double_precision_trains_and_scores(tiny: Tiny, make_trainer: Callable[..., Trainer]) -> None:
-    model, trainer = make(), make_trainer(precision="64-true")
-    trainer.fit(model, datamodule=tiny)
-    trainer.test(model, datamodule=tiny, verbose=False)
-    assert {weight.dtype for weight in model.parameters()} == {torch.float64}
-    assert np.isfinite(float(trainer.callback_metrics["test_b/lve"]))

@@ -11,7 +11,6 @@ import pytest
 import torch
 import trimesh
 
-from facediff import registry
 from facediff.animation import Animation, write_archive
 from facediff.animation.style_files import Weighted, marked, split_styles, style_paths
 from facediff.data import Reference
@@ -119,32 +118,6 @@ def test_a_mixture_is_the_weighted_mean_of_style_vectors(
     assert torch.isfinite(model.animate(speech, identity="A", style=beyond).vertices).all()
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ("A_e01:1,B_e01:-1", "whose sum is not 0"),
-        ("A_e01:inf,B_e01:1", "expected finite weights"),
-        ("A_e01:0.3,B_e01", "give every style a weight"),
-        ("A_e01:0.3", "one style alone cannot be weighted"),
-        ("A_e01:0.3,", "expected names or files with weights"),
-        (":0.3,A_e01:1", "expected names or files with weights"),
-        ("A_e01:0.5,nobody.npy:0.5", "style nobody.npy: no such file"),
-    ],
-)
-def test_words_that_make_no_style(words: str, sentence: str, model: DualPathDiffusion) -> None:
-    with pytest.raises(FaceDiffError) as caught:
-        read_styles(words, "A", model)
-    assert sentence in str(caught.value)
-
-
-def test_a_checkpoint_without_a_style_says_so(tiny: Tiny, make_model: Callable[..., DualPathDiffusion]) -> None:
-    tiny.setup("fit")
-    model = make_model(style_encoder=registry.style_encoder.none)
-    model.adopt(tiny.assets().with_motion_scale(1.0))
-    with pytest.raises(FaceDiffError, match="trained without a dynamic style"):
-        read_styles("A_e01", "A", model)
-
-
 @pytest.fixture
 def unseen(model: DualPathDiffusion, tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
     """B's motion on a face that nobody knows: file, template, offsets."""
@@ -202,20 +175,6 @@ def test_the_median_stands_for_a_template_with_a_note(
     assert isinstance(style, Reference)
     np.testing.assert_allclose(style.motion, offsets - np.median(offsets, axis=0), atol=2e-6)
     assert "the median of its" in capsys.readouterr().out
-
-
-def test_templates_that_do_not_fit(
-    unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
-) -> None:
-    path, face, _ = unseen
-    np.save(tmp_path / "small.npy", face[:20])
-    with pytest.raises(FaceDiffError, match=r"small.npy: has shape \(20, 3\); expected the neutral face of 24 finite"):
-        read_style(str(path), "A", model, template=tmp_path / "small.npy")
-    np.save(tmp_path / "far.npy", face + 1.0)
-    with pytest.raises(FaceDiffError, match="does not lie on its template"):
-        read_style(str(path), "A", model, template=tmp_path / "far.npy")
-    with pytest.raises(FaceDiffError, match="no such mesh file"):
-        read_style(str(path), "A", model, template=tmp_path / "none.obj")
 
 
 # Models of channels take motion in parameters.
@@ -279,9 +238,3 @@ def test_parameters_are_resampled_and_mixed_as_vectors(of_channels: DiffPoseTalk
     assert isinstance(mixed, Style)
     first, second = (extract_style([word], person, of_channels) for word in words)
     torch.testing.assert_close(mixed.vector, 0.25 * first + 0.75 * second)
-
-
-def test_motion_without_the_models_channels_is_refused(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
-    np.save(tmp_path / "weights.npy", values_of(52))
-    with pytest.raises(FaceDiffError, match="arkit"):
-        read_styles(f"{tmp_path / 'weights.npy'}@arkit", of_channels.identities[0], of_channels)

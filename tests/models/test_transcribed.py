@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from facediff.errors import FaceDiffError
 from facediff.models.audio_distillation import DistillationOptions, distil_audio_encoder, with_pause_in_both
 from facediff.models.base import AnimationModel
 from facediff.models.transcribed import STEP_RATE, Said, read_said
-from facediff.synthetic.voices import Espeak
 from tests.fakes.tiny import Tiny
 
 TEXT = "mabopimeba"
@@ -138,46 +136,6 @@ def test_the_student_hears_the_singer_as_the_teacher_hears_the_corpus(
         return float((features(model.speech_encoder, recording) - target).square().mean())
 
     assert error(transcribed=folder, transcribed_share=0.8) < 0.3 * error()
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (lambda folder: (folder / "one" / "a.txt").unlink(), "--transcribed .*: holds no recording with words"),
-        (lambda folder: (folder / "one" / "a.txt").rename(folder / "one" / "a.xx.txt"), r'a\.xx\.txt: language "xx"'),
-        (lambda folder: (folder / "one" / "a.txt").write_text("2 + 2"), r"a\.txt: holds no words"),
-        (lambda folder: (folder / "one" / "a.txt").write_bytes(b"m\xe4h"), r"a\.txt: is no text in UTF-8"),
-        (lambda folder: (folder / "one" / "a.txt").write_text("ma" * 4500), r"a\.txt: is longer than 2000 characters"),
-        (lambda folder: (folder / "one" / "a.txt").write_text("ma"), r"a\.txt: takes 0\.2 s to say, and a\.wav lasts"),
-        (lambda folder: (folder / "one" / "a.wav").write_bytes(b"RIFF"), r"a\.wav"),
-        (lambda folder: soundfile.write(folder / "one" / "a.wav", np.zeros(22400), 16_000), r"a\.wav: is silent"),
-        (lambda folder: folder.rename(folder.with_name("moved")), "--transcribed .*: no such folder"),
-    ],
-)
-def test_what_cannot_be_used_is_named(
-    change: Callable[[Path], object],
-    named: str,
-    folder: Path,
-    data: Singers,
-    make_model: Callable[..., AnimationModel],
-) -> None:
-    change(folder)
-    with pytest.raises(FaceDiffError) as caught:
-        read_said(folder, data, make_model().speech_encoder, most=9, seed=0)
-    assert re.search(named, caught.value.on_command_line)
-
-
-def test_people_cannot_say_what_they_are_told(
-    folder: Path, tiny: Tiny, make_model: Callable[..., AnimationModel]
-) -> None:
-    with pytest.raises(FaceDiffError, match="Tiny cannot say texts"):
-        read_said(folder, tiny, make_model().speech_encoder, most=9, seed=0)
-
-
-def test_without_espeak_a_language_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Espeak, "voices", classmethod(lambda cls: []))
-    with pytest.raises(FaceDiffError, match=r"espeak is not installed; pip install"):
-        Puppet(root=str(tmp_path / "none")).say("My map", 0, "de")
 
 
 def test_speakers_of_the_built_in_corpus_take_turns(tmp_path: Path) -> None:
