@@ -42,8 +42,6 @@ NAMES = {
     "facediff.benchmark.Outline": Renamed("ReportOutline", "1.0", "2.0"),
 }
 
-KEYWORDS = {"facediff.models.DualPathDiffusion.sample(first)": Renamed("wanted=slice(first, None)", "1.1", "2.0")}
-
 
 def current_option(word: str, flags: Collection[str]) -> str:
     """An option as it is typed, ``--old=3`` too, under its present name, with a note if that is another one.
@@ -63,11 +61,6 @@ def current_option(word: str, flags: Collection[str]) -> str:
 def tell(note: str) -> None:
     """Print a note to the terminal, apart from the output."""
     print(f"facediff: note: {note}", file=sys.stderr, flush=True)
-
-
-def warn_of_keyword(old: str) -> None:
-    """Warn that an old keyword of :data:`KEYWORDS` was given."""
-    warnings.warn(KEYWORDS[old].note(old), DeprecationWarning, stacklevel=3)
 
 
 def old_names(package: str) -> Callable[[str], object]:

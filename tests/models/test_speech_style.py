@@ -161,6 +161,28 @@ def test_default_style_depends_on_the_speech_and_a_given_one_does_not(model: Dua
         assert not torch.allclose(tokens(asked, batch.audio), tokens(asked, batch.audio.flip(1)))
 
 
+def test_each_clip_is_asked_by_its_own_share_and_of_the_animated_frames_alone(
+    model: DualPathDiffusion, batch: Batch
+) -> None:
+    """A stream encodes speech before a window that it does not animate: other speech there changes no style."""
+    network, size = model.network, 640
+    style = model.default_style("A").vector.expand(len(batch), -1).clone()
+    style[:, -1] = torch.tensor([0.0, 0.5])
+    frames = int(batch.frame_lengths.min())
+    audio = torch.randn(len(batch), frames * size, generator=torch.Generator().manual_seed(5))
+    clips = replace(batch.select([0, 1]), audio=audio, audio_lengths=torch.full((2,), frames * size), style=style)
+    clips = replace(clips, motion=batch.motion[:, :frames], frame_lengths=torch.full((2,), frames))
+    with torch.no_grad():
+        features = network.audio_encoder(clips.audio, clips.audio_lengths, clips.frame_lengths)
+        for animated in (slice(None), slice(4, frames)):
+            asked = features[:, animated]
+            change = network.speech_style(asked, torch.ones(asked.shape[:2], dtype=torch.bool))
+            found = model.conditions(clips, animated=animated).dynamic
+            torch.testing.assert_close(found, style[:, :-1] + style[:, -1:] * change)
+        assert torch.equal(found[0], style[0, :-1])
+        assert not torch.allclose(found[1], style[1, :-1])
+
+
 def test_style_of_another_identity_starts_from_its_reference(model: DualPathDiffusion) -> None:
     stranger = next(name for name in model.assets.references if name not in model.assets.identities)
     style, reference = model.default_style(stranger), model.assets.references[stranger]

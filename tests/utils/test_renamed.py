@@ -17,7 +17,7 @@ def numbers(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in version.split("."))
 
 
-EVERY = {**renamed.COMMANDS, **renamed.OPTIONS, **renamed.NAMES, **renamed.KEYWORDS}
+EVERY = {**renamed.COMMANDS, **renamed.OPTIONS, **renamed.NAMES}
 
 
 Number = Annotated[int, Range(0, 10)]

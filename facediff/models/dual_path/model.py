@@ -66,7 +66,6 @@ from facediff.speech.windows import LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS, Motion
 from facediff.utils import ranges
 from facediff.utils.hints import defaults, mismatch
 from facediff.utils.ranges import Range
-from facediff.utils.renamed import warn_of_keyword
 
 NumericScale = Annotated[float, Range(1e-6, 1e6)]
 NoiseScale = NumericScale | Literal["auto"]
@@ -665,7 +664,6 @@ class DualPathDiffusion(AnimationModel):
         blend: Blend = unchanged,
         wanted: slice = slice(None),  # noqa: B008 - it cannot be changed
         progress: Progress | None = None,
-        first: int = 0,
     ) -> Float[Tensor, "batch wanted points dims"]:
         """Run the sampler from noise to motion, in offsets from the template.
 
@@ -677,14 +675,10 @@ class DualPathDiffusion(AnimationModel):
             blend: changes the features of every step.
             wanted: the frames whose motion is wanted.
             progress: wraps the iteration over steps.
-            first: the old name of ``slice(first, None)``.
         """
-        if first:
-            warn_of_keyword("facediff.models.DualPathDiffusion.sample(first)")
-        frames = slice(first, None) if first else wanted
         expressivity = self.expressivity
         whole = not isinstance(expressivity, Tensor)
-        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, frames)
+        mean = None if whole and expressivity == 1 else self._mean(conditions, of_mean, blend, wanted)
         if mean is not None and whole and expressivity == 0:
             return mean.expand(samples * len(mean), -1, -1, -1)
         # Samples of one clip share its speech features and style: only the noisy motion differs.
@@ -697,7 +691,7 @@ class DualPathDiffusion(AnimationModel):
         sample = self.sampler.run(
             denoiser.denoise, noise(self._empty(denoiser, conditions)), noise=noise, progress=progress
         )
-        motion = self._motion(denoiser, sample, frames)
+        motion = self._motion(denoiser, sample, wanted)
         if mean is None:
             return motion
         share = expressivity.to(motion)[:, None] if isinstance(expressivity, Tensor) else expressivity
