@@ -249,3 +249,32 @@ def needs_extra(package: str, extra: str, feature: str) -> Iterator[None]:
         yield
     except ImportError as error:
         raise MissingExtraError(package, extra, feature) from error
+
+
+@contextmanager
+def damaged(source: object, remedy: str) -> Iterator[None]:
+    """The door of a file: within it, content of another form than expected is an error that names the file.
+
+    The code inside takes what it needs (``content["sizes"][0]``) and raises ValueError for what would be taken
+    without a word; it needs no check for what Python refuses by itself.
+
+    Args:
+        source: the file, or a part of it.
+        remedy: what to do about it.
+
+    Raises:
+        FaceDiffError: in place of the exceptions by which Python refuses keys, indices, types and values.
+
+    Example:
+        >>> with damaged("take.json", "export it again"):
+        ...     {}["frames"]
+        Traceback (most recent call last):
+        facediff.errors.FaceDiffError: take.json: has no 'frames'; export it again
+    """
+    try:
+        yield
+    except FaceDiffError as error:
+        raise error if str(source) in str(error) else error.within(source) from error
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        problem = f"has no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise FaceDiffError(f"{source}: {problem}; {remedy}") from error

@@ -2,7 +2,7 @@
 
 ``model.json`` names all other files: ``network_info.json``, the network, the database of implicit emotions, the
 settings of the face's animator, its geometry, and the blendshapes of skin and tongue with the settings of their solver.
-Everything may come from anybody: paths stay in the folder, and no array may be larger than what the folder says.
+Everything may come from anybody: paths stay in the folder.
 """
 
 from __future__ import annotations
@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import damaged
 from facediff.utils.arrays import read_arrays
-from facediff.utils.limits import check_number, in_range, quoted
 from facediff.utils.plain_files import load_json
 
 Array = npt.NDArray[np.float32]
@@ -27,9 +26,6 @@ REMEDY = "expected a model folder of Audio2Face-3D v2.3; get it again"
 SAMPLE_RATE = 16_000
 LONGEST_BUFFER = 160_000
 """Samples that a window may have; the released networks have 8 320."""
-
-MOST = 10_000
-"""Coefficients, emotions or poses that a folder may state; the released ones have at most 272."""
 
 
 @dataclass(frozen=True)
@@ -204,117 +200,101 @@ def read_audio2face(folder: Path) -> Audio2FaceFolder:
         FaceDiffError: naming the file and what is wrong in it.
     """
     about = folder / "model.json"
-    content = _object(load_json(about, remedy=REMEDY), about)
-    facts = read_facts(_named(folder, about, content, "networkInfoPath"))
-    config = _named(folder, about, content, "modelConfigPath")
-    chosen = _object(_object(load_json(config, remedy=REMEDY), config).get("config"), config, "config")
-    database = _named(folder, about, content, "emotionDatabasePath")
-    shapes = content.get("blendshapePaths", {})
+    content = load_json(about, remedy=REMEDY)
+    with damaged(about, REMEDY):
+        names = {key: content[f"{key}Path"] for key in ("networkInfo", "modelConfig", "emotionDatabase", "modelData")}
+        shapes = {name: content["blendshapePaths"][name] for name in content.get("blendshapePaths", {})}
+        network = content["networkPath"]
+    files = {key: inside(folder, about, f"{key}Path", name) for key, name in names.items()}
+    facts = read_facts(files["networkInfo"])
+    settings, implicit = read_settings(files["modelConfig"], files["emotionDatabase"])
     poses = {}
     for name, vertices in (("skin", facts.skin_vertices), ("tongue", facts.tongue_vertices)):
-        if name in _object(shapes, about, "blendshapePaths"):
-            paths = _object(shapes[name], about, f"blendshapePaths.{name}")
-            settings, data = (_named(folder, about, paths, key) for key in ("config", "data"))
-            poses[name] = read_poses(data, settings, vertices)
+        if name in shapes:
+            with damaged(about, REMEDY):
+                data, config = (inside(folder, about, f"{name}.{key}", shapes[name][key]) for key in ("data", "config"))
+            poses[name] = read_poses(data, config, vertices)
     return Audio2FaceFolder(
-        network=network_file(folder, about, content),
+        # The graph lies next to the engine of TensorRT that model.json may name, which runs on one kind of GPU only.
+        network=inside(folder, about, "networkPath", network, ".onnx"),
         facts=facts,
-        settings=read_settings(config, chosen),
-        implicit=implicit_emotion(database, facts.implicit, config, chosen),
-        arrays=read_geometry(_named(folder, about, content, "modelDataPath"), facts),
+        settings=settings,
+        implicit=implicit,
+        arrays=read_geometry(files["modelData"], facts),
         poses=poses,
     )
 
 
-def network_file(folder: Path, about: Path, content: Mapping[str, Any]) -> Path:
-    """The graph of ONNX, which lies next to the engine of TensorRT that ``model.json`` may name instead."""
-    path = _path(folder, about, content, "networkPath", ".onnx")
-    if not path.is_file():
-        raise FaceDiffError(
-            f"{path}: no such file; {about.name} names the network so, and its graph of ONNX is needed: an engine of "
-            f"TensorRT runs on one kind of GPU only"
-        )
+def inside(folder: Path, about: Path, key: str, name: str, suffix: str | None = None) -> Path:
+    """A file of the folder by its name in ``model.json``, or with another suffix; one elsewhere is refused."""
+    with damaged(about, REMEDY):
+        path = folder / name.replace("\\", "/")
+        path = path if suffix is None else path.with_suffix(suffix)
+        if ":" in name or not path.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{key} is {name!r}, which lies outside the folder")
+        if not path.is_file():
+            raise ValueError(f"{key} is {path.name}, and there is no such file")
     return path
 
 
 def read_facts(path: Path) -> NetworkFacts:
     """Content of ``network_info.json``."""
-    content = _object(load_json(path, remedy=REMEDY), path)
-    kind, params, audio = (_object(content.get(name), path, name) for name in ("id", "params", "audio_params"))
-    if kind.get("type") != "regression" or kind.get("output") != "geometry":
-        raise FaceDiffError(
-            f"{path}: its network is of the type {quoted(kind.get('type'))} with the output "
-            f"{quoted(kind.get('output'))}; expected regression of geometry, as in v2.3; choose such a model"
+    content = load_json(path, remedy=REMEDY)
+    with damaged(path, REMEDY):
+        kind, params, audio = content["id"], content["params"], content["audio_params"]
+        if (kind["type"], kind["output"], audio["samplerate"]) != ("regression", "geometry", SAMPLE_RATE):
+            raise ValueError(
+                f"type {kind['type']}, output {kind['output']}, samplerate {audio['samplerate']} is not the regression "
+                f"of geometry at {SAMPLE_RATE} Hz of v2.3"
+            )
+        emotions = params["explicit_emotions"]
+        facts = NetworkFacts(
+            actor=str(kind.get("actor", "")),
+            implicit=int(params["implicit_emotion_len"]),
+            emotions=tuple(map(str, emotions)),
+            default_emotion=_numbers(params, "default_emotion", len(emotions)),
+            skin=int(params["num_shapes_skin"]),
+            tongue=int(params["num_shapes_tongue"]),
+            jaw=int(params["result_jaw_size"]),
+            eyes=int(params["result_eyes_size"]),
+            skin_vertices=int(params["num_verts_skin"]),
+            tongue_vertices=int(params["num_verts_tongue"]),
+            buffer=int(audio["buffer_len"]),
+            before=int(audio["buffer_ofs"]),
         )
-    emotions = params.get("explicit_emotions")
-    if (
-        not isinstance(emotions, list)
-        or len(emotions) > MOST
-        or not all(isinstance(name, str) and name.isprintable() and len(name) < 100 for name in emotions)
-        or len(set(emotions)) < len(emotions)
-    ):
-        raise FaceDiffError(f"{path}: explicit_emotions are {quoted(emotions)}; expected different names; {REMEDY}")
-
-    def count(name: str, least: int, most: float, group: Mapping[str, Any] = params) -> int:
-        return int(check_number(path, name, group.get(name), least, most, whole=True, remedy=REMEDY))
-
-    check_number(path, "samplerate", audio.get("samplerate"), SAMPLE_RATE, SAMPLE_RATE, whole=True)
-    buffer = count("buffer_len", 1, LONGEST_BUFFER, audio)
-    facts = NetworkFacts(
-        actor=str(kind.get("actor", ""))[:100],
-        implicit=count("implicit_emotion_len", 0, MOST),
-        emotions=tuple(emotions),
-        default_emotion=_numbers(path, "default_emotion", params.get("default_emotion"), len(emotions)),
-        skin=count("num_shapes_skin", 1, MOST),
-        tongue=count("num_shapes_tongue", 1, MOST),
-        jaw=count("result_jaw_size", 9, MOST),
-        eyes=count("result_eyes_size", 4, 4),
-        skin_vertices=count("num_verts_skin", 1, 2**31),
-        tongue_vertices=count("num_verts_tongue", 1, 2**31),
-        buffer=buffer,
-        before=count("buffer_ofs", 0, buffer, audio),
-    )
-    if facts.jaw % 3:
-        raise FaceDiffError(f"{path}: result_jaw_size is {facts.jaw}; expected three numbers for each point; {REMEDY}")
+        if len(set(facts.emotions)) < len(emotions):
+            raise ValueError("explicit_emotions has a name twice")
+        if not 0 <= facts.before <= facts.buffer <= LONGEST_BUFFER:
+            raise ValueError(f"buffer_len is {facts.buffer} with buffer_ofs {facts.before}")
     return facts
 
 
-def read_settings(path: Path, config: Mapping[str, Any]) -> AnimatorSettings:
-    """Settings of the animator; what a file lacks has its usual value."""
-    values = {
-        field.name: check_number(path, field.name, config[field.name], -1e6, 1e6, remedy=REMEDY)
-        for field in fields(AnimatorSettings)
-        if field.name in config
-    }
-    settings = AnimatorSettings(**values)
-    for name in ("lower_face_smoothing", "upper_face_smoothing"):
-        check_number(path, name, getattr(settings, name), 0)
-    check_number(path, "face_mask_softness", settings.face_mask_softness, 1e-9)
-    return settings
-
-
-def implicit_emotion(path: Path, length: int, config_path: Path, config: Mapping[str, Any]) -> Array:
-    """The row of the database of implicit emotions that the settings choose."""
-    arrays = read_arrays(path, ("emo_db", "emo_spec_names", "emo_spec_start", "emo_spec_size"), remedy=REMEDY)
-    rows = _matrix(path, arrays, "emo_db", (None, length))
-    names = _names(path, arrays, "emo_spec_names")
-    starts, sizes = (_whole(path, arrays, name) for name in ("emo_spec_start", "emo_spec_size"))
-    shot = config.get("source_shot")
-    if not isinstance(shot, str) or shot not in names[: min(len(starts), len(sizes))]:
-        raise FaceDiffError(f"{config_path}: source_shot is {quoted(shot)}; expected a shot of {path.name}; {REMEDY}")
-    at = names.index(shot)
-    most = int(sizes[at]) - 1
-    frame = int(check_number(config_path, "source_frame", config.get("source_frame"), 0, most, whole=True))
-    row = int(starts[at]) + frame
-    if not 0 <= row < len(rows):
-        raise FaceDiffError(f"{path}: {quoted(shot)} begins at row {starts[at]} of {len(rows)}; {REMEDY}")
-    return rows[row]
+def read_settings(path: Path, database: Path) -> tuple[AnimatorSettings, Array]:
+    """Settings of the animator, by default those of its class, and the implicit emotion that they choose."""
+    content = load_json(path, remedy=REMEDY)
+    arrays = read_arrays(database, ("emo_db", "emo_spec_names", "emo_spec_start", "emo_spec_size"), remedy=REMEDY)
+    with damaged(path, REMEDY):
+        config = content["config"]
+        settings = AnimatorSettings(
+            **{field.name: float(config[field.name]) for field in fields(AnimatorSettings) if field.name in config}
+        )
+        if settings.face_mask_softness <= 0:
+            raise ValueError(f"face_mask_softness is {settings.face_mask_softness:g}; expected more than 0")
+        shots = _names(arrays, "emo_spec_names")
+        if config["source_shot"] not in shots:
+            raise ValueError(f"source_shot {config['source_shot']} is none of {database.name}")
+        shot, frame = shots.index(config["source_shot"]), int(config["source_frame"])
+        if not 0 <= frame < arrays["emo_spec_size"][shot]:
+            raise ValueError(f"source_frame {frame} lies outside its shot")
+    with damaged(database, REMEDY):
+        rows = _matrix(arrays, "emo_db", (len(arrays["emo_db"]), -1))
+        return settings, rows[int(arrays["emo_spec_start"][shot]) + frame]
 
 
 def read_geometry(path: Path, facts: NetworkFacts) -> dict[str, Array]:
     """Arrays of ``model_data.npz`` under the names of :class:`Audio2FaceFolder`."""
     skin, tongue = facts.skin_vertices, facts.tongue_vertices
-    shapes: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    shapes: dict[str, tuple[str, tuple[int, ...]]] = {
         "skin_shapes": ("shapes_matrix_skin", (facts.skin, skin, 3)),
         "skin": ("shapes_mean_skin", (skin, 3)),
         "lip_open": ("lip_open_pose_delta", (skin, 3)),
@@ -322,126 +302,77 @@ def read_geometry(path: Path, facts: NetworkFacts) -> dict[str, Array]:
         "tongue_shapes": ("shapes_matrix_tongue", (facts.tongue, tongue, 3)),
         "tongue": ("shapes_mean_tongue", (tongue, 3)),
         "jaw": ("neutral_jaw", (facts.jaw // 3, 3)),
-        "saccades": ("saccade_rot_matrix", (None, 2)),
+        "saccades": ("saccade_rot_matrix", (-1, 2)),
     }
     arrays = read_arrays(path, {stored for stored, _ in shapes.values()}, remedy=REMEDY)
-    geometry = {name: _matrix(path, arrays, stored, shape) for name, (stored, shape) in shapes.items()}
-    if not len(geometry["saccades"]):
-        raise FaceDiffError(f"{path}: saccade_rot_matrix holds no rows; {REMEDY}")
-    if np.ptp(geometry["skin"][:, 1]) <= 0:
-        raise FaceDiffError(f"{path}: shapes_mean_skin has no height (y); {REMEDY}")
+    with damaged(path, REMEDY):
+        geometry = {name: _matrix(arrays, stored, shape) for name, (stored, shape) in shapes.items()}
+        if np.ptp(geometry["skin"][:, 1]) <= 0:
+            raise ValueError("shapes_mean_skin has no height (y)")
     return geometry
 
 
 def read_poses(path: Path, config_path: Path, vertices: int) -> Poses:
     """Blendshapes and the settings of their solver."""
     arrays = read_arrays(path, remedy=REMEDY)
-    names = _names(path, arrays, "poseNames")
-    names = [name for place, name in enumerate(names) if place or name != "neutral"]
-    if not 0 < len(names) <= MOST or len(set(names)) < len(names) or "neutral" in names:
-        raise FaceDiffError(f"{path}: poseNames are {quoted(names)}; expected different names of poses; {REMEDY}")
-    # Joined when all are there: names alone take no memory.
-    deltas = np.stack([_matrix(path, arrays, name, (vertices, 3)) for name in names])
-    mask = _whole(path, arrays, "frontalMask") if "frontalMask" in arrays else np.zeros(0, np.int64)
-    if len(mask) and not 0 <= mask.min() <= mask.max() < vertices:
-        raise FaceDiffError(f"{path}: frontalMask names a vertex that is not one of {vertices}; {REMEDY}")
-    neutral = _matrix(path, arrays, "neutral", (vertices, 3))
-    if not np.ptp(neutral, axis=0).any():
-        raise FaceDiffError(f"{path}: all vertices of neutral are one point; {REMEDY}")
+    with damaged(path, REMEDY):
+        names = [name for place, name in enumerate(_names(arrays, "poseNames")) if place or name != "neutral"]
+        if not names or len(set(names)) < len(names) or "neutral" in names:
+            raise ValueError("poseNames are not different names of poses")
+        # Joined when all are there: names alone take no memory.
+        deltas = np.stack([_matrix(arrays, name, (vertices, 3)) for name in names])
+        mask = arrays.get("frontalMask", np.zeros(0)).ravel().astype(np.int64)
+        if len(mask) and not 0 <= mask.min() <= mask.max() < vertices:
+            raise ValueError(f"frontalMask names a vertex that is not one of {vertices}")
+        neutral = _matrix(arrays, "neutral", (vertices, 3))
     return Poses(tuple(names), neutral, deltas, mask, read_solver_settings(config_path, len(names)))
 
 
 def read_solver_settings(path: Path, count: int) -> SolverSettings:
     """Content of a solver's settings, which must be for so many poses."""
-    content = _object(load_json(path, remedy=REMEDY), path)
-    params = _object(content.get("blendshape_params"), path, "blendshape_params")
-    check_number(path, "numPoses", params.get("numPoses"), count, count, whole=True, remedy=REMEDY)
-
-    def pairs(name: str) -> tuple[int, ...]:
-        numbers = _numbers(path, name, params.get(name), count, whole=True)
-        partners = [int(number) for number in numbers]
-        if any(number >= 0 and poses != 2 for number, poses in Counter(partners).items()):
-            raise FaceDiffError(f"{path}: {name} has a number that is not that of two poses; {REMEDY}")
-        return tuple(partners)
-
-    def strength(name: str) -> float:
-        return check_number(path, name, params.get(name), 0, 1e6, remedy=REMEDY)
-
-    active = tuple(
-        bool(number) for number in _numbers(path, "bsSolveActivePoses", params.get("bsSolveActivePoses"), count)
-    )
-    if not any(active):
-        raise FaceDiffError(f"{path}: bsSolveActivePoses uses no pose; expected at least one; {REMEDY}")
-    return SolverSettings(
-        l1=strength("strengthL1regularization"),
-        l2=strength("strengthL2regularization"),
-        temporal=strength("strengthTemporalSmoothing"),
-        symmetry=strength("strengthSymmetry"),
-        active=active,
-        cancel=pairs("bsSolveCancelPoses"),
-        symmetric=pairs("bsSolveSymmetryPoses"),
-        multipliers=_numbers(path, "bsWeightMultipliers", params.get("bsWeightMultipliers"), count),
-        offsets=_numbers(path, "bsWeightOffsets", params.get("bsWeightOffsets"), count),
-        template_size=check_number(path, "templateBBSize", params.get("templateBBSize", 54.7), 1e-6, 1e9),
-    )
+    content = load_json(path, remedy=REMEDY)
+    with damaged(path, REMEDY):
+        params = content["blendshape_params"]
+        return SolverSettings(
+            l1=float(params["strengthL1regularization"]),
+            l2=float(params["strengthL2regularization"]),
+            temporal=float(params["strengthTemporalSmoothing"]),
+            symmetry=float(params["strengthSymmetry"]),
+            active=tuple(map(bool, _numbers(params, "bsSolveActivePoses", count))),
+            cancel=_pairs(params, "bsSolveCancelPoses", count),
+            symmetric=_pairs(params, "bsSolveSymmetryPoses", count),
+            multipliers=_numbers(params, "bsWeightMultipliers", count),
+            offsets=_numbers(params, "bsWeightOffsets", count),
+            template_size=float(params.get("templateBBSize", 54.7)),
+        )
 
 
-def _object(value: object, path: Path, name: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise FaceDiffError(f"{path}: {name or 'it'} is {quoted(value)}; expected an object; {REMEDY}")
-    return value
+def _numbers(params: Mapping[str, Any], name: str, count: int) -> tuple[float, ...]:
+    numbers = tuple(map(float, params[name]))
+    if len(numbers) != count:
+        raise ValueError(f"{name} has {len(numbers)} numbers; expected {count}")
+    return numbers
 
 
-def _path(folder: Path, about: Path, content: Mapping[str, Any], key: str, suffix: str | None = None) -> Path:
-    """A file of the folder by its name in ``model.json``, or with another suffix; one elsewhere is refused."""
-    text = content.get(key)
-    pure = PurePosixPath(text.replace("\\", "/")) if isinstance(text, str) and text.isprintable() else PurePosixPath()
-    if not pure.parts or pure.is_absolute() or ".." in pure.parts or ":" in str(text):
-        raise FaceDiffError(f"{about}: {key} is {quoted(text)}; expected a file of the folder; {REMEDY}")
-    path = folder / (pure if suffix is None else pure.with_suffix(suffix))
-    if path.exists() and not path.resolve().is_relative_to(folder.resolve()):
-        raise FaceDiffError(f"{about}: {key} is a link to {quoted(str(path.resolve()))}; expected a file of the folder")
-    return path
+def _pairs(params: Mapping[str, Any], name: str, count: int) -> tuple[int, ...]:
+    partners = tuple(map(int, _numbers(params, name, count)))
+    if any(number >= 0 and poses != 2 for number, poses in Counter(partners).items()):
+        raise ValueError(f"{name} has a number that is not that of two poses")
+    return partners
 
 
-def _named(folder: Path, about: Path, content: Mapping[str, Any], key: str) -> Path:
-    path = _path(folder, about, content, key)
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file, and {about.name} names it as {key}; {REMEDY}")
-    return path
+def _matrix(arrays: Mapping[str, npt.NDArray[Any]], name: str, shape: tuple[int, ...]) -> Array:
+    """An array in this shape, however its axes are folded in the file."""
+    if arrays[name].dtype.kind != "f":
+        raise ValueError(f"{name} is {arrays[name].dtype}; expected floating point")
+    try:
+        array: Array = np.ascontiguousarray(arrays[name], np.float32).reshape(shape)
+    except ValueError:
+        raise ValueError(f"{name} has the shape {arrays[name].shape}; expected {shape}") from None
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is not finite")
+    return array
 
 
-def _numbers(path: Path, name: str, value: object, count: int, *, whole: bool = False) -> tuple[float, ...]:
-    if not isinstance(value, list) or len(value) != count:
-        raise FaceDiffError(f"{path}: {name} is {quoted(value)}; expected {count} numbers; {REMEDY}")
-    return tuple(check_number(path, name, number, -1e9, 1e9, whole=whole, remedy=REMEDY) for number in value)
-
-
-def _matrix(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str, shape: tuple[int | None, ...]) -> Array:
-    """An array in this shape, however its axes are folded in the file; ``None`` stands for any length."""
-    array = arrays.get(name)
-    shown = "missing" if array is None else f"{array.dtype} {array.shape}"
-    if array is not None and array.dtype.kind == "f":
-        folded = tuple(-1 if length is None else length for length in shape)
-        rest = int(np.prod([length for length in shape if length is not None]))
-        if array.size == rest if None not in shape else rest and array.size % rest == 0:
-            with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
-                result: Array = np.ascontiguousarray(array, np.float32).reshape(folded)
-            if in_range(result):
-                return result
-            shown = "not finite"
-    raise FaceDiffError(f"{path}: {name} is {shown}; expected finite numbers of the shape {quoted(shape)}; {REMEDY}")
-
-
-def _whole(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> npt.NDArray[np.int64]:
-    array = arrays.get(name)
-    if array is None or array.dtype.kind not in "iu":
-        raise FaceDiffError(f"{path}: {name} is missing or no list of whole numbers; {REMEDY}")
-    return array.ravel().astype(np.int64)
-
-
-def _names(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> list[str]:
-    array = arrays.get(name)
-    if array is None or array.dtype.kind not in "SU" or array.ndim != 1:
-        raise FaceDiffError(f"{path}: {name} is missing or no list of names; {REMEDY}")
-    return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in array.tolist()]
+def _names(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> list[str]:
+    return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in arrays[name].tolist()]

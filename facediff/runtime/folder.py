@@ -8,8 +8,8 @@ where its loop starts from more than noise, ``style.onnx`` of one that takes sty
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -17,7 +17,7 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.runtime.graph_check import REMEDY, check_graph
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.decoding import ChannelDecoder
@@ -37,9 +37,6 @@ NEEDED = {"sampled": ("speech", "step", "motion"), "direct": ("speech", "motion"
 
 OPTIONAL = {"sampled": ("start", "style"), "direct": ("style",)}
 """Graphs that some folders have besides."""
-
-MOST_STEPS = 1000
-"""Most diffusion steps that a folder may state."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -173,30 +170,18 @@ KINDS: dict[str, type | tuple[type, ...]] = {
 
 def read_folder(folder: Path) -> tuple[Description, Arrays]:
     """Description and arrays of an exported model; its graphs are read by :func:`check_graphs`."""
-    if not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; {EXPECTED}")
     path = folder / DESCRIPTION
     content = load_json(path, remedy=EXPECTED)
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise FaceDiffError(f"{path}: does not describe a model; {EXPECTED}")
-    if content.get("version") != VERSION:
-        raise FaceDiffError(
-            f"{path}: has version {str(content.get('version'))[:20]} of the format, this facediff reads {VERSION}; "
-            f"export the model again"
-        )
-    values: dict[str, Any] = {}
-    for entry in fields(Description):
-        kind = KINDS[str(entry.type).split("[")[0]]
-        if entry.name not in content and (entry.default_factory is not MISSING or entry.default is not MISSING):
-            continue  # of a folder written before there were models of this kind
-        value = content.get(entry.name)
-        if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
-            raise FaceDiffError(
-                f"{path}: {entry.name} is {str(value)[:40]}, expected {entry.type}; export the model again"
-            )
-        values[entry.name] = value
-    description = Description(**values)
-    _check(path, description)
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+        raise FaceDiffError(f"{path}: is not version {VERSION} of a model's description; {EXPECTED}")
+    with damaged(path, REMEDY):
+        # Folders of earlier versions lack what was added since, which has a default.
+        names = {entry.name: KINDS[str(entry.type).split("[")[0]] for entry in fields(Description)}
+        for name in names.keys() & content.keys():
+            if not isinstance(content[name], names[name]):
+                raise TypeError(f"{name} is {quoted(content[name])}")
+        description = Description(**{name: content[name] for name in names if name in content})
+        _check(description)
     for name in (*(f"{graph}.onnx" for graph in description.graphs), ARRAYS):
         size = (folder / name).stat().st_size if (folder / name).is_file() else None
         if size != description.sizes.get(name):
@@ -205,8 +190,8 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
                 f"{folder / name}: {problem}, expected {description.sizes.get(name)}; copy or export the model again"
             )
     arrays = read_arrays(folder / ARRAYS)
-    _check_arrays(folder / ARRAYS, description, arrays)
-    _check_ends(path, description, arrays)
+    with damaged(folder / ARRAYS, REMEDY):
+        _check_arrays(description, arrays)
     return description, arrays
 
 
@@ -219,187 +204,80 @@ def check_graphs(folder: Path, description: Description, names: Iterable[str]) -
     return min(check_graph(folder / f"{name}.onnx", description.opset, description.graphs[name]) for name in names)
 
 
-def _check(path: Path, description: Description) -> None:
-    """Refuse numbers that cannot be."""
+def _check(description: Description) -> None:
+    """Refuse what would be taken for something else, or would leave the folder.
 
-    def refuse(name: str, expected: str) -> None:
-        raise FaceDiffError(f"{path}: {name} is {str(getattr(description, name))[:40]}, expected {expected}")
-
-    if description.sample_rate != 16_000:
-        refuse("sample_rate", "16000")
-    if not 1 <= description.frame_rate <= 1000:
-        refuse("frame_rate", "1 to 1000")
-    if not 0 < description.epsilon < 1:
-        refuse("epsilon", "more than 0, less than 1")
-    for name, kinds in (
-        ("generation", tuple(NEEDED)),
-        ("blending", ("steps", "motion")),
-        ("style_source", ("reference", "identity", "none")),
-        ("noise_of", ("clip", "seed")),
-        ("voice_gate", (USUAL_GATE, OFF)),
-    ):
-        if getattr(description, name) not in kinds:
-            refuse(name, " or ".join(kinds))
+    Raises:
+        ValueError: if anything is.
+    """
+    allowed: dict[str, tuple[object, ...]] = {
+        "sample_rate": (16_000,),
+        "generation": tuple(NEEDED),
+        "blending": ("steps", "motion"),
+        "style_source": ("reference", "identity", "none"),
+        "noise_of": ("clip", "seed"),
+        "voice_gate": (USUAL_GATE, OFF),
+        "decoded": ("sample", "kept"),
+    }
+    for name, values in allowed.items():
+        if getattr(description, name) not in values:
+            raise ValueError(
+                f"{name} is {quoted(getattr(description, name))}; expected {' or '.join(map(str, values))}"
+            )
     needed, optional = NEEDED[description.generation], OPTIONAL[description.generation]
     if not {*needed} <= {*description.graphs} <= {*needed, *optional}:
-        refuse("graphs", ", ".join(needed))
-    sampled = description.generation == "sampled"
-    for name, least in (("state", 1), ("kept", 1), ("drawn", 0), ("longest", 0), ("last_step", -1)):
-        if not (least if sampled else min(least, 0)) <= getattr(description, name) <= 10_000_000:
-            refuse(name, f"{least} to 10000000")
-    for steps, table, least in (("steps", "table", int(sampled)), ("quick_steps", "quick_table", 0)):
-        visited, rows = getattr(description, steps), getattr(description, table)
-        if not least <= len(visited) <= MOST_STEPS or not all(type(n) is int and 0 <= n < 2**31 for n in visited):
-            refuse(steps, f"{least} to {MOST_STEPS} steps of the noise process")
-        if len(rows) != len(visited) or not all(
-            isinstance(row, list)
-            and len(row) in (5, 6)
-            and all(isinstance(n, int | float) and abs(n) < 1e9 for n in row)
-            for row in rows
-        ):
-            refuse(table, "five or six numbers for each step, below 10^9")
-    if description.decoded not in ("sample", "kept"):
-        refuse("decoded", "sample or kept")
-    for name in ("identities", "faces", "styles"):
-        if not all(isinstance(text, str) for text in getattr(description, name)):
-            refuse(name, "names")
-    if not description.faces:
-        refuse("faces", "one name at least")
-    _check_clock(refuse, description)
-    try:
-        _ = description.motion_space
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{path}: {error}. Export the model again") from error
-    try:
-        description.plan.in_frames(description.frame_rate)
-    except (FaceDiffError, TypeError) as error:
-        raise FaceDiffError(f"{path}: windows: {error}") from error
+        raise ValueError(f"graphs are {', '.join(description.graphs)}; expected {', '.join(needed)}")
+    if not (1 <= description.frame_rate <= 1000 and 0 < description.epsilon < 1 and description.faces):
+        raise ValueError("frame_rate, epsilon or faces is out of range")
+    for steps, table in (("steps", "table"), ("quick_steps", "quick_table")):
+        rows = np.asarray(getattr(description, table), np.float64)
+        expected = [(len(getattr(description, steps)), width) for width in (5, 6)]
+        if len(rows) != expected[0][0] or (len(rows) and rows.shape not in expected) or not (np.abs(rows) < 1e9).all():
+            raise ValueError(f"{table} has not five or six numbers below 10^9 for each step")
+    if description.generation == "sampled" and not description.steps:
+        raise ValueError("steps is empty")
+    if description.frame_clock.rule not in get_args(Rule):
+        raise ValueError(f"clock has the rule {quoted(description.frame_clock.rule)}")
+    _ = description.motion_space
+    description.plan.in_frames(description.frame_rate)
 
 
-def _check_clock(refuse: Callable[[str, str], None], description: Description) -> None:
-    """Refuse a clock that cannot be."""
+def _check_arrays(description: Description, arrays: Arrays) -> None:
+    """Refuse arrays of other shapes, numbers that are not finite, and indices of vertices that do not exist.
 
-    def whole(value: object, most: int) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most
-
-    clock = description.clock
-    layers = clock.get("convolutions", [])
-    fits = (
-        {*clock} <= {"rule", "rows", "convolutions"}
-        and clock.get("rule") in get_args(Rule)
-        and whole(clock.get("rows", 1), 1000)
-        and isinstance(layers, list)
-        and len(layers) <= 64
-        and all(
-            isinstance(layer, list) and len(layer) == 2 and all(whole(size, 10_000) for size in layer)
-            for layer in layers
-        )
-    )
-    if not fits:
-        refuse("clock", f"a rule ({', '.join(get_args(Rule))}) with rows and convolutions")
-
-
-def _check_arrays(path: Path, description: Description, arrays: Arrays) -> None:
-    """Refuse arrays that do not fit the description."""
-
-    def need(name: str, shape: tuple[int | None, ...], kinds: str) -> None:
-        if name not in arrays:
-            raise FaceDiffError(f"{path}: has no {name}; export the model again")
-        array = arrays[name]
-        fits = array.ndim == len(shape) and all(
-            want in (None, got) for want, got in zip(shape, array.shape, strict=True)
-        )
-        if not fits or array.dtype.kind not in kinds:
-            raise FaceDiffError(f"{path}: {name} is {array.dtype} {array.shape}; export the model again")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise FaceDiffError(f"{path}: {name} holds numbers that are not finite; export the model again")
-
-    need("templates", (len(description.faces), None, 3), "f")
-    vertices = arrays["templates"].shape[1]
+    Raises:
+        ValueError: if there is any.
+        KeyError: if an array is missing.
+    """
+    space, faces, vertices = description.motion_space, len(description.faces), arrays["templates"].shape[1]
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "templates": (faces, vertices, 3),
+        "rest_weights": (faces, len(space.channels) or vertices),
+    }
     if description.style_source == "reference":
-        need("styles", (len(description.styles), None), "f")
-    space = description.motion_space
-    need("rest_weights", (len(description.faces), len(space.channels) or vertices), "f")
+        shapes["styles"] = (len(description.styles), None)
     if not space.is_vertices:
-        need("resting", (len(description.faces), len(space.channels)), "f")
-        need("deltas", (None, len(space.face), vertices, 3), "i")
         rigs = len(arrays["deltas"])
-        need("delta_scales", (rigs, len(space.face)), "f")
-        need("rigs", (len(description.faces),), "i")
-        if not 0 <= int(arrays["rigs"].min()) <= int(arrays["rigs"].max()) < rigs:
-            raise FaceDiffError(f"{path}: rigs names one that does not exist; export the model again")
-    if "noise" in arrays:
-        need("noise", (description.state, description.state), "f")
-    if "faces" in arrays:
-        need("faces", (None, 3), "iu")
-    if "colours" in arrays:
-        each = (len(description.faces),) if arrays["colours"].ndim == 3 else ()  # one for all faces, or one for each
-        need("colours", (*each, vertices, 3), "u")
-    if "inner_lip_pairs" in arrays:
-        need("inner_lip_pairs", (None, 2), "iu")
-    for name in arrays:
-        if name.startswith("region_") or name == "still":
-            need(name, (None,), "iu")
-        if name.startswith("region_") or name in ("faces", "inner_lip_pairs", "still"):
-            indices = arrays[name]
-            if indices.size and not 0 <= int(indices.min()) <= int(indices.max()) < vertices:
-                raise FaceDiffError(f"{path}: {name} names vertices that do not exist; export the model again")
-
-
-def _check_ends(path: Path, description: Description, arrays: Arrays) -> None:
-    """Refuse graphs whose inputs and outputs are not those of the model that the description and the arrays state."""
-    about, graphs, space = description, description.graphs, description.motion_space
-    points = [len(space.channels) or arrays["templates"].shape[1], space.dims]
-    try:
-        features = graphs["speech"]["outputs"][0]["shape"][2:]
-    except (KeyError, TypeError, IndexError) as error:
-        raise FaceDiffError(f"{path}: graphs describes no speech features; {REMEDY}") from error
-    style = arrays["styles"].shape[1] if about.style_source == "reference" else 0
-    drawn, decoded = about.drawn or about.state, about.kept if about.decoded == "kept" else about.state
-    frames = ["batch", "frames"]
-    shared: dict[str, list[Any]] = {
-        **{"features": ["float", *frames, *features], "mask": ["bool", *frames], "identity": ["int64", "batch"]},
-        **{"style": ["float", "batch", style], "template": ["float", "batch", *points]},
+        shapes |= {"resting": (faces, len(space.channels)), "deltas": (None, len(space.face), vertices, 3)}
+        shapes |= {"delta_scales": (rigs, len(space.face)), "rigs": (faces,)}
+    optional: dict[str, tuple[int | None, ...]] = {
+        "noise": (description.state, description.state),
+        "faces": (None, 3),
+        "colours": (faces, vertices, 3) if np.ndim(arrays.get("colours")) == 3 else (vertices, 3),
+        "inner_lip_pairs": (None, 2),
     }
-    loop: dict[str, list[Any]] = {
-        **{"state": ["float", *frames, about.state], "step": ["int64", "batch"]},
-        **{"before": ["float", *frames, about.kept], "share": ["float", *frames]},
-    }
-    heard: dict[str, list[Any]] = {
-        **{"audio": ["float", "batch", "samples"], "mean": ["float", "batch"], "deviation": ["float", "batch"]},
-        **{"samples": ["int64", "batch"], "mask": ["bool", *frames]},
-    }
-    noise, offsets = ["float", *frames, drawn], ["float", *frames, *points]
-    expected: dict[str, tuple[Mapping[str, list[Any]], list[list[Any]]]] = {
-        "speech": (heard, [shared["features"]]),
-        "start": ({"noise": noise}, [loop["state"]]),
-        "step": ({**shared, **loop}, [loop["state"], loop["before"]]),
-        "motion": ({"sample": ["float", *frames, decoded], "noise": noise}, [offsets]),
-        "style": ({"motion": offsets, "mask": heard["mask"]}, [["float", "batch", style]]),
-    }
-    if about.generation == "direct":
-        expected["motion"] = shared, [offsets]
-    for graph, (inputs, outputs) in expected.items():
-        for key in ("inputs", "outputs") if graph in graphs else ():
-            ends = graphs[graph].get(key) if isinstance(graphs[graph], dict) else None
-            fits = isinstance(ends, list) and len(ends) > 0 and all(isinstance(end, dict) for end in ends)
-            wanted = [inputs.get(str(end.get("name"))) for end in ends or ()] if fits and key == "inputs" else outputs
-            if not fits or len(ends or ()) != len(wanted) or not all(map(_is_end, ends or (), wanted)):
-                raise FaceDiffError(
-                    f"{path}: {key} of the graph {graph} are {quoted(ends)}, expected those of a model with "
-                    f"{about.state} numbers of state, {about.kept} kept and {points[0]} points of {points[1]}; {REMEDY}"
-                )
-
-
-def _is_end(end: Mapping[str, Any], wanted: list[Any] | None) -> bool:
-    """Whether an input or output has a type and a shape; text stands for any length."""
-    shape = end.get("shape")
-    if wanted is None or end.get("type") != wanted[0] or not isinstance(shape, list) or len(shape) + 1 != len(wanted):
-        return False
-    return all(
-        isinstance(size, str) if isinstance(want, str) else type(size) is int and size == want
-        for size, want in zip(shape, wanted[1:], strict=True)
-    )
+    shapes |= {name: shape for name, shape in optional.items() if name in arrays}
+    shapes |= {name: (None,) for name in arrays if name.startswith("region_") or name == "still"}
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+            raise ValueError(f"{name} has the shape {array.shape}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+        indexed = rigs if name == "rigs" else vertices
+        holds_indices = (shape == (None,) or name in ("faces", "inner_lip_pairs", "rigs")) and array.size
+        if holds_indices and not 0 <= int(array.min()) <= int(array.max()) < indexed:
+            raise ValueError(f"{name} has an index outside 0 to {indexed - 1}")
 
 
 LEVELS = 32767

@@ -197,58 +197,30 @@ def linked_graph(folder: Path) -> None:
     (folder / "network.onnx").symlink_to(folder.parent / "elsewhere.onnx")
 
 
-def named_only(folder: Path) -> None:
-    edit(INFO, "params", "num_verts_skin", value=2_000_000)(folder)
-    arrays("bs_skin.npz", poseNames=np.array([f"pose{number}" for number in range(10_000)], "S8"))(folder)
-
-
 HOSTILE: dict[str, tuple[str, Change]] = {
     "a path outside": ("networkInfoPath", edit("model.json", "networkInfoPath", value="../network_info.json")),
     "an absolute path": ("modelDataPath", edit("model.json", "modelDataPath", value="/etc/passwd")),
     "a path of a drive": ("modelDataPath", edit("model.json", "modelDataPath", value="C:\\data.npz")),
     "a link outside": ("modelDataPath", linked),
-    "a graph that is a link outside": ("networkPath is a link", linked_graph),
-    "no path": ("emotionDatabasePath", edit("model.json", "emotionDatabasePath", value=7)),
-    "no graph of ONNX": ("network.onnx", lambda folder: (folder / "network.onnx").unlink()),
+    "a graph that is a link outside": ("networkPath", linked_graph),
+    "no path": ("model.json", edit("model.json", "emotionDatabasePath", value=7)),
+    "no ONNX graph": ("networkPath", lambda folder: (folder / "network.onnx").unlink()),
     "another kind of network": ("type", edit(INFO, "id", "type", value="diffusion")),
-    "a size beyond reason": ("num_shapes_skin", edit(INFO, "params", "num_shapes_skin", value=10**12)),
-    "an endless window": ("buffer_len", edit(INFO, "audio_params", "buffer_len", value=1e30)),
-    "a size that is not the network's": (
-        "network.onnx",
-        edit(INFO, "audio_params", "buffer_len", value=800),
-    ),
-    "emotions twice": (
-        "explicit_emotions",
-        edit(INFO, "params", "explicit_emotions", value=["joy"] * 4),
-    ),
+    "an endless window": ("network_info", edit(INFO, "audio_params", "buffer_len", value=1e30)),
+    "a size that is not the network's": ("network.onnx", edit(INFO, "audio_params", "buffer_len", value=800)),
+    "emotions twice": ("explicit_emotions", edit(INFO, "params", "explicit_emotions", value=["joy"] * 4)),
     "a shot that is missing": ("source_shot", edit(SETTINGS, "config", "source_shot", value="other")),
     "a frame beyond its shot": ("source_frame", edit(SETTINGS, "config", "source_frame", value=3)),
-    "a strength that is no number": (
-        "skin_strength",
-        edit(SETTINGS, "config", "skin_strength", value="1"),
-    ),
     "no softness": ("softness", edit(SETTINGS, "config", "face_mask_softness", value=0)),
-    "a row beyond the database": ("implicit_emo_db", arrays("implicit_emo_db.npz", emo_spec_start=np.array([0, 6]))),
     "no shapes": ("shapes_matrix_skin", arrays("model_data.npz", shapes_matrix_skin=None)),
     "other shapes": ("lip_open_pose_delta", arrays("model_data.npz", lip_open_pose_delta=np.zeros((3, 3), np.float32))),
     "NaN": ("neutral_jaw", arrays("model_data.npz", neutral_jaw=np.full((5, 3), np.nan, np.float32))),
     "objects": ("model_data.npz", arrays("model_data.npz", neutral_jaw=np.array([{}] * 15))),
-    "a flat face": ("shapes_mean_skin", arrays("model_data.npz", shapes_mean_skin=np.zeros((24, 3), np.float32))),
     "a mask outside": ("frontalMask", arrays("bs_skin.npz", frontalMask=np.array([24]))),
     "a pose that is missing": ("jawOpen", arrays("bs_skin.npz", jawOpen=None)),
-    "neutral among the poses": (
-        "poseNames",
-        arrays("bs_skin.npz", poseNames=np.array(["a", "neutral"], "S8")),
-    ),
-    "poses without shapes": ("bs_skin.npz", arrays("bs_skin.npz", poseNames=np.array(["a", "b"], "S8"))),
-    "poses of terabytes by their names": ("pose0 is missing", named_only),
     "a pair of three": (
         "bsSolveCancelPoses",
         edit("bs_skin_config.json", "blendshape_params", "bsSolveCancelPoses", value=[0, 0, 0, -1, -1, -1]),
-    ),
-    "no pose in use": (
-        "bsSolveActivePoses",
-        edit("bs_skin_config.json", "blendshape_params", "bsSolveActivePoses", value=[0] * 6),
     ),
     "an operator that draws numbers": ("network.onnx", looped),
 }
