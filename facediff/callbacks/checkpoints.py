@@ -33,7 +33,7 @@ from facediff.models.checkpoint import read_checkpoint
 from facediff.utils.files import atomic
 from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
-from facediff.utils.torch_files import load_tensors, open_checkpoint
+from facediff.utils.torch_files import load_tensors
 
 TRAIN = RunningStage.TRAINING
 
@@ -81,8 +81,7 @@ TRANSFER = ".temp.ckpt"
 
 def only_weights(path: Path) -> dict[str, Any] | None:
     """What a file holds if that is tensors by name and nothing else, which names no class and no option."""
-    with open_checkpoint(path) as (stream, name):
-        content = load_tensors(stream, name)
+    content = load_tensors(path)
     plain = isinstance(content, dict) and all(isinstance(value, torch.Tensor) for value in content.values())
     return content if plain else None
 

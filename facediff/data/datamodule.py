@@ -55,7 +55,7 @@ from facediff.spaces import VERTICES, Space
 from facediff.utils.hints import defaults, is_name
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
 from facediff.utils.ranges import Range
-from facediff.utils.torch_files import load_tensors, open_checkpoint
+from facediff.utils.torch_files import load_tensors
 
 if TYPE_CHECKING:
     from facediff.data.packed.reader import PackedCorpus
@@ -272,14 +272,16 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         **options: Any,  # noqa: ANN401
     ) -> Self:
         """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's."""
-        with open_checkpoint(checkpoint_path) as (stream, path):
-            content = load_tensors(stream, path)
-            hyperparameters = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
-            if not isinstance(hyperparameters, dict):
-                raise FaceDiffError(f"{path}: holds no options of a data module; expected a file of `facediff fit`")
-            read_options(str(path), cls, hyperparameters, {})
-            stream.seek(0)
-            data: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
+        content = load_tensors(checkpoint_path)
+        hyperparameters = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
+        if not isinstance(hyperparameters, dict):
+            raise FaceDiffError(
+                f"{checkpoint_path}: holds no options of a data module; expected a file of `facediff fit`"
+            )
+        read_options(str(checkpoint_path), cls, hyperparameters, {})
+        if not isinstance(checkpoint_path, str | Path):
+            checkpoint_path.seek(0)
+        data: Self = super().load_from_checkpoint(checkpoint_path, *arguments, **{**options, "weights_only": True})
         return data
 
     @classmethod

@@ -225,8 +225,7 @@ def read_tensors(path: Path) -> object:
     """The model in a file of PyTorch's: its tensors as arrays, which may lie under ``flame_model``."""
     from facediff.utils.torch_files import load_tensors
 
-    with path.open("rb") as stream:
-        content = load_tensors(stream, path)
+    content = load_tensors(path, HELP)
     inner = content.get("flame_model", content) if isinstance(content, Mapping) else content
     if not isinstance(inner, Mapping):
         return inner

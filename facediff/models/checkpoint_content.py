@@ -27,7 +27,7 @@ from facediff.models.layers import frame_mask
 from facediff.registry import COMPONENTS, corpus
 from facediff.spaces import Space
 from facediff.speech.voice_activity import OFF, USUAL_GATE
-from facediff.utils.hints import defaults, is_name, is_plain_text
+from facediff.utils.hints import defaults, is_name
 from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
 from facediff.utils.limits import quoted
 
@@ -88,11 +88,7 @@ class CheckpointContent(LightningModule, Inference):
 
     @property
     def assets(self) -> Assets:
-        """Templates, faces, regions, references and scale of the training corpus.
-
-        Raises:
-            FaceDiffError: if neither a corpus nor a checkpoint has been seen yet.
-        """
+        """Templates, faces, regions, references and scale of the training corpus."""
         if self._assets is None:
             raise FaceDiffError("the model has no templates yet; train it with a data module or load a checkpoint")
         return self._assets
@@ -105,11 +101,7 @@ class CheckpointContent(LightningModule, Inference):
 
     @property
     def scale(self) -> float:
-        """Factor from offsets in the corpus's unit to the motion that the networks see.
-
-        Raises:
-            FaceDiffError: if it has not been measured, because the model was never trained.
-        """
+        """Factor from offsets in the corpus's unit to the motion that the networks see."""
         if self.motion_scaling == "none":
             return 1.0
         if self.assets.motion_scale is None:
@@ -122,11 +114,7 @@ class CheckpointContent(LightningModule, Inference):
         return OFF if IMPORTED in self.provenance else USUAL_GATE
 
     def adopt(self, assets: Assets) -> None:
-        """Take over a corpus's assets after checking that they fit the model's sizes.
-
-        Raises:
-            FaceDiffError: naming what differs.
-        """
+        """Take over a corpus's assets after checking that they fit the model's sizes."""
         sizes = {template.shape[0] for template in assets.templates.values()}
         for what, mine, theirs in (
             ("kinds of space", self.space.kind, assets.space.kind),
@@ -193,6 +181,13 @@ class CheckpointContent(LightningModule, Inference):
         if ASSETS_KEY in checkpoint:
             # Before the weights are loaded: modules whose size follows from the corpus are made by it.
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
+            weights = checkpoint.get("state_dict", {})
+            check_weights("the checkpoint", weights, self.state_dict())
+            if diverged := next((name for name, value in weights.items() if not value.isfinite().all()), None):
+                raise FaceDiffError(
+                    f"its weights {quoted(diverged)} hold NaN or infinity, so the training has diverged; use an "
+                    f"earlier checkpoint, or train again with a lower learning rate"
+                )
             self.data_source = checkpoint.get(DATA_SOURCE_KEY) or {}
             self.licences = merged(self.licences, self._stated_licences(checkpoint))
             self.provenance = read_provenance(checkpoint)
@@ -211,42 +206,31 @@ class CheckpointContent(LightningModule, Inference):
         return merged([own], people, network_licences(dict(self.hparams)))
 
 
-def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
-    """What a checkpoint was made from; the epochs and steps of one that says nothing else.
-
-    Raises:
-        FaceDiffError: if it is anything but short texts by name.
-    """
-    texts = checkpoint.get(PROVENANCE_KEY, {})
-    if not isinstance(texts, dict) or not all(
-        isinstance(text, str) and is_plain_text(text) for pair in texts.items() for text in pair
-    ):
-        raise FaceDiffError(f"its provenance is {quoted(texts)}; expected texts by name. The file is damaged")
-    counted = {name: checkpoint.get(key) for name, key in COUNTED.items()}
-    return {**texts, **{name: str(count) for name, count in counted.items() if isinstance(count, int)}}
-
-
-def read_person_styles(state: object) -> dict[str, Style]:
-    """The styles of all motion of each speaker, from a checkpoint.
-
-    Raises:
-        FaceDiffError: if they are anything but finite vectors of one length, by speaker.
-    """
-    if not isinstance(state, dict):
-        raise FaceDiffError(f"its styles are {quoted(state)}; expected vectors by speaker. The file is damaged")
-    styles: dict[str, Style] = {}
-    for name, value in state.items():
-        fits = is_name(name) and isinstance(value, list | tuple) and len(value) == 2 and isinstance(value[0], str)
-        vector = value[1] if fits and is_plain_text(value[0]) else None
-        if not isinstance(vector, Tensor) or vector.ndim != 1 or not bool(vector.isfinite().all()):
+def check_weights(source: object, weights: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+    """Refuse weights of another kind of number than the model's: copying would convert them without a word."""
+    for name, value in weights.items():
+        if name in own and own[name].is_floating_point() != value.is_floating_point():
             raise FaceDiffError(
-                f"its style of {quoted(name)} is {quoted(value)}; expected a name and a finite vector. The file is "
-                f"damaged"
+                f"{source}: its weights {quoted(name)} are of the type {value.dtype}, and {own[name].dtype} in the "
+                f"model; the file is damaged"
             )
-        styles[name] = Style(value[0], vector.float())
-    if len({len(style.vector) for style in styles.values()}) > 1:
-        raise FaceDiffError("its styles of speakers differ in length; expected one length. The file is damaged")
-    return styles
+
+
+def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
+    """A checkpoint's provenance; the epochs and steps of one that says nothing else."""
+    counted = {name: checkpoint.get(key) for name, key in COUNTED.items()}
+    return {
+        **checkpoint.get(PROVENANCE_KEY, {}),
+        **{name: str(count) for name, count in counted.items() if isinstance(count, int)},
+    }
+
+
+def read_person_styles(state: Mapping[str, tuple[str, Tensor]]) -> dict[str, Style]:
+    """The styles of all motion of each speaker, from a checkpoint."""
+    for name, (_, vector) in state.items():
+        if not is_name(name) or vector.ndim != 1 or not bool(vector.isfinite().all()):
+            raise FaceDiffError(f"its style of {quoted(name)} is {quoted(vector)}; expected a name and a finite vector")
+    return {name: Style(text, vector.float()) for name, (text, vector) in state.items()}
 
 
 class PersonStyles(CheckpointContent):
@@ -267,11 +251,7 @@ class PersonStyles(CheckpointContent):
         """A batch's own style vectors, or else those of its references."""
 
     def default_style(self, identity: str) -> Reference | Style:
-        """The style of all of an identity's motion if the model keeps it, else its stored reference.
-
-        Raises:
-            FaceDiffError: if it has neither.
-        """
+        """The style of all of an identity's motion if the model keeps it, else its stored reference."""
         return self.person_styles.get(identity) or super().default_style(identity)
 
     def styled_identities(self) -> list[str]:

@@ -36,7 +36,7 @@ from facediff.utils.hub import ASSETS, CARD, CONFIG, WEIGHTS
 from facediff.utils.licences import Licence, commercial_use, known_licence, merged
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import json_text, load_json
-from facediff.utils.safetensors import TYPES, read_safetensors, write_safetensors
+from facediff.utils.torch_files import read_safetensors, write_safetensors
 from facediff.version import __version__
 
 FORMAT = "facediff model 1"
@@ -59,7 +59,10 @@ MARK = "$tensor"
 MOTION_FRAMES = 8
 """From so many frames on, a (T, V, 3) tensor is stored as differences between frames."""
 
-NUMBERS = {name: size for name, size in TYPES.values()}
+NUMBERS = {
+    name: getattr(torch, name).itemsize
+    for name in ("float64", "float32", "float16", "bfloat16", "int64", "int32", "int16", "int8", "uint8", "bool")
+}
 
 
 def publish(

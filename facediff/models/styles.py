@@ -250,11 +250,10 @@ def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
         return parameter_styles.recorded_parameters(words, frame_rate)
     import torch
 
-    from facediff.utils.torch_files import load_tensors, open_checkpoint
+    from facediff.utils.torch_files import load_tensors
 
     entry = find_layout(stated or "flame_artalk", f"--style {path}")
-    with open_checkpoint(path) as (stream, source):
-        content = load_tensors(stream, source)
+    content = load_tensors(path)
     values: npt.NDArray[np.floating] = np.zeros(0, np.float32)
     if isinstance(content, torch.Tensor) and content.is_floating_point():
         values = content.float().numpy()

@@ -20,7 +20,7 @@ from facediff.models import DualPathDiffusion, load_model
 from facediff.models.checkpoint import checked_file, read_assets, read_checkpoint
 from facediff.models.pretrained import coded, decoded, read_model, stored_once, write_model
 from facediff.utils.licences import Licence, commercial_use
-from facediff.utils.safetensors import read_safetensors
+from facediff.utils.torch_files import read_safetensors
 from tests.fakes.tiny import Tiny, write_tiny
 
 

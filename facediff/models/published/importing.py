@@ -27,8 +27,7 @@ from facediff.data.corpus import read_templates
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.hyperparameters import component_class
 from facediff.metrics import Region
-from facediff.models.checkpoint import check_weights
-from facediff.models.checkpoint_content import IMPORTED
+from facediff.models.checkpoint_content import IMPORTED, check_weights
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.recognition import (
     RECOGNISERS,
@@ -46,7 +45,7 @@ from facediff.utils.licences import Licence, merged, network_licences
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
 from facediff.utils.tensorflow_files import read_bundle
-from facediff.utils.torch_files import read_arguments, read_state_dict
+from facediff.utils.torch_files import read_authors_checkpoint
 
 if TYPE_CHECKING:
     from facediff.models.base import AnimationModel
@@ -215,7 +214,8 @@ def read_weights(files: Sequence[Path]) -> AuthorsWeights:
     together: dict[str, Tensor] = {}
     arguments: dict[str, Mapping[str, Any]] = {}
     for path, shards in bundles(files).items():
-        state = read_bundle(path, shards) if path.suffix == ".index" else read_state_dict(path)
+        bundle = path.suffix == ".index"
+        state, options = (read_bundle(path, shards), {}) if bundle else read_authors_checkpoint(path)
         if "facediff_format" in state:
             raise FaceDiffError(f"{path}: is a checkpoint of facediff already; use it as it is")
         if twice := sorted(together.keys() & state.keys()):
@@ -224,7 +224,7 @@ def read_weights(files: Sequence[Path]) -> AuthorsWeights:
                 f"one method"
             )
         together |= state
-        if path.suffix != ".index" and (options := read_arguments(path)):
+        if options:
             arguments |= dict.fromkeys(state, options)
     return AuthorsWeights(together, ", ".join(map(str, files)), arguments)
 

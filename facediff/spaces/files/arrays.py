@@ -76,10 +76,8 @@ def _read_tensor(path: Path) -> npt.NDArray[Any]:
     """The one tensor of a file of PyTorch's, as ARTalk keeps its style clips."""
     from facediff.utils.torch_files import load_tensors
 
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected a tensor of motion (.pt)")
-    with needs_extra("torch", "metrics", "reading a tensor of motion (.pt)"), path.open("rb") as stream:
-        content = load_tensors(stream, path)
+    with needs_extra("torch", "metrics", "reading a tensor of motion (.pt)"):
+        content = load_tensors(path, "expected a tensor of motion (.pt)")
     if not hasattr(content, "detach") or not content.is_floating_point():
         raise FaceDiffError(f"{path}: holds a {type(content).__name__}; expected one tensor of numbers")
     return np.asarray(content.detach().double().numpy())
