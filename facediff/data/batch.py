@@ -7,7 +7,6 @@ template, (frames, points, dims): of vertices in the corpus's unit of length, or
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.rigs import LinearRig
 from facediff.utils.hints import is_name
-from facediff.utils.limits import FRAME_RATES, check_number, quoted
+from facediff.utils.limits import FRAME_RATES, quoted
 
 UNKNOWN_IDENTITY = -1
 
@@ -423,99 +422,45 @@ class Assets:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> Assets:
-        """The inverse of :meth:`state`."""
+        """The inverse of :meth:`state`. It comes from a file, so names, shapes and indices are checked."""
         expected = {attribute.name for attribute in fields(cls)}
-        if isinstance(state, dict):
-            # Checkpoints of 0.2 and older have no colours, and those of vertices no space.
-            state = {"identity_colours": {}, "space": VERTICES.state(), "rig": None, **state}
-        if not isinstance(state, dict) or state.keys() != expected:
-            odd = sorted(map(str, expected ^ state.keys())) if isinstance(state, dict) else []
-            raise FaceDiffError(
-                f"its assets are not those of this version of facediff (different: {quoted(odd)}); train it again"
-            )
-        names = state["identities"]
-        if not isinstance(names, list) or not names or not all(map(is_name, names)) or len(set(names)) < len(names):
-            raise _bad("identities", names, "a list of different names without path separators")
-        for key in ("templates", "regions", "references", "identity_colours"):
-            if not isinstance(state[key], dict) or not all(map(is_name, state[key])):
-                raise _bad(key, state[key], "a dict by name")
-        for key in ("corpus", "unit"):
-            if not is_name(state[key]):
-                raise _bad(key, state[key], "a short text")
-        if not isinstance(state["synthetic"], bool):
-            raise _bad("synthetic", state["synthetic"], "true or false")
-        check_number("assets", "frame_rate", state["frame_rate"], *FRAME_RATES)
-        if state["motion_scale"] is not None:
-            check_number("assets", "motion_scale", state["motion_scale"], sys.float_info.min)
-        space = Space.from_state(state["space"])
-        cls._check_tensors(state, space)
-        references = {name: Reference(clip, motion) for name, (clip, motion) in state["references"].items()}
-        return cls(**{**state, "references": references, "space": space, "rig": cls._read_rig(state["rig"], space)})
+        # Checkpoints of 0.2 and older have no colours, and those of vertices no space.
+        state = {"identity_colours": {}, "space": VERTICES.state(), "rig": None, **state}
+        if state.keys() != expected:
+            odd = quoted(sorted(map(str, expected ^ state.keys())))
+            raise FaceDiffError(f"its assets are not those of this version of facediff (different: {odd}); train again")
+        rig = state["rig"]
+        assets = cls(
+            **{
+                **state,
+                "references": {name: Reference(clip, motion) for name, (clip, motion) in state["references"].items()},
+                "space": Space.from_state(state["space"]),
+                "rig": None if rig is None else Rig(cls.from_state(rig["mesh"]), rig["deltas"]),
+            }
+        )
+        if fault := assets._fault():
+            raise FaceDiffError(f"its assets have {fault}. The file is damaged; get it again")
+        return assets
 
-    @classmethod
-    def _read_rig(cls, state: object, space: Space) -> Rig | None:
-        """The rig of a parametric space, after the same checks."""
-        if state is None:
-            return None
-        if space.is_vertices or not isinstance(state, dict) or state.keys() != {"mesh", "deltas"}:
-            raise _bad("rig", state, "none of vertices; else a mesh and deltas")
-        mesh, deltas = cls.from_state(state["mesh"]), state["deltas"]
-        if not mesh.space.is_vertices:
-            raise _bad("rig", state["mesh"], "a mesh of vertices")
-        if not isinstance(deltas, dict) or not deltas or not deltas.keys() <= mesh.templates.keys():
-            raise _bad("rig", deltas, "deltas of speakers who have a template")
-        for name, own in deltas.items():
-            _check_tensor(f"rig[{name}]", own, (len(space.face), mesh.n_vertices, 3))
-        return Rig(mesh, deltas)
-
-    @staticmethod
-    def _check_tensors(state: dict[str, Any], space: Space) -> None:
-        """Refuse tensors of the wrong shape or type, not finite, or with indices of vertices that do not exist."""
-        sizes = {len(t) for t in state["templates"].values() if isinstance(t, Tensor) and t.ndim == 2}
-        if len(sizes) != 1 or not min(sizes):
-            raise _bad("templates", state["templates"], "a neutral face of equally many vertices for every speaker")
-        (count,) = sizes
-        dims = space.dims
-        if not space.is_vertices and (count != len(space.channels) or state["faces"] is not None):
-            raise _bad("templates", count, f"{len(space.channels)} channels, as the space has, and no triangles")
-        for name, template in state["templates"].items():
-            _check_tensor(f"templates[{name}]", template, (count, dims))
-        for name, reference in state["references"].items():
-            if not isinstance(reference, list | tuple) or len(reference) != 2 or not is_name(reference[0]):
-                raise _bad(f"references[{name}]", reference, "a clip's name and its motion")
-            _check_tensor(f"references[{name}]", reference[1], (None, count, dims))
-            if not len(reference[1]):
-                raise _bad(f"references[{name}]", reference, "a motion of at least one frame")
-        for name in {"lips", "upper_face"} - state["regions"].keys():
-            raise FaceDiffError(f"its assets have no region {name}; train the model again with `facediff fit`")
-        for name, region in state["regions"].items():
-            _check_tensor(f"regions[{name}]", region, (None,), below=count)
-        for name, shape in (("faces", (None, 3)), ("inner_lip_pairs", (None, 2))):
-            if state[name] is not None:
-                _check_tensor(name, state[name], shape, below=count)
-        own = {f"identity_colours[{name}]": colours for name, colours in state["identity_colours"].items()}
-        for name, colours in {"colours": state["colours"], **own}.items():
-            if colours is not None:
-                _check_tensor(name, colours, (count, 3), below=256)
-
-
-def _check_tensor(name: str, value: object, shape: tuple[int | None, ...], *, below: int | None = None) -> None:
-    """Refuse anything but a finite tensor of a shape (None: any size), or of indices ``below`` a number."""
-    sizes = ", ".join("any" if size is None else str(size) for size in shape)
-    kind = "finite numbers" if below is None else f"whole numbers from 0 to {below - 1}"
-    fits = isinstance(value, Tensor) and value.layout == torch.strided and value.ndim == len(shape)
-    if not fits or any(size not in (None, own) for size, own in zip(shape, value.shape, strict=True)):  # type: ignore[attr-defined]
-        raise _bad(name, value, f"{kind} of the shape ({sizes})")
-    tensor = cast(Tensor, value)
-    if below is None:
-        good = tensor.is_floating_point() and bool(tensor.isfinite().all())
-    else:
-        good = not tensor.is_floating_point() and not tensor.is_complex() and tensor.dtype != torch.bool
-        good = good and (not tensor.numel() or (int(tensor.min()) >= 0 and int(tensor.max()) < below))
-    if not good:
-        raise _bad(name, value, f"{kind} of the shape ({sizes})")
-
-
-def _bad(name: str, value: object, expected: str) -> FaceDiffError:
-    shown = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else quoted(value)
-    return FaceDiffError(f"its assets' {name} is {shown}; expected {expected}. The file is damaged")
+    def _fault(self) -> str:
+        """What contradicts itself and would go unnoticed: names reach files, shapes and indices select vertices."""
+        named = (self.templates, self.regions, self.references, self.identity_colours)
+        names = [self.corpus, self.unit, *self.identities, *(name for entries in named for name in entries)]
+        if odd := [name for name in names if not is_name(name)]:
+            return f"a name {quoted(odd[0])}; expected a short text without path separators"
+        if not self.identities or len(set(self.identities)) < len(self.identities):
+            return "no identities, or one of them twice"
+        if not FRAME_RATES[0] <= self.frame_rate <= FRAME_RATES[1]:
+            return f"a frame rate of {self.frame_rate}"
+        points = (self.n_vertices, self.space.dims)
+        motions = [*self.templates.values(), *(reference.motion for reference in self.references.values())]
+        if any(motion.shape[-2:] != points or not motion.isfinite().all() for motion in motions):
+            return f"a template or reference that is not of finite {points[0]} points in {points[1]} dimensions"
+        indices = [*self.regions.values(), *(part for part in (self.faces, self.inner_lip_pairs) if part is not None)]
+        if any(part.numel() and not 0 <= int(part.min()) <= int(part.max()) < points[0] for part in indices):
+            return f"indices beyond {points[0] - 1}"
+        if not self.space.is_vertices and points[0] != len(self.space.channels):
+            return f"{points[0]} values for {len(self.space.channels)} channels"
+        deltas = {} if self.rig is None else self.rig.deltas
+        shape = (len(self.space.face), self.scored.n_vertices, 3)
+        return next((f"shapes of {quoted(name)} of another rig" for name, d in deltas.items() if d.shape != shape), "")

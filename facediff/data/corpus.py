@@ -413,15 +413,7 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
         if not size or size % 3:
             raise FaceDiffError(f"{path}: expected a dict from identity to (V, 3) array, as every corpus has it")
         n_vertices = size // 3
-    templates = {}
-    for name, value in loaded.items():
-        if not (isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST):
-            raise FaceDiffError(f"{path}: has a template of {quoted(name)}; expected the names of identities")
-        try:
-            templates[name] = torch.from_numpy(as_template(value, n_vertices))
-        except ValueError as error:
-            raise FaceDiffError(f"{path}: the template of {name} {error}") from error
-    return templates
+    return {name: torch.from_numpy(as_template(path, name, value, n_vertices)) for name, value in loaded.items()}
 
 
 def load_template_dict(path: Path) -> dict[Any, Any]:
@@ -432,25 +424,24 @@ def load_template_dict(path: Path) -> dict[Any, Any]:
     return loaded
 
 
-def as_template(value: object, n_vertices: int, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
+def as_template(
+    path: object, name: object, value: object, n_vertices: int, dtype: npt.DTypeLike = np.float32
+) -> npt.NDArray[Any]:
     """One entry of ``templates.pkl`` as a neutral face (V, 3)."""
     try:
         entry = np.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:  # lists of unequal length
-        raise ValueError(f"is no array of numbers; expected ({n_vertices}, 3)") from error
-    if entry.dtype.kind != "f":
-        # Anything else would lose something: an imaginary part, or what comes after the point.
-        raise ValueError(f"is no array of floating-point numbers but of {entry.dtype}; expected ({n_vertices}, 3)")
-    if entry.shape not in ((3 * n_vertices,), (n_vertices, 3)):
-        raise ValueError(f"has shape {entry.shape}, expected ({n_vertices}, 3)")
+    except (TypeError, ValueError, OverflowError):  # lists of unequal length
+        entry = np.array(None)
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-        array = np.array(entry.reshape(n_vertices, 3), dtype)
-    bad = np.count_nonzero(~(np.abs(array) <= COORDINATE).all(axis=1))
-    if bad:
-        raise ValueError(
-            f"holds NaN, infinity or a coordinate beyond {COORDINATE:g} in {bad} {'vertex' if bad == 1 else 'vertices'}"
+        array = np.array(entry, dtype) if entry.dtype.kind == "f" else np.empty(0, dtype)
+    bad = np.count_nonzero(~(np.abs(array) <= COORDINATE))
+    named = isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST
+    if not named or array.shape not in ((3 * n_vertices,), (n_vertices, 3)) or bad:
+        raise FaceDiffError(
+            f"{path}: the template of {quoted(name)} is {entry.dtype} {entry.shape} with {bad} coordinates that are "
+            f"NaN or beyond {COORDINATE:g}; expected finite floating-point numbers, ({n_vertices}, 3)"
         )
-    return array
+    return array.reshape(n_vertices, 3)
 
 
 def read_clip_table(root: Path) -> dict[str, dict[str, str]]:

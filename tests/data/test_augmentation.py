@@ -141,14 +141,6 @@ def test_speed_changes_speech_and_motion_together() -> None:
     assert len(lengths) > 5
 
 
-@pytest.mark.parametrize(
-    ("words", "named"), [("vioce", "voice"), ("voice:semitone=2", "semitones"), ("room:share=2", "share")]
-)
-def test_wrong_words_are_named(words: str, named: str) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        Puppet(augmentations=[words])
-
-
 def test_training_hears_changed_speech_and_tests_do_not(puppet_of_two: str) -> None:
     plain, data = (Puppet(root=puppet_of_two, augmentations=each) for each in (None, ["tilt:share=1", "noise:share=1"]))
     ours, theirs = (each.dataset("train", training=True)[0] for each in (data, plain))

@@ -87,12 +87,12 @@ def test_assets_of_channels_survive_a_checkpoint_and_refuse_what_does_not_fit(tm
     rig = state["rig"]
     wrong = [
         {"space": CHANNELS.state() | {"channels": ["a"], "rotations": []}},
-        {"space": []},
         {"rig": {**rig, "deltas": {"A": torch.zeros(2, 24, 3)}}},
-        {"rig": {**rig, "deltas": {"nobody": torch.zeros(3, 24, 3)}}},
         {"rig": {**rig, "mesh": state}},
-        {"rig": {"mesh": rig["mesh"]}},
-        {"rig": 3},
+        {"identities": ["../A"]},
+        {"frame_rate": 0.0},
+        {"templates": {"A": torch.full((6, 1), torch.nan)}},
+        {"regions": {"lips": torch.tensor([6])}},
     ]
     for change in wrong:
         with pytest.raises(FaceDiffError):

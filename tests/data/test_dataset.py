@@ -117,16 +117,6 @@ def broken(tmp_path: Path) -> Path:
     return write_tiny(tmp_path / "broken")
 
 
-def test_an_empty_folder(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"no clip found; expected wav/<clip>\.wav"):
-        Tiny(root=str(tmp_path)).clips("train")
-
-
-def test_a_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="nowhere: no such folder"):
-        Tiny(root=str(tmp_path / "nowhere")).clips("train")
-
-
 def test_nan_names_the_file_and_the_frame(broken: Path) -> None:
     path = broken / "vertices_npy" / "A_e01.npy"
     array = np.load(path)
@@ -144,12 +134,6 @@ def test_wrong_vertex_count_and_truncated_file(broken: Path) -> None:
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(FaceDiffError, match=r"A_e01\.npy: not a readable NumPy array"):
         Tiny(root=str(broken)).dataset("train")[0]
-
-
-def test_a_region_index_out_of_range_names_the_file(broken: Path) -> None:
-    (broken / "regions" / "lve.txt").write_text("1, 2, 24")
-    with pytest.raises(FaceDiffError, match=r"lve\.txt.*24"):
-        Tiny(root=str(broken)).assets()
 
 
 def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:

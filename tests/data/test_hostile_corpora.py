@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from facediff.data.corpus import Corpus, read_clip_table, read_templates
-from facediff.data.prepare.biwi import read_vl
 from facediff.data.prepare.motion import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import quoted
@@ -45,7 +43,7 @@ FACE = np.random.default_rng(0).normal(size=(9, 3))
 )
 def test_template_that_is_no_face_is_refused(value: Any, tmp_path: Path) -> None:  # noqa: ANN401
     (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": FACE, "B": value}))
-    with pytest.raises(FaceDiffError, match=r"templates\.pkl.* B ") as refused:
+    with pytest.raises(FaceDiffError, match=r"templates\.pkl.*'B'") as refused:
         read_templates(tmp_path / "templates.pkl", 9)
     assert "\n" not in str(refused.value)
 
@@ -54,14 +52,6 @@ def test_template_that_is_no_face_is_refused(value: Any, tmp_path: Path) -> None
 def test_template_of_floating_point_numbers_is_read(value: Any, tmp_path: Path) -> None:  # noqa: ANN401
     (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": value}))
     np.testing.assert_allclose(read_templates(tmp_path / "templates.pkl")["A"], FACE, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", [1, b"A", None, "", "a\nb", "\x1b[31m", "x" * 999, ("A",), 10**5000], ids=quoted)
-def test_template_of_a_name_that_is_no_name_is_refused(name: object, tmp_path: Path) -> None:
-    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({name: FACE}))
-    with pytest.raises(FaceDiffError, match=r"templates\.pkl") as refused:
-        read_templates(tmp_path / "templates.pkl", 9)
-    assert str(refused.value).isprintable()
 
 
 @pytest.mark.parametrize(
@@ -105,13 +95,7 @@ def corpus(root: Path, clip: str = "A_01") -> Corpus:
     return Corpus(root, 9, 25.0)
 
 
-def test_frame_of_biwi_that_is_a_device_is_refused(tmp_path: Path) -> None:
-    os.symlink("/dev/zero", tmp_path / "frame_001.vl")
-    with pytest.raises(FaceDiffError, match=r"frame_001\.vl"):
-        read_vl(tmp_path / "frame_001.vl")
-
-
-def test_parameters_that_lie_in_another_file_or_declare_gigabytes_are_refused(tmp_path: Path) -> None:
+def test_parameters_that_lie_in_another_file_are_refused(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     widths = {"shape": 300, "exp": 100, "jaw": 3}
     with h5py.File(tmp_path / "other.h5", "w") as other:
@@ -124,13 +108,10 @@ def test_parameters_that_lie_in_another_file_or_declare_gigabytes_are_refused(tm
         for name in widths:
             file[f"far_{name}"] = h5py.ExternalLink("other.h5", f"/data/{name}")
             file[name] = h5py.SoftLink(f"/far_{name}")
-    with h5py.File(tmp_path / "huge.h5", "w") as file:
-        for name in widths:
-            file.create_dataset(name, (1, 900_000, 900_000), "f8", chunks=(1, 64, 64), compression="gzip")
     with h5py.File(tmp_path / "complex.h5", "w") as file:
         for name, width in widths.items():
             file[name] = np.zeros((1, 5, width), complex)
-    for name in ("group", "soft", "huge", "complex"):
+    for name in ("group", "soft", "complex"):
         with pytest.raises(FaceDiffError, match=rf"{name}\.h5"):
             read_parameters(tmp_path / f"{name}.h5")
 

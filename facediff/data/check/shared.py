@@ -102,12 +102,9 @@ def check_templates(root: Path, view: CorpusView, findings: Findings) -> tuple[d
         loaded = load_template_dict(path)
         section["file"] = path.name
         for subject, value in loaded.items():
-            try:
-                templates[str(subject)] = as_template(value, view.n_vertices)
-            except ValueError as error:
-                section["broken"].append(str(subject))
-                where = f"templates.pkl:{subject}"
-                findings.error("template_broken", where, f"{error}; get templates.pkl again")
+            with findings.guard("template_broken", path, root):
+                templates[str(subject)] = as_template(path, subject, value, view.n_vertices)
+        section["broken"] = sorted({str(subject) for subject in loaded} - templates.keys())
         section["subjects"] = sorted(templates)
         content = path.read_bytes()
         # Git's name for the file's content, by which a file in a repository can be found.

@@ -80,7 +80,10 @@ def plan(
     vertices, templates_file = _need(raw, VERTICES), _need(raw, TEMPLATES)
     row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
     n_vertices = open_vertices(vertices).shape[1]
-    templates = _read_templates(templates_file, n_vertices)
+    templates: dict[str, Array] = {
+        str(name): as_template(templates_file, name, face, n_vertices, np.float64)
+        for name, face in load_template_dict(templates_file).items()
+    }
     extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
     region_files = find_regions(raw, regions)
     missing = _missing_extras([*extras, *region_files])
@@ -173,27 +176,20 @@ def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], fl
 
     Whole numbers of any type, and floats beyond -1 … 1, are 16-bit samples.
     """
-    if not isinstance(entry, dict) or not {"audio", "sample_rate"} <= set(entry):
-        raise FaceDiffError(f'{where}: expected a dict with "audio" and "sample_rate" in {AUDIO}')
     try:
-        rate, samples = float(entry["sample_rate"]), np.squeeze(np.asarray(entry["audio"]))
-    except (TypeError, ValueError) as error:
+        rate, samples = float(entry["sample_rate"]), np.squeeze(np.asarray(entry["audio"]))  # type: ignore[index]
+        peak = float(np.abs(samples.astype(np.float64)).max())
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise FaceDiffError(f"{where}: its sound in {AUDIO} is no array of numbers with a rate ({error})") from error
-    if not SAMPLE_RATES[0] <= rate <= SAMPLE_RATES[1]:
-        raise FaceDiffError(
-            f"{where}: sample rate {rate:g} in {AUDIO}; expected {SAMPLE_RATES[0]} to {SAMPLE_RATES[1]}"
-        )
     channels = min(samples.shape) if samples.ndim == 2 else 1
-    if samples.ndim not in (1, 2) or channels > 2 or samples.size == 0 or samples.dtype.kind not in "if":
+    signed = samples.ndim in (1, 2) and channels <= 2 and samples.dtype.kind in "if" and peak <= FULL_SCALE
+    if not signed or not SAMPLE_RATES[0] <= rate <= SAMPLE_RATES[1]:
         raise FaceDiffError(
-            f"{where}: its sound in {AUDIO} has shape {samples.shape} and type {samples.dtype}; expected one row of "
-            f"signed samples, or two"
+            f"{where}: its sound in {AUDIO} is {samples.dtype} {samples.shape} up to {peak:g} at {rate:g} Hz; expected "
+            f"one row of signed 16-bit samples, or two, at {SAMPLE_RATES[0]} to {SAMPLE_RATES[1]} Hz"
         )
     if samples.ndim == 2 and samples.shape[0] < samples.shape[1]:
         samples = samples.T
-    peak = float(np.abs(samples.astype(np.float64)).max())
-    if peak > FULL_SCALE:
-        raise FaceDiffError(f"{where}: a sample of its sound in {AUDIO} is {peak:g}; expected 16-bit samples")
     full = 1.0 if samples.dtype.kind == "f" and not peak > 1.0 else FULL_SCALE
     return (samples / full).astype(np.float32), rate
 
@@ -216,25 +212,13 @@ def _nested(path: Path) -> dict[str, dict[str, Any]]:
     return {str(subject): {str(key): value for key, value in inner.items()} for subject, inner in loaded.items()}
 
 
-def _read_templates(path: Path, n_vertices: int) -> dict[str, Array]:
-    templates = {}
-    for subject, value in load_template_dict(path).items():
-        try:
-            templates[str(subject)] = as_template(value, n_vertices, np.float64)
-        except ValueError as error:
-            raise FaceDiffError(f"{path}: the template of {subject} {error}; get the file again") from error
-    return templates
-
-
 def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
     """Rows of a clip in the order of its frames."""
     try:
         # An index that has been a float would be rounded silently.
         pairs = sorted((index(frame), index(row)) for frame, row in dict(frames).items())  # type: ignore[call-overload]
     except (TypeError, ValueError) as error:
-        raise FaceDiffError(
-            f"{ROWS}: {name}: expected a dict from frame to row ({error}); get the file again"
-        ) from error
+        raise FaceDiffError(f"{ROWS}: {name}: expected a dict from frame to row ({error})") from error
     if pairs and pairs[-1][0] != len(pairs) - 1:
         notes.append(f"{name}: {ROWS} leaves out some of the frames up to {pairs[-1][0]}; it is written without them")
     return np.array([row for _, row in pairs], np.int64)

@@ -515,10 +515,9 @@ def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets,
             "take it"
         )
     if isinstance(templates, Mapping):
-        try:
-            faces = {str(name): torch.from_numpy(as_template(value, count)) for name, value in templates.items()}
-        except ValueError as error:
-            raise FaceDiffError(f"templates: a face {error}; expected ({count}, 3) or ({3 * count},)") from error
+        faces = {
+            name: torch.from_numpy(as_template("templates", name, value, count)) for name, value in templates.items()
+        }
     else:
         faces = read_templates(Path(templates), count)
     if not faces:

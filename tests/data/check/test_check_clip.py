@@ -136,19 +136,19 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         "NaN in a template",
         lambda r: change_templates(r, lambda t: t["A"].__setitem__((3, 1), np.nan)),
         {"template_broken"},
-        "in 1 vertex",
+        "1 coordinates",
     ),
     (
         "template of another topology",
         lambda r: change_templates(r, lambda t: t.update(A=t["A"][:20])),
         {"template_broken"},
-        "shape (20, 3), expected (24, 3)",
+        "(20, 3)",
     ),
     (
         "template of words",
         lambda r: change_templates(r, lambda t: t.update(A="face")),
         {"template_broken"},
-        "no array of floating-point numbers",
+        "expected finite floating-point numbers",
     ),
     ("mesh of text", lambda r: (r / "tiny.ply").write_text("ply\n"), {"mesh_broken"}, "not a readable PLY mesh"),
     (

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.app import main, run
+from facediff.cli.app import run
 from facediff.data.corpus import Corpus, read_manifest
 from facediff.errors import FaceDiffError
 from facediff.utils.pickles import load_pickle
@@ -270,14 +270,6 @@ def test_what_is_printed(files: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "sound is 0.50 s shorter" in text
     assert lines[-1].startswith("warning: the motion lasts 8.00 s (240 frames at 30/s) and the sound 7.50 s")
     assert len(imported(out)) == 225
-
-
-def test_the_command_line_leads_here(brief: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = words(brief, "motion.npy", tmp_path / "out")
-    assert main(["data", "import-person", *arguments]) == 0
-    assert main(["data", "import-person", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error == f"facediff: error: {tmp_path / 'out'}: is not empty; choose a new folder, or remove this one\n"
 
 
 def nothing_left(folder: Path) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_recordings, find_sounds
 from facediff.data.prepare.motion import read_parameters
 from facediff.data.prepare.runner import PreparationReport, prepare
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import Flame
 from facediff.speech.audio import read_speech
@@ -369,13 +368,6 @@ def test_wrong_parameters_cost_one_clip_and_say_why(
         raise FaceDiffError(said)
 
 
-def test_a_truncated_file_costs_one_clip(raw: Path, flame: Path) -> None:
-    content = hdf5(raw).read_bytes()
-    hdf5(raw).write_bytes(content[: len(content) // 2])
-    said = problem(raw, flame)
-    assert said.startswith(f"{hdf5(raw)}: not a readable HDF5 file, perhaps truncated")
-
-
 def test_a_file_that_points_to_other_files_is_refused(raw: Path, tmp_path: Path) -> None:
     import h5py
 
@@ -398,63 +390,6 @@ def test_a_file_that_points_to_other_files_is_refused(raw: Path, tmp_path: Path)
         file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
     with pytest.raises(FaceDiffError, match="expected at most 1000000 frames"):
         read_parameters(hdf5(raw))
-
-
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [
-        (
-            np.zeros((1, 9, 400), np.float32),
-            r"holds float32 \(1, 9, 400\); expected floats of shape \(1, frames, 403\)",
-        ),
-        (np.zeros((2, 9, 403), np.float32), r"has shape \(2, 9, 403\); expected \(1, frames, "),
-        (np.zeros((1, 0, 403), np.float32), r"holds no numbers"),
-        (np.zeros((1, 9, 403), np.int64), r"holds int64"),
-        (np.full((1, 9, 403), np.inf, np.float32), r"frame 0 \(counted from 0\) of shape holds NaN or infinity"),
-    ],
-)
-def test_wrong_arrays_of_probtalk3d(array: np.ndarray, message: str, tmp_path: Path) -> None:
-    np.save(tmp_path / "clip.npy", array)
-    with pytest.raises(FaceDiffError, match=rf"clip\.npy: .*{message}"):
-        read_parameters(tmp_path / "clip.npy")
-
-
-def test_files_that_are_no_parameters(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"clip\.npy: no such file; expected FLAME parameters"):
-        read_parameters(tmp_path / "clip.npy")
-    np.save(tmp_path / "clip.npy", np.array([{}], object))
-    with pytest.raises(FaceDiffError, match=r"clip\.npy: not a readable NumPy array"):
-        read_parameters(tmp_path / "clip.npy")
-    np.savez(tmp_path / "clip.npz", a=np.zeros(3))
-    (tmp_path / "clip.npz").replace(tmp_path / "clip.npy")
-    with pytest.raises(FaceDiffError, match=r"clip\.npy: is an archive"):
-        read_parameters(tmp_path / "clip.npy")
-
-
-def test_without_h5py_the_extra_is_named(raw: Path, flame: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(MissingExtraError, match=r'"h5py".*facediff\[prepare\]'):
-        mead3d.plan(raw, flame=flame)
-
-
-def test_unusable_sound_costs_one_clip(raw: Path, flame: Path) -> None:
-    next((raw / "MEAD").rglob("001.wav")).write_bytes(b"RIFF")
-    assert "001.wav: not a readable sound file" in problem(raw, flame)
-
-
-def test_folders_without_the_data_set_are_refused(tmp_path: Path, flame: Path, raw: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"nowhere: no such folder"):
-        mead3d.plan(tmp_path / "nowhere", flame=flame)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(FaceDiffError, match=r"empty: holds no reconstructions of MEAD; expected <speaker>/front/"):
-        mead3d.plan(tmp_path / "empty", flame=flame)
-    with pytest.raises(FaceDiffError, match=r"generic_model\.pkl: no such file"):
-        mead3d.plan(raw, flame=tmp_path / "generic_model.pkl")
-    with pytest.raises(FaceDiffError, match=r"nowhere: no such folder"):
-        mead3d.plan(raw, flame=flame, audio=tmp_path / "nowhere")
-    shutil.copytree(raw / "EMICA-MEAD_flame2020", raw / "EMICA_mead_mp_lr_mse_15")
-    with pytest.raises(FaceDiffError, match="holds reconstructions in .*EMICA-MEAD_flame2020 and in .*; give one of"):
-        find_recordings(raw)
 
 
 @pytest.mark.parametrize("depth", ["", "EMICA-MEAD_flame2020"])

@@ -21,12 +21,9 @@ from tests.fakes.vocaset import (
     RATE,
     TRAIN,
     VERTICES,
-    flame_masks,
     frames_of,
     motion_of,
-    python2_pickle,
     speech_of,
-    template_of,
     write_raw_vocaset,
 )
 
@@ -149,31 +146,20 @@ def test_sound_of_any_type_means_the_same(audio: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "sentence"),
+    "entry",
     [
-        (np.ones(9, np.int16), 'expected a dict with "audio" and "sample_rate"'),
-        ({"audio": RAMP}, 'expected a dict with "audio" and "sample_rate"'),
-        ({"audio": RAMP, "sample_rate": 0}, "sample rate 0"),
-        ({"audio": RAMP, "sample_rate": "fast"}, "no array of numbers with a rate"),
-        ({"audio": np.zeros(0, np.int16), "sample_rate": RATE}, "has shape (0,)"),
-        ({"audio": RAMP.astype(np.uint8), "sample_rate": RATE}, "type uint8"),
-        ({"audio": np.ones((9, 9)), "sample_rate": RATE}, "has shape (9, 9)"),
-        (
-            {"audio": np.array([1, 100_000]), "sample_rate": RATE},
-            "a sample of its sound in raw_audio_fixed.pkl is 100000",
-        ),
+        np.ones(9, np.int16),
+        {"audio": RAMP},
+        {"audio": RAMP, "sample_rate": 0},
+        {"audio": np.zeros(0, np.int16), "sample_rate": RATE},
+        {"audio": RAMP.astype(np.uint8), "sample_rate": RATE},
+        {"audio": np.array([1, 100_000]), "sample_rate": RATE},
+        {"audio": np.array([0.1, np.nan] * 5000), "sample_rate": RATE},
     ],
 )
-def test_sound_of_another_form_is_refused(raw: Path, entry: object, sentence: str) -> None:
+def test_sound_of_another_form_is_refused(raw: Path, entry: object) -> None:
     change(raw / "raw_audio_fixed.pkl", "", entry)
-    said = problem(raw)
-    assert f"{TRAIN} sentence01" in said
-    assert sentence in said
-
-
-def test_sound_that_is_not_finite(raw: Path) -> None:
-    change(raw / "raw_audio_fixed.pkl", "audio", np.array([0.1, np.nan] * 5000))
-    assert "not finite" in problem(raw)
+    assert f"{TRAIN} sentence01: its sound in raw_audio_fixed.pkl" in problem(raw)
 
 
 @pytest.mark.parametrize("row", [25, -1])
@@ -247,19 +233,6 @@ def test_a_file_that_is_missing_or_truncated_is_named(raw: Path, file: str) -> N
         prepared(raw)
 
 
-@pytest.mark.parametrize("content", [[1], {TRAIN: 3}])
-def test_pickles_of_another_shape(raw: Path, content: object) -> None:
-    (raw / "subj_seq_to_idx.pkl").write_bytes(pickle.dumps(content))
-    with pytest.raises(FaceDiffError, match=r"subj_seq_to_idx\.pkl: expected a dict from subject"):
-        prepared(raw)
-
-
-def test_mixed_vertex_counts(raw: Path) -> None:
-    change(raw / "templates.pkl", "", template_of(TRAIN)[:-8])
-    with pytest.raises(FaceDiffError, match=rf"templates\.pkl: the template of {TRAIN} has shape \(72, 3\)"):
-        prepared(raw)
-
-
 def test_names_from_pickles_cannot_leave_the_folder(raw: Path) -> None:
     for name in ("subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"):
         content = load_pickle(raw / name)
@@ -288,15 +261,3 @@ def test_the_command_line(raw: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "1 clip, 25 frames" in capsys.readouterr().out
     with pytest.raises(FaceDiffError, match="--frame-rate was 60 and is 30"):
         run("data prepare", ["vocaset", str(raw), str(out), "--workers", "1"])
-
-
-def test_the_fake_pickles_are_python_2s(raw: Path) -> None:
-    data = (raw / "raw_audio_fixed.pkl").read_bytes()
-    assert data.startswith(b"\x80\x02}")
-    assert b"cnumpy.core.multiarray\n_reconstruct" in data
-    assert b"_codecs" not in data
-    with pytest.raises(UnicodeDecodeError):
-        pickle.loads(data)  # noqa: S301 - as it is with the real file: an encoding must be given
-    masks = pickle.loads(python2_pickle(flame_masks()), encoding="latin1")  # noqa: S301 - just written here
-    assert masks["lips"].dtype == np.int64
-    assert len(masks["lips"]) > len(set(masks["lips"]))
