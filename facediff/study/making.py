@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -128,7 +128,6 @@ class StudyPlan:
         notes: what was left out, and why.
     """
 
-    material: StudyAnimations
     options: StudyOptions
     study: Study
     clips: Mapping[str, StudyClip]
@@ -160,9 +159,6 @@ class StudyPlan:
             workers: videos at a time; as many as processors, or workers of a cluster, if None.
             scheduler: where they are drawn; see :func:`facediff.utils.jobs.run_tasks`.
             progress: whether a progress bar is shown.
-
-        Raises:
-            FaceDiffError: if the folder holds anything else or a study with answers, or a video cannot be drawn.
         """
         check_output(output, self.study)
         folder = output / PAGE_FOLDER / VIDEO_FOLDER
@@ -228,12 +224,7 @@ def plan_study(
     options: StudyOptions | None = None,
     *,
     truth: Path | None = None,
-    references: Path | None = None,
-    identity: str = "own",
-    speech: Path | None = None,
-    mesh: Path | None = None,
-    frame_rate: float | None = None,
-    unit: str | None = None,
+    **sources: Any,  # noqa: ANN401 - passed on
 ) -> StudyPlan:
     """Choose clips, trials and schedules, after reading and checking every file that is shown.
 
@@ -241,28 +232,15 @@ def plan_study(
         methods: each method's folder; the first is compared with the others and with the truth.
         options: how the study is made.
         truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
-        references: folder of animations of the same speakers, shown with questions of style.
-        identity: whose style the predictions were given: ``own``, or an identity's name.
-        speech: folder of recordings; the corpus's, or those that the animations hold, if None.
-        mesh: what bare arrays lack: a file with the triangles.
-        frame_rate: frames a second of bare arrays.
-        unit: unit of length of bare arrays.
+        sources: what else :class:`StudyAnimations` takes: ``references``, ``identity``, ``speech``, ``mesh``,
+            ``frame_rate`` and ``unit``.
     """
     options = options or StudyOptions()
     if len(methods) + (truth is not None) < 2:
         raise FaceDiffError("methods: there is nothing to compare; give the folders of two methods, or one and --truth")
     languages = check_languages(options.languages)
     questionnaire = Questionnaire(options.questions, languages)
-    material = StudyAnimations(
-        methods,
-        truth,
-        references=references,
-        identity=identity,
-        speech=speech,
-        mesh=mesh,
-        frame_rate=frame_rate,
-        unit=unit,
-    )
+    material = StudyAnimations(methods, truth, **sources)
     notes = [
         f"{name}: {counted(len(left), 'clip')} that others lack, left out: "
         f"{', '.join(left[:3])}{' …' if len(left) > 3 else ''}"
@@ -270,29 +248,17 @@ def plan_study(
         if left and name != TRUTH
     ]
     names = choose_clips(material, options)
-    clips = {name: material.open(name) for name in names}
-    questions = questionnaire.questions
-    if any(question.reference for question in questions):
-        rng = np.random.default_rng([options.seed, 2])
-        references_by_clip = {name: material.reference(name, names, rng) for name in names}
-        without = [name for name, reference in references_by_clip.items() if reference is None]
-        if without and questionnaire.chosen:
-            raise FaceDiffError(
-                f"{without[0]}: has no reference, another clip of the same speaker, which a question needs; give them "
-                f"with --style-references or --truth, or ask no question with reference: true"
-            )
-        if without:
-            notes.append(f"style is not asked about: {without[0]} has no reference, another clip of the same speaker")
-            questions = [question for question in questions if not question.reference]
-        else:
-            clips = {name: replace(clip, reference=references_by_clip[name]) for name, clip in clips.items()}
+    references = choose_references(material, names, questionnaire, options.seed)
+    clips = {name: replace(material.open(name), reference=references.get(name)) for name in names}
+    questions = [question for question in questionnaire.questions if references or not question.reference]
+    if len(questions) < len(questionnaire.questions):
+        notes.append("style is not asked about: a clip has no reference, another clip of the same speaker")
     still = options.still if truth is not None else 0
     if options.still and not still:
         notes.append("there are no controls against a still face, since no truth is given")
-    conditions = [*material.methods, *([TRUTH] if truth is not None else [])]
     forms = make_forms(
         names,
-        make_pairs(conditions, options.pairs),
+        make_pairs([*methods, *([TRUTH] if truth is not None else [])], options.pairs),
         design=options.design,
         still=still,
         same=options.same,
@@ -300,28 +266,44 @@ def plan_study(
         seed=options.seed,
     )
     showings, schedules = make_schedules(forms, options.seed)
-    videos: dict[str, VideoTask] = {}
-    trials = _trials(material, clips, showings, options, videos)
+    videos = Videos(material, options)
     study = Study(
         title=questionnaire.title,
         consent=questionnaire.consent,
         languages=tuple(languages),
-        methods=tuple(material.methods),
+        methods=tuple(methods),
         questions=tuple(questions),
         rule=questionnaire.rule,
-        trials=tuple(trials),
+        trials=tuple(videos.trial(showing, clips[showing.clip]) for showing in showings),
         schedules=tuple(map(tuple, schedules)),
         seed=options.seed,
         remark=material.remark,
         details={
-            "options": {name: _plain(value) for name, value in asdict(options).items()},
+            "options": {name: str(v) if isinstance(v, Path) else v for name, v in asdict(options).items()},
             "folders": {name: str(folder) for name, folder in methods.items()},
             "truth": None if truth is None else str(truth),
             "references": {name: clip.reference for name, clip in clips.items()},
         },
         version=__version__,
     )
-    return StudyPlan(material, options, study, clips, tuple(notes), videos)
+    return StudyPlan(options, study, clips, tuple(notes), videos.tasks)
+
+
+def choose_references(
+    material: StudyAnimations, names: Sequence[str], questionnaire: Questionnaire, seed: int
+) -> dict[str, str]:
+    """A reference for each clip; empty if no question needs one, or if one is missing and style need not be asked."""
+    if not any(question.reference for question in questionnaire.questions):
+        return {}
+    rng = np.random.default_rng([seed, 2])
+    references = {name: material.reference(name, names, rng) for name in names}
+    without = next((name for name, reference in references.items() if reference is None), None)
+    if without is not None and questionnaire.chosen:
+        raise FaceDiffError(
+            f"{without}: has no reference, another clip of the same speaker, which a question needs; give them "
+            f"with --style-references or --truth, or ask no question with reference: true"
+        )
+    return {} if without is not None else {name: str(reference) for name, reference in references.items()}
 
 
 def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
@@ -341,96 +323,69 @@ def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
     return sorted(turns[: options.max_clips])
 
 
-def _trials(
-    material: StudyAnimations,
-    clips: Mapping[str, StudyClip],
-    showings: Sequence[Showing],
-    options: StudyOptions,
-    videos: dict[str, VideoTask],
-) -> list[Trial]:
-    """The trials; their videos are added to ``videos``, by name."""
-    digests: dict[Path, str] = {}
-    references: dict[str, str] = {}
-    trials = []
-    for showing in showings:
-        clip = clips[showing.clip]
-        task = _pair_task(material, clip, showing, options, digests)
-        name = _video_name(task, options)
-        videos.setdefault(name, task)
-        reference = None
-        if clip.reference is not None:
-            if clip.reference not in references:
-                shown = _reference_task(material, clip.reference, options, digests)
-                references[clip.reference] = _video_name(shown, options)
-                videos.setdefault(references[clip.reference], shown)
-            reference = references[clip.reference]
-        trial = hashlib.sha256(f"{options.seed}/{showing}/{name}".encode()).hexdigest()[:16]
-        trials.append(Trial(trial, showing.kind, showing.clip, showing.left, showing.right, name, reference))
-    return trials
+class Videos:
+    """The videos of a study, each once; names say nothing about what is shown, and change with it.
 
+    Attributes:
+        tasks: by name.
+    """
 
-def _pair_task(
-    material: StudyAnimations, clip: StudyClip, showing: Showing, options: StudyOptions, digests: dict[Path, str]
-) -> VideoTask:
-    panels = tuple((clip.motion(condition), condition == STILL) for condition in (showing.left, showing.right))
-    camera = Camera.framing(list(clip.templates), view=options.view)
-    return _task(panels, camera, clip.colours, clip.sound, clip.frames, material.remark, options, digests)
+    def __init__(self, material: StudyAnimations, options: StudyOptions) -> None:
+        self.material, self.options = material, options
+        self.tasks: dict[str, VideoTask] = {}
+        self._digest = cache(sha256)
 
+    def trial(self, showing: Showing, clip: StudyClip) -> Trial:
+        """A trial of a clip, with its video and that of its reference."""
+        panels = tuple((clip.motion(condition), condition == STILL) for condition in (showing.left, showing.right))
+        camera = Camera.framing(list(clip.templates), view=self.options.view)
+        name = self._add(panels, camera, clip.colours, clip.sound, clip.frames)
+        reference = None if clip.reference is None else self._reference(clip.reference)
+        trial = hashlib.sha256(f"{self.options.seed}/{showing}/{name}".encode()).hexdigest()[:16]
+        return Trial(trial, showing.kind, showing.clip, showing.left, showing.right, name, reference)
 
-def _reference_task(material: StudyAnimations, name: str, options: StudyOptions, digests: dict[Path, str]) -> VideoTask:
-    motion = material.references[name]
-    animation = motion.read()
-    sound = material.sound_of(name, motion)
-    if sound is not None and sound == motion.path and animation.speech is None:
-        sound = None
-    camera = Camera.framing([animation.template], view=options.view)
-    frames = len(animation.vertices)
-    return _task(((motion, False),), camera, animation.colours, sound, frames, material.remark, options, digests)
+    def _reference(self, clip: str) -> str:
+        motion = self.material.references[clip]
+        animation = motion.read()
+        sound = self.material.sound_of(clip, motion)
+        if sound == motion.path and animation.speech is None:
+            sound = None
+        camera = Camera.framing([animation.template], view=self.options.view)
+        return self._add(((motion, False),), camera, animation.colours, sound, len(animation.vertices))
 
-
-def _task(
-    panels: tuple[tuple[MotionFile, bool], ...],
-    camera: Camera,
-    colours: npt.NDArray[np.uint8] | None,
-    sound: Path | None,
-    frames: int,
-    remark: str,
-    options: StudyOptions,
-    digests: dict[Path, str],
-) -> VideoTask:
-    """A task without its output, whose name follows from the recipe."""
-    files = [path for path in (*(motion.path for motion, _ in panels), sound) if path is not None]
-    for path in files:
-        digests.setdefault(path, sha256(path))
-    facts = {
-        "panels": [[motion.digest(), still, digests[motion.path]] for motion, still in panels],
-        "camera": asdict(camera),
-        "colours": None if colours is None else hashlib.sha256(colours.tobytes()).hexdigest(),
-        "sound": None if sound is None else digests[sound],
-        "frames": frames,
-        "size": options.size,
-        "remark": remark,
-    }
-    recipe = Recipe((json.dumps(facts, sort_keys=True),), {str(path): digests[path] for path in files})
-    return VideoTask(
-        source=panels[0][0].path,
-        output=Path(),
-        recipe=recipe,
-        panels=panels,
-        camera=camera,
-        colours=colours,
-        sound=sound,
-        frames=frames,
-        size=options.size,
-        remark=remark,
-    )
-
-
-def _video_name(task: VideoTask, options: StudyOptions) -> str:
-    """A name that says nothing about what is shown, and changes with it."""
-    digest = hashlib.sha256(f"{options.seed}/{task.recipe.command[0]}".encode()).hexdigest()
-    return f"{digest[:16]}.{options.video}"
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    return str(value) if isinstance(value, Path) else value
+    def _add(
+        self,
+        panels: tuple[tuple[MotionFile, bool], ...],
+        camera: Camera,
+        colours: npt.NDArray[np.uint8] | None,
+        sound: Path | None,
+        frames: int,
+    ) -> str:
+        """A task without its output, whose name follows from the recipe."""
+        files = {path: self._digest(path) for path in (*(motion.path for motion, _ in panels), sound) if path}
+        facts = {
+            "panels": [[motion.digest(), still, files[motion.path]] for motion, still in panels],
+            "camera": asdict(camera),
+            "colours": None if colours is None else hashlib.sha256(colours.tobytes()).hexdigest(),
+            "sound": None if sound is None else files[sound],
+            "frames": frames,
+            "size": self.options.size,
+            "remark": self.material.remark,
+        }
+        text = json.dumps(facts, sort_keys=True)
+        name = f"{hashlib.sha256(f'{self.options.seed}/{text}'.encode()).hexdigest()[:16]}.{self.options.video}"
+        recipe = Recipe((text,), {str(path): digest for path, digest in files.items()})
+        if name not in self.tasks:
+            self.tasks[name] = VideoTask(
+                source=panels[0][0].path,
+                output=Path(),
+                recipe=recipe,
+                panels=panels,
+                camera=camera,
+                colours=colours,
+                sound=sound,
+                frames=frames,
+                size=self.options.size,
+                remark=self.material.remark,
+            )
+        return name

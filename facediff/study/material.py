@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -137,16 +137,15 @@ class StudyAnimations:
         self.remark = ""
         self._sounds: dict[str, Path] = {} if speech is None else _recordings(speech)
         self._subjects: dict[str, str] = {}
-        self._facts: AnimationFacts = {}
-        if mesh is not None:
-            read = read_mesh(mesh)
-            self._facts = {"template": read.vertices.astype(np.float32), "faces": read.faces}
-            if read.colours is not None:
-                self._facts["colours"] = read.colours
-        if frame_rate is not None:
-            self._facts["frame_rate"] = frame_rate
-        if unit is not None:
-            self._facts["unit"] = unit
+        read = None if mesh is None else read_mesh(mesh)
+        stated = {
+            "template": None if read is None else read.vertices.astype(np.float32),
+            "faces": None if read is None else read.faces,
+            "colours": None if read is None else read.colours,
+            "frame_rate": frame_rate,
+            "unit": unit,
+        }
+        self._facts: AnimationFacts = _known(stated)
         self._templates: dict[str, AnimationFacts] = {}
         self._files: dict[str, dict[str, MotionFile]] = {}
         if truth is not None:
@@ -178,16 +177,14 @@ class StudyAnimations:
             return {clip: MotionFile(path, self._facts) for clip, path in animations.items()}
         corpus = gather({}, truth, mesh=mesh, frame_rate=frame_rate, unit=unit)
         self.remark = corpus.remark
-        facts: dict[str, Any] = {"unit": corpus.unit or "m"}
-        if corpus.frame_rate is not None:
-            facts["frame_rate"] = corpus.rate
-        if corpus.faces is not None:
-            facts["faces"] = corpus.faces
-        if corpus.colours is not None:
-            facts["colours"] = corpus.colours
-        if corpus.rest is not None:
-            facts["template"] = corpus.rest.astype(np.float32)
-        self._facts = {**facts, **self._facts}  # type: ignore[typeddict-item]
+        facts = {
+            "unit": corpus.unit or "m",
+            "frame_rate": None if corpus.frame_rate is None else corpus.rate,
+            "faces": corpus.faces,
+            "colours": corpus.colours,
+            "template": None if corpus.rest is None else corpus.rest.astype(np.float32),
+        }
+        self._facts = {**_known(facts), **self._facts}
         for subject, template in corpus.templates.items():
             self._templates[subject] = {**self._facts, "template": np.asarray(template, np.float32)}
         for clip, found_truth in corpus.truths.items():
@@ -261,6 +258,11 @@ class StudyAnimations:
         return self._sounds.get(clip) or (motion.path if motion.path.suffix == ".npz" else None)
 
 
+def _known(facts: Mapping[str, Any]) -> AnimationFacts:
+    """The facts that are known."""
+    return cast(AnimationFacts, {name: value for name, value in facts.items() if value is not None})
+
+
 def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = OWN) -> dict[str, Path]:
     """The animations of a folder by clip, as ``facediff animate`` and ``facediff predict`` name them.
 
@@ -269,15 +271,12 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
         subjects: known speakers.
         identity: which of several conditions is taken: ``own``, the speaker's own, or an identity's name.
     """
-    if not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; expected the animations of a method")
-    files = sorted(
-        file for file in folder.iterdir() if file.suffix in ANIMATIONS and file.is_file() and file.name[0] != "."
-    )
+    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    files = [file for file in inside if file.suffix in ANIMATIONS and file.is_file() and file.name[0] != "."]
     if not files:
         raise FaceDiffError(
-            f"{folder}: holds no animation; expected .npz files of `facediff animate --suffix .npz`, or .npy files of "
-            f"`facediff predict`"
+            f"{folder}: holds no animation; expected a folder of .npz files of `facediff animate --suffix .npz`, or of "
+            f".npy files of `facediff predict`"
         )
     pattern = NamePattern(DEFAULT_PATTERNS[0], subjects)
     by_clip: dict[str, dict[str | None, Path]] = {}
@@ -311,11 +310,12 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
 
 def _recordings(folder: Path) -> dict[str, Path]:
     """Recordings of a folder by their names without the suffix."""
-    if not folder.is_dir():
-        raise FaceDiffError(f"--speech {folder}: no such folder; expected recordings named like the clips")
-    recordings = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES + CONTAINERS}
+    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    recordings = {file.stem: file for file in inside if file.suffix.lower() in SUFFIXES + CONTAINERS}
     if not recordings:
-        raise FaceDiffError(f"--speech {folder}: holds no recording; expected {', '.join(SUFFIXES)}")
+        raise FaceDiffError(
+            f"--speech {folder}: holds no recording; expected a folder of {', '.join(SUFFIXES)}, named like the clips"
+        )
     return recordings
 
 
