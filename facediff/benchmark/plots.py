@@ -11,6 +11,7 @@ from facediff.benchmark.tables import BenchmarkReport, Table
 from facediff.errors import printable
 from facediff.reporting.documents import Drawing
 from facediff.reporting.drawing import GREY, line_style, listed, plot_svg, point_style
+from facediff.reporting.scores import ScoreTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,14 +81,14 @@ def scatter_plot(table: Table) -> Drawing | None:
     column = main_column(table)
     baseline = table.row(table.baseline)
     base = baseline.scores.get(column)
-    if base is None or base.values is None:
+    if base is None or base.table is None:
         return None
-    own = dict(zip(base.clips, np.nanmean(base.values, 0).tolist(), strict=True))
+    own = means_of(base.table)
     clouds: list[tuple[str, Points]] = []
     for row in table.rows:
         scores = row.scores.get(column)
-        if row.name != table.baseline and not row.reference and scores is not None and scores.values is not None:
-            means = zip(scores.clips, np.nanmean(scores.values, 0).tolist(), strict=True)
+        if row.name != table.baseline and not row.reference and scores is not None and scores.table is not None:
+            means = means_of(scores.table).items()
             clouds.append((printable(row.label), [(own[clip], value) for clip, value in means if clip in own]))
     values = [value for _, points in clouds for point in points for value in point]
     if not values:
@@ -109,6 +110,12 @@ def scatter_plot(table: Table) -> Drawing | None:
         ),
         caption,
     )
+
+
+def means_of(table: ScoreTable) -> dict[str, float]:
+    """The mean over the runs of each sentence."""
+    counts = (table.weights > 0).sum(1)
+    return dict(zip(table.clips, (table.values.sum(1) / counts).tolist(), strict=True))
 
 
 def speed_plot(table: Table) -> Drawing | None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from facediff.reporting.scores import ScoreTable
 from facediff.reporting.statistics import Array, Bootstrap, Interval, holm, sign_flip
 
 
@@ -23,17 +24,12 @@ class RowScores:
 
     Attributes:
         runs: the score of each training run (runs,).
-        values: of each sentence in each run (runs, sentences), NaN where it has none; None if the score is no mean of
-            those of sentences.
-        weights: of each sentence (sentences,): its frames where all frames count alike, else 1.
-        clips: names of the sentences.
+        table: a row a sentence, a column a training run; None if the score is no mean of those of sentences.
         fixed: whether nothing was trained, so that there is no chance between runs.
     """
 
     runs: Array
-    values: Array | None
-    weights: Array
-    clips: tuple[str, ...]
+    table: ScoreTable | None = None
     fixed: bool = False
 
     @property
@@ -46,34 +42,26 @@ class RowScores:
         """Standard deviation between the runs (n − 1); None with a single one."""
         return float(self.runs.std(ddof=1)) if len(self.runs) > 1 else None
 
-    def valued(self) -> list[str]:
-        """Sentences that have a value in some run; all of them if the score is no mean of those of sentences."""
-        if self.values is None:
-            return list(self.clips)
-        return [self.clips[place] for place in np.flatnonzero((~np.isnan(self.values)).any(0))]
-
-    def shares(self, clips: Sequence[str]) -> Array:
-        """What each of some sentences adds to the mean over the runs; their sum is the score over these sentences."""
-        if self.values is None:
-            raise ValueError("the score is no mean of those of sentences")
-        places = [self.clips.index(clip) for clip in clips]
-        values = self.values[:, places]
-        weights = np.where(np.isnan(values), 0.0, self.weights[places])
-        return np.asarray((np.nan_to_num(values) * weights / weights.sum(1, keepdims=True)).mean(0))
+    @property
+    def clips(self) -> tuple[str, ...]:
+        """Names of the sentences."""
+        return () if self.table is None else self.table.clips
 
     def interval(self, bootstrap: Bootstrap) -> Interval | None:
         """Bootstrap interval over sentences of the mean over the runs."""
-        resampled = self._resampled(bootstrap, self.clips)
+        resampled = None if self.table is None else mean_resampled(self.table, bootstrap)
         return None if resampled is None else bootstrap.intervals(resampled[:, None], 1)[0]
 
-    def _resampled(self, bootstrap: Bootstrap, clips: Sequence[str]) -> Array | None:
-        if self.values is None:
-            return None
-        places = [self.clips.index(clip) for clip in clips]
-        values = self.values[:, places].T
-        weights = np.where(np.isnan(values), 0.0, self.weights[places][:, None])
-        scores = bootstrap.scores(np.nan_to_num(values), weights)
-        return None if scores is None else np.asarray(scores.mean(1))
+
+def mean_resampled(table: ScoreTable, bootstrap: Bootstrap) -> Array | None:
+    """The mean over the runs of every resample of the sentences."""
+    scores = table.resampled(bootstrap)
+    return None if scores is None else np.asarray(scores.mean(1))
+
+
+def shares(table: ScoreTable) -> Array:
+    """What each sentence adds to the mean over the runs; their sum is the score over these sentences."""
+    return np.asarray((table.values * table.weights / table.weights.sum(0)).mean(1))
 
 
 @dataclass(frozen=True)
@@ -109,28 +97,31 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
         other: the row that is subtracted.
         bootstrap: resamples, level and seed; the permutations have the same seed.
     """
-    common = in_both(one, other)
     p_runs, runs = welch(one, other, bootstrap.level)
-    if one.values is None or other.values is None or not common:
+    tables = in_both(one, other)
+    if tables is None:
         # Training runs are all the chance that there is, unless nothing was trained.
-        alone = one.values is None and other.values is None and not (one.fixed and other.fixed)
+        alone = one.table is None and other.table is None and not (one.fixed and other.fixed)
         p, both = (p_runs, runs) if alone else (None, None)
-        return Difference(one.mean - other.mean, None, None, runs, p_runs, both, p, len(common))
-    ours, theirs = one.shares(common), other.shares(common)
-    valued = ~(np.isnan(ours) | np.isnan(theirs))
-    gaps = ours[valued] - theirs[valued]
-    p_sentences = sign_flip(gaps, seed=bootstrap.seed)
-    mine, yours = one._resampled(bootstrap, common), other._resampled(bootstrap, common)
+        return Difference(one.mean - other.mean, None, None, runs, p_runs, both, p, 0)
+    gaps = shares(tables[0]) - shares(tables[1])
+    p_sentences = sign_flip(gaps[~np.isnan(gaps)], seed=bootstrap.seed)
+    mine, yours = (mean_resampled(table, bootstrap) for table in tables)
     interval = None if mine is None or yours is None else bootstrap.intervals((mine - yours)[:, None], 1)[0]
-    p, both = both_chances(gaps, [scores.runs for scores in (one, other) if not scores.fixed], bootstrap.level)
-    return Difference(float((ours - theirs).sum()), interval, p_sentences, runs, p_runs, both, p, len(common))
+    trained = [scores.runs for scores in (one, other) if not scores.fixed]
+    p, both = both_chances(gaps[~np.isnan(gaps)], trained, bootstrap.level)
+    common = len(tables[0].clips)
+    return Difference(float(gaps.sum()), interval, p_sentences, runs, p_runs, both, p, common)
 
 
-def in_both(one: RowScores, other: RowScores) -> list[str]:
-    """Sentences of which both rows have a value."""
+def in_both(one: RowScores, other: RowScores) -> tuple[ScoreTable, ScoreTable] | None:
+    """The sentences of which both rows have a value in some run; None if there are none."""
+    if one.table is None or other.table is None:
+        return None
     # One that a single row has would count as a gap as large as that row's score.
-    theirs = set(other.valued())
-    return [clip for clip in one.valued() if clip in theirs]
+    theirs = set(other.table.valued())
+    clips = [clip for clip in one.table.valued() if clip in theirs]
+    return (one.table.at(clips), other.table.at(clips)) if clips else None
 
 
 def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tuple[float | None, Interval | None]:
@@ -213,10 +204,10 @@ def hears(own: RowScores, shuffled: RowScores, sign: int, bootstrap: Bootstrap) 
         bootstrap: its level decides, its seed is the permutations'.
     """
     gap = sign * (shuffled.mean - own.mean)
-    common = in_both(own, shuffled)
-    if gap <= 0 or own.values is None or shuffled.values is None or not common:
+    tables = in_both(own, shuffled)
+    if gap <= 0 or tables is None:
         return gap > 0
-    gaps = shuffled.shares(common) - own.shares(common)
+    gaps = shares(tables[1]) - shares(tables[0])
     gaps = gaps[~np.isnan(gaps)]
     p, _ = both_chances(gaps, [own.runs - shuffled.runs], bootstrap.level)
     return (sign_flip(gaps, seed=bootstrap.seed) if p is None else p) < 1 - bootstrap.level

@@ -13,6 +13,7 @@ from facediff.benchmark.plan import COSTS, MEAN_SUFFIX
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
 from facediff.benchmark.statistics import Difference, RowScores, compared, hears, marked
+from facediff.reporting.scores import ScoreTable
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils import ranges
 
@@ -277,29 +278,24 @@ def _scores(
     runs: Sequence[Result], split: str, method: str, column: str, pooling: str | None, *, fixed: bool
 ) -> RowScores | None:
     totals = [(_row_of(result, split, method) or {}).get(column) for result in runs]
-    scored = [value for value in totals if value is not None]
-    if not scored or len(scored) < len(totals):
+    if not totals or None in totals:
         return None
-    of_runs: list[dict[str, list[tuple[float, float]]]] = []
-    for result in runs:
-        clips: dict[str, list[tuple[float, float]]] = {}
+    scored = np.array(totals, np.float64)
+    values: dict[str, list[list[float]]] = {}  # of each clip in each run, several under several identities
+    frames: dict[str, float] = {}
+    for run, result in enumerate(runs):
         for row in result.sequences:
             if (row["split"], row["method"]) == (split, method) and row.get(column) is not None:
-                clips.setdefault(str(row["clip"]), []).append((float(row[column]), float(row["frames"])))
-        of_runs.append(clips)
-    names = tuple(sorted({clip for clips in of_runs for clip in clips}))
-    if pooling is None or not names:
-        return RowScores(np.array(scored, np.float64), None, np.ones(0), (), fixed)
+                clip = str(row["clip"])
+                values.setdefault(clip, [[] for _ in runs])[run].append(float(row[column]))
+                frames[clip] = float(row["frames"])
+    if pooling is None or not values:
+        return RowScores(scored, fixed=fixed)
+    clips = sorted(values)
     # A clip that was scored under several identities is one sentence: the mean of them.
-    values = np.array(
-        [
-            [np.mean([value for value, _ in clips[name]]) if name in clips else np.nan for name in names]
-            for clips in of_runs
-        ]
-    )
-    frames = {name: clips[name][0][1] for clips in of_runs for name in clips}
-    weights = np.array([frames[name] if pooling == "frames" else 1.0 for name in names])
-    return RowScores(np.array(scored, np.float64), values, weights, names, fixed)
+    matrix = np.array([[np.mean(some) if some else np.nan for some in values[clip]] for clip in clips])
+    weights = np.array([[frames[clip] if pooling == "frames" else 1.0] for clip in clips])
+    return RowScores(scored, ScoreTable.of(clips, matrix, np.broadcast_to(weights, matrix.shape)), fixed)
 
 
 def _cost(runs: Sequence[Result]) -> Cost:

@@ -22,6 +22,7 @@ from facediff.evaluation.files import (
     TRUTH_PATTERN,
     NamePattern,
     Pair,
+    Truth,
     index_truths,
     list_names,
     pair_up,
@@ -42,47 +43,11 @@ from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
 
 
-@ranges.checked
-def evaluate(
-    methods: Mapping[str, str | Path],
-    truth: str | Path,
-    *,
-    lips: Region,
-    upper_face: Region | None = None,
-    templates: Mapping[str, Tensor] | None = None,
-    n_vertices: ranges.Vertices,
-    protocols: Sequence[str | Protocol] = ("paper",),
-    metrics: Sequence[str] = (),
-    lip_pairs: LipPairs | None = None,
-    eyelid_pairs: LipPairs | None = None,
-    corpus: Path | None = None,
-    by: Sequence[str] = (),
-    frame_rate: ranges.FrameRate | None = None,
-    topology: str | None = None,
-    files: ParameterFiles | None = None,
-    unit: str | None = None,
-    file_unit: str | None = None,
-    renders: Sequence[str] = (),
-    faces: npt.NDArray[np.integer] | None = None,
-    patterns: Sequence[str] = DEFAULT_PATTERNS,
-    truth_pattern: str = TRUTH_PATTERN,
-    identity: str = OWN,
-    truth_stride: ranges.Stride = 1,
-    bootstrap: ranges.Resamples = 1000,
-    level: ranges.Level = 0.95,
-    seed: ranges.Seed = 0,
-    workers: ranges.Workers | None = None,
-    scheduler: str | None = "",
-    progress: bool = False,
-) -> EvaluationReport:
-    """Score the files of one or several methods against the truth.
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """How files are scored.
 
-    Files hold absolute vertices, (T, V, 3) or (T, 3V), of any floating-point type. They are memory-mapped, and of each
-    clip only its scores are kept. The scores are those of :class:`facediff.metrics.ProtocolMetrics` over all clips.
-
-    Args:
-        methods: folder of predictions by method; the first is what the others are compared with.
-        truth: folder of truths.
+    Attributes:
         lips: lip vertices.
         upper_face: upper-face vertices; needed if a protocol has FDD.
         templates: neutral face (V, 3) by identity; needed if a protocol has FDD.
@@ -114,158 +79,203 @@ def evaluate(
         workers: clips that are scored at a time; as many as processors if None. Digits do not depend on it.
         scheduler: where clips are scored; see :func:`facediff.utils.jobs.run_tasks`. Nor on this.
         progress: whether to show a progress bar on standard error, if it is a terminal.
-
-    Raises:
-        FaceDiffError: if an argument does not fit, a method has nothing that can be scored, a clip holds NaN or
-            infinity, or a protocol refuses a clip's length.
     """
-    if not methods or not protocols:
+
+    lips: Region
+    upper_face: Region | None = None
+    templates: Mapping[str, Tensor] | None = None
+    n_vertices: ranges.Vertices
+    protocols: Sequence[str | Protocol] = ("paper",)
+    metrics: Sequence[str] = ()
+    lip_pairs: LipPairs | None = None
+    eyelid_pairs: LipPairs | None = None
+    corpus: Path | None = None
+    by: Sequence[str] = ()
+    frame_rate: ranges.FrameRate | None = None
+    topology: str | None = None
+    files: ParameterFiles | None = None
+    unit: str | None = None
+    file_unit: str | None = None
+    renders: Sequence[str] = ()
+    faces: npt.NDArray[np.integer] | None = None
+    patterns: Sequence[str] = DEFAULT_PATTERNS
+    truth_pattern: str = TRUTH_PATTERN
+    identity: str = OWN
+    truth_stride: ranges.Stride = 1
+    bootstrap: ranges.Resamples = 1000
+    level: ranges.Level = 0.95
+    seed: ranges.Seed = 0
+    workers: ranges.Workers | None = None
+    scheduler: str | None = ""
+    progress: bool = False
+
+    def __post_init__(self) -> None:
+        ranges.check_fields(self)
+
+    @property
+    def regions(self) -> dict[str, tuple[int, ...]]:
+        """Vertices of the lips and, if known, of the upper face."""
+        parts = {"lips": self.lips, "upper_face": self.upper_face}
+        return {name: region.indices for name, region in parts.items() if region is not None}
+
+    def completed(self, needed: Set[str], *, rate: bool, methods: Mapping[str, str | Path]) -> EvaluationOptions:
+        """The options with what the corpus says: the frame rate, if it is wanted, and pairs that metrics need."""
+        found: dict[str, Any] = {}
+        if self.files is not None:
+            files = replace(self.files, predictions=tuple(map(Path, methods.values())))
+            found = {"files": files, "frame_rate": files.frame_rate}
+        elif self.frame_rate is None and rate and self.corpus is not None:
+            stored = read_manifest(self.corpus).get("frame_rate")
+            if isinstance(stored, int | float) and stored > 0:
+                found["frame_rate"] = stored / self.truth_stride
+        for field, need, file, kind in (
+            ("lip_pairs", "lip_pairs", LIP_PAIRS, LipPairs),
+            ("eyelid_pairs", "lid_pairs", EYELID_PAIRS, EyelidPairs),
+        ):
+            if getattr(self, field) is None and need in needed and self.corpus and (self.corpus / file).is_file():
+                found[field] = read_pairs(None, self.corpus, self.n_vertices, kind)
+        return replace(self, **found)
+
+
+def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: Any) -> EvaluationReport:  # noqa: ANN401
+    """Score the files of one or several methods against the truth.
+
+    Files hold absolute vertices, (T, V, 3) or (T, 3V), of any floating-point type. They are memory-mapped, and of each
+    clip only its scores are kept. The scores are those of :class:`facediff.metrics.ProtocolMetrics` over all clips.
+
+    Args:
+        methods: folder of predictions by method; the first is what the others are compared with.
+        truth: folder of truths.
+        options: the fields of :class:`EvaluationOptions`, of which ``lips`` and ``n_vertices`` are needed.
+    """
+    given = EvaluationOptions(**options)
+    if not methods or not given.protocols:
         raise FaceDiffError("expected at least one method and at least one protocol")
-    settings = find_protocols(protocols, topology)
-    sampling = Bootstrap(bootstrap, level, seed)
-    source = source_unit(settings, files, corpus, unit, file_unit)
-    scales = {setting.name: scale_of(source, unit or setting.unit) for setting in settings}
-    requests = {request.text: request.scaled(scale_of(source, unit)) for request in parse_all(metrics)}
-    owners: dict[str, tuple[str, str]] = {}
-    for setting in settings:
-        for label, request in setting.further(scales[setting.name]).items():
-            owners[f"{setting.name}/{label}"] = setting.name, label
-            requests[f"{setting.name}/{label}"] = request
-    suffixes = (".npy",) if files is None else SUFFIXES
-    names, unnamed_truths = list_names(Path(truth), [NamePattern(truth_pattern, templates or ())], suffixes)
-    truths = index_truths(names)
-    if frame_rate is None and (requests or renders) and corpus is not None:
-        stored = read_manifest(corpus).get("frame_rate")
-        frame_rate = stored / truth_stride if isinstance(stored, int | float) and stored > 0 else None
-    if files is not None:
-        files = replace(files, predictions=tuple(map(Path, methods.values())))
-        frame_rate = files.frame_rate
+    settings = find_protocols(given.protocols, given.topology)
+    sampling = Bootstrap(given.bootstrap, given.level, given.seed)
+    source = source_unit(settings, given)
+    scales = {setting.name: scale_of(source, given.unit or setting.unit) for setting in settings}
+    requests = {request.text: request.scaled(scale_of(source, given.unit)) for request in parse_all(given.metrics)}
+    further = [
+        (setting.name, label, request)
+        for setting in settings
+        for label, request in setting.further(scales[setting.name]).items()
+    ]
+    requests |= {f"{owner}/{label}": request for owner, label, request in further}
     needed = {need for request in requests.values() for need in request.needs}
-    if lip_pairs is None and "lip_pairs" in needed and corpus is not None and (corpus / LIP_PAIRS).is_file():
-        lip_pairs = read_pairs(None, corpus, n_vertices)
-    if eyelid_pairs is None and "lid_pairs" in needed and corpus is not None and (corpus / EYELID_PAIRS).is_file():
-        eyelid_pairs = read_pairs(None, corpus, n_vertices, EyelidPairs)
-    speakers = sorted({name.subject for name in names.values()})
-    material = CorpusInputs(corpus if requests else None, frame_rate, speakers, files, truth_stride)
-    context = material.context(
-        lips,
-        upper_face,
-        lip_pairs,
-        eyelid_pairs,
-        templated=bool(templates) or files is not None,
-        every_condition=identity == ALL,
-    )
-    if files is not None and files.rig is None:
+    given = given.completed(needed, rate=bool(requests or given.renders), methods=methods)
+    suffixes = (".npy",) if given.files is None else SUFFIXES
+    names, unnamed_truths = list_names(Path(truth), [NamePattern(given.truth_pattern, given.templates or ())], suffixes)
+    truths = index_truths(names)
+    if given.files is not None and given.files.rig is None:
         refuse_vertex_protocols(settings)
-    chosen = {name: request.build(context) for name, request in requests.items()}
+    material = CorpusInputs(given, sorted({name.subject for name in names.values()}))
+    context = material.context()
+    metrics = {name: request.build(context) for name, request in requests.items()}
     scorer = Scorer(
         settings,
-        lips=lips,
-        upper_face=upper_face,
-        templates=templates or {},
-        n_vertices=n_vertices,
-        truth_stride=truth_stride,
-        metrics=chosen,
+        lips=given.lips,
+        upper_face=given.upper_face,
+        templates=given.templates or {},
+        n_vertices=given.n_vertices,
+        truth_stride=given.truth_stride,
+        metrics=metrics,
         inputs=partial(material.inputs, needed=needed),
         moments={name: request.moment for name, request in requests.items()},
-        owners=owners,
-        read=None if files is None else files.read,
-        channels=None if files is None else channel_regions(files.space),
+        owners={f"{owner}/{label}": (owner, label) for owner, label, _ in further},
+        read=None if given.files is None else given.files.read,
+        channels=None if given.files is None else channel_regions(given.files.space),
         scales=scales,
     )
-    readers = [NamePattern(pattern, templates or ()) for pattern in patterns]
-    paired = {}
-    for method, folder in methods.items():
-        predictions, unnamed = list_names(Path(folder), readers, suffixes)
-        pairs, missing = pair_up(predictions, truths, identity)
-        paired[method] = pairs, replace(missing, unnamed=unnamed)
-    jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
-    reads = [Path(truth), *map(Path, methods.values()), *([] if corpus is None else [corpus])]
-    scores_by_method = score_all(scorer, jobs, workers, scheduler=scheduler, reads=reads, progress=progress)
-    tables = [
-        MethodTable(method, str(methods[method]), pairs, missing, scores_by_method.get(method, {}), scorer.columns)
-        for method, (pairs, missing) in paired.items()
-    ]
-    attributes = attributes_of(corpus, names_of(paired), by) if by else {}
-    definitions = {setting.name: setting.describe() for setting in settings}
-    named = {name: metric for name, metric in chosen.items() if name not in owners}
-    if named:
-        lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in named.items()]
-        definitions[METRICS] = "\n".join(["further metrics", *lines])
-    rendered = {}
-    regions = {"lips": lips.indices} | ({} if upper_face is None else {"upper_face": upper_face.indices})
-    if renders:
-        usable = {table.name: ([pair for pair, _ in table.rows], table.missing) for table in tables}
-        rendered = score_renders(renders, scorer, usable, regions, faces, corpus, frame_rate)
+    tables = score_methods(methods, Path(truth), truths, scorer, given, suffixes)
+    clips = {pair.truth.path.stem for table in tables for pair, _ in table.rows}
+    attributes = attributes_of(given.corpus, clips, given.by) if given.by else {}
+    chosen = {request.text: metrics[request.text] for request in parse_all(given.metrics)}
     results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
         truth=str(truth),
-        lips=lips,
-        upper_face=upper_face if needs_upper_face(settings, metrics) else None,
-        n_vertices=n_vertices,
-        protocols=definitions,
-        identity=identity,
-        truth_stride=truth_stride,
-        resamples=bootstrap,
-        level=level,
-        seed=seed,
+        lips=given.lips,
+        upper_face=given.upper_face if needs_upper_face(settings, given.metrics) else None,
+        n_vertices=given.n_vertices,
+        protocols={setting.name: setting.describe() for setting in settings} | definitions(chosen),
+        identity=given.identity,
+        truth_stride=given.truth_stride,
+        resamples=given.bootstrap,
+        level=given.level,
+        seed=given.seed,
         methods=results,
         runs=runs_of(results),
         groups=[group for table in tables for group in table.groups(attributes)],
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
-        renders=rendered,
-        points="channels" if files is not None and files.rig is None else "vertices",
+        renders=score_renders(tables, scorer, given),
+        points="channels" if given.files is not None and given.files.rig is None else "vertices",
     )
 
 
-def score_renders(
-    renders: Sequence[str],
-    scorer: Scorer,
-    paired: Mapping[str, tuple[Sequence[Pair], object]],
-    regions: Mapping[str, Sequence[int]],
-    faces: npt.NDArray[np.integer] | None,
-    corpus: Path | None,
-    frame_rate: float | None,
-) -> dict[str, dict[str, float]]:
-    """Means over clips of the scores on renders, of every method and of the truth.
+def definitions(metrics: Mapping[str, object]) -> dict[str, str]:
+    """What metrics chosen by name are, as the definition of a protocol of their own."""
+    lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in metrics.items()]
+    return {METRICS: "\n".join(["further metrics", *lines])} if lines else {}
 
-    Raises:
-        FaceDiffError: if there are no triangles, no vertices or no frame rate.
-    """
-    metrics = read_render_metrics(renders)
-    if faces is None or frame_rate is None:
-        lacking = "triangles (--mesh FILE)" if faces is None else "the frame rate (--frame-rate)"
+
+def score_methods(
+    methods: Mapping[str, str | Path],
+    truth: Path,
+    truths: Mapping[str, Truth],
+    scorer: Scorer,
+    given: EvaluationOptions,
+    suffixes: Sequence[str],
+) -> list[MethodTable]:
+    """Pair each method's files with the truths, and score all clips together."""
+    readers = [NamePattern(pattern, given.templates or ()) for pattern in given.patterns]
+    paired = {}
+    for method, folder in methods.items():
+        predictions, unnamed = list_names(Path(folder), readers, suffixes)
+        pairs, missing = pair_up(predictions, truths, given.identity)
+        paired[method] = pairs, replace(missing, unnamed=unnamed)
+    jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
+    reads = [truth, *map(Path, methods.values()), *([] if given.corpus is None else [given.corpus])]
+    scores = score_all(scorer, jobs, given.workers, scheduler=given.scheduler, reads=reads, progress=given.progress)
+    return [
+        MethodTable(method, str(methods[method]), pairs, missing, scores.get(method, {}), scorer.columns)
+        for method, (pairs, missing) in paired.items()
+    ]
+
+
+def score_renders(
+    tables: Sequence[MethodTable], scorer: Scorer, given: EvaluationOptions
+) -> dict[str, dict[str, float]]:
+    """Means over clips of the scores on renders, of every method and of the truth; empty if none are asked for."""
+    if not given.renders:
+        return {}
+    metrics = read_render_metrics(given.renders)
+    if given.faces is None or given.frame_rate is None:
+        lacking = "triangles (--mesh FILE)" if given.faces is None else "the frame rate (--frame-rate)"
         raise FaceDiffError(f"--render draws motion, and lacks {lacking}; give it")
 
     def speech(clip: str) -> npt.NDArray[np.float32]:
-        path = None if corpus is None else corpus / "wav" / f"{clip}.wav"
+        path = None if given.corpus is None else given.corpus / "wav" / f"{clip}.wav"
         return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
 
-    drawing = RenderScorer(metrics=metrics, faces=faces, regions=regions, frame_rate=frame_rate, speech=speech)
-    rows: dict[str, dict[str, list[dict[str, float]]]] = {}
-    for method, (pairs, _) in paired.items():
-        for pair in pairs:
+    drawing = RenderScorer(
+        metrics=metrics, faces=given.faces, regions=given.regions, frame_rate=given.frame_rate, speech=speech
+    )
+    rows: dict[str, dict[str, dict[str, float]]] = {}
+    for table in tables:
+        for pair, _ in table.rows:
             truth = scorer.read(pair.truth.path, scorer.truth_stride)
             vertices = truth.get(channels=False)
             known = scorer.templates.get(pair.truth.name.subject, truth.template)
             template = (vertices.double().mean(0) if known is None else known.double()).numpy()
             clip = pair.truth.path.stem
-            own = rows.setdefault(method, {})
-            own[clip] = [
-                drawing.score(clip, scorer.read(path, 1).get(channels=False).double().numpy(), template)
-                for path in pair.predictions.values()
-            ]
-            truths = rows.setdefault("truth", {})
-            if clip not in truths:
-                truths[clip] = [drawing.score(clip, vertices.double().numpy(), template)]
-    return {who: means([means(own) for own in clips.values()]) for who, clips in rows.items()}
-
-
-def names_of(paired: Mapping[str, tuple[Sequence[Pair], object]]) -> set[str]:
-    """Names of the truths' files."""
-    return {pair.truth.path.stem for pairs, _ in paired.values() for pair in pairs}
+            files = [scorer.read(path, 1).get(channels=False) for path in pair.predictions.values()]
+            drawn = [drawing.score(clip, motion.double().numpy(), template) for motion in files]
+            rows.setdefault(table.name, {})[clip] = means(drawn)
+            if clip not in rows.setdefault("truth", {}):
+                rows["truth"][clip] = drawing.score(clip, vertices.double().numpy(), template)
+    return {method: means([*clips.values()]) for method, clips in rows.items()}
 
 
 def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> bool:
@@ -282,40 +292,32 @@ def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> b
 class CorpusInputs:
     """What metrics may read of a corpus in addition to motion."""
 
-    corpus: Path | None
-    frame_rate: float | None  # of the predictions, if known
+    given: EvaluationOptions
     identities: Sequence[str]  # names of all speakers
-    files: ParameterFiles | None = None  # how files of parameters are read
-    truth_stride: int = 1  # of what is stored at the frame rate of the truth
 
-    def context(
-        self,
-        lips: Region,
-        upper_face: Region | None,
-        lip_pairs: LipPairs | None,
-        eyelid_pairs: LipPairs | None,
-        *,
-        templated: bool,
-        every_condition: bool,
-    ) -> Context:
+    def context(self) -> Context:
         """What there is for metrics, and how to get what is missing."""
-        has: dict[str, dict[str, Any]] = {"lips": {"lips": lips}, "identities": {"n_identities": len(self.identities)}}
-        rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": self.frame_rate}
+        given = self.given
+        has: dict[str, dict[str, Any]] = {
+            "lips": {"lips": given.lips},
+            "identities": {"n_identities": len(self.identities)},
+        }
+        rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": given.frame_rate}
+        lids = {"pairs": given.eyelid_pairs, "frames_per_second": given.frame_rate}
         for need, there, arguments in (
-            ("upper_face", upper_face is not None, {"upper": upper_face}),
-            ("lip_pairs", lip_pairs is not None, {"pairs": lip_pairs}),
-            ("lid_pairs", eyelid_pairs is not None, {"pairs": eyelid_pairs, "frames_per_second": self.frame_rate}),
-            ("template", templated, {}),
-            ("closures", self._has("phonemes"), {}),
-            ("speech", self._has("wav"), rates),
-            ("conditions", every_condition, {}),
+            ("upper_face", given.upper_face is not None, {"upper": given.upper_face}),
+            ("lip_pairs", given.lip_pairs is not None, {"pairs": given.lip_pairs}),
+            ("lid_pairs", given.eyelid_pairs is not None, lids),
+            ("template", bool(given.templates) or given.files is not None, {}),
+            ("closures", given.frame_rate is not None and self._has("phonemes"), {}),
+            ("speech", given.frame_rate is not None and self._has("wav"), rates),
+            ("conditions", given.identity == ALL, {}),
+            ("channels", given.files is not None, {}),
+            *((need, self._has(need), {}) for need in CONVERSATION),
         ):
             if there:
                 has[need] = arguments
-        if self.files is not None:
-            has["channels"] = {}
-        has |= {need: {} for need in CONVERSATION if self.corpus is not None and (self.corpus / need).is_dir()}
-        rate = "" if self.frame_rate else " and give --frame-rate"
+        rate = "" if given.frame_rate else " and give --frame-rate"
         in_test = "is known to `facediff test --model.metrics=[…]` only"
         are_known = in_test.replace("is", "are", 1)
         return Context(
@@ -336,53 +338,44 @@ class CorpusInputs:
                 "style": f"a model's style encoder {in_test}",
                 "time": f"the time that inference takes {in_test}",
             },
-            {} if self.files is None else channel_regions(self.files.space),
+            {} if given.files is None else channel_regions(given.files.space),
         )
 
     def _has(self, folder: str) -> bool:
-        return self.corpus is not None and self.frame_rate is not None and (self.corpus / folder).is_dir()
+        return self.given.corpus is not None and (self.given.corpus / folder).is_dir()
 
     def inputs(self, pair: Pair, needed: Set[str]) -> dict[str, Any]:
         """What the needs mean for one clip, by the name under which metrics take it."""
         inputs: dict[str, Any] = {}
+        corpus, rate, stride = self.given.corpus, self.given.frame_rate, self.given.truth_stride
+        clip = pair.truth.path.stem
         if "identities" in needed:
             inputs["identities"] = [self.identities.index(pair.truth.name.subject)]
-        clip = pair.truth.path.stem
-        if "speech" in needed and self.corpus is not None:
-            inputs["waveform"] = torch.from_numpy(read_speech(self.corpus / "wav" / f"{clip}.wav"))
-        if "closures" in needed and self.frame_rate is not None:
-            file = phonemes_file(self.corpus, clip)
-            inputs["closures"] = [] if file is None else closures(read_phonemes(file), self.frame_rate)
-        if "speaking" in needed and self.corpus is not None:
-            speaking = conversation_file(self.corpus, "speaking", clip, self.truth_stride)
-            inputs["speaking"] = [torch.from_numpy(speaking)]
-        if "partner" in needed and self.corpus is not None and self.files is not None:
-            path = self.corpus / "partner" / pair.truth.path.name
-            partner = replace(self.files, truth=path.parent, rig=None)
-            inputs["partner"] = partner.read(path, self.truth_stride).channels
+        if corpus is None:
+            return inputs
+        if "speech" in needed:
+            inputs["waveform"] = torch.from_numpy(read_speech(corpus / "wav" / f"{clip}.wav"))
+        if "closures" in needed and rate is not None:
+            file = phonemes_file(corpus, clip)
+            inputs["closures"] = [] if file is None else closures(read_phonemes(file), rate)
+        if "speaking" in needed:
+            inputs["speaking"] = [torch.from_numpy(conversation_file(corpus, "speaking", clip, stride))]
+        if "partner" in needed and self.given.files is not None:
+            path = corpus / "partner" / pair.truth.path.name
+            inputs["partner"] = replace(self.given.files, truth=path.parent, rig=None).read(path, stride).channels
         return inputs
 
 
-def source_unit(
-    protocols: Sequence[Protocol],
-    files: ParameterFiles | None,
-    corpus: Path | None,
-    unit: str | None,
-    stated: str | None,
-) -> str | None:
-    """The unit of the vertices that are scored; None where no score needs it.
-
-    Raises:
-        FaceDiffError: if a score is in a unit, and nothing says that of the files.
-    """
+def source_unit(protocols: Sequence[Protocol], given: EvaluationOptions) -> str | None:
+    """The unit of the vertices that are scored; None where no score needs it."""
     named = next((one.name for one in protocols if one.unit is not None), None)
-    if unit is None and named is None:
+    if given.unit is None and named is None:
         return None
-    source = stated or (files.unit if files is not None else None)
-    if not source and corpus is not None:
-        source = str(read_manifest(corpus).get("unit") or "")
-    if not source and (files is None or files.rig is not None):
-        asked = f"--unit {unit}" if unit is not None else f"protocol {named}"
+    source = given.file_unit or (given.files.unit if given.files is not None else None)
+    if not source and given.corpus is not None:
+        source = str(read_manifest(given.corpus).get("unit") or "")
+    if not source and (given.files is None or given.files.rig is not None):
+        asked = f"--unit {given.unit}" if given.unit is not None else f"protocol {named}"
         raise FaceDiffError(f"{asked}: the scores' unit is known, that of the files is not; give --file-unit")
     return source or None
 
@@ -393,11 +386,7 @@ def scale_of(source: str | None, target: str | None) -> float:
 
 
 def find_protocols(protocols: Sequence[str | Protocol], topology: str | None = None) -> list[Protocol]:
-    """Protocols by name, or one's own; each once.
-
-    Raises:
-        FaceDiffError: if there is no protocol or topology of that name, or two protocols share a name.
-    """
+    """Protocols by name, or one's own; each once."""
     settings: dict[str, Protocol] = {}
     for name in protocols:
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from facediff.errors import FaceDiffError, printable
 from facediff.evaluation.files import Missing, Pair
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
-from facediff.reporting.statistics import Array, Bootstrap, Interval, pooled
+from facediff.reporting.scores import ScoreTable
+from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils.provenance import Provenance, read_provenance
 from facediff.utils.tables import format_table
 
@@ -181,7 +182,7 @@ class EvaluationReport:
 class MethodTable:
     """One method's values: a row a clip, sorted by clip, so that no order of files or workers changes a digit.
 
-    ``found`` has the scores by clip, or in words why there are none; ``missing`` what names alone rule out.
+    ``clip_scores`` has the scores by clip, or in words why there are none; ``missing`` what names alone rule out.
     """
 
     def __init__(
@@ -193,80 +194,71 @@ class MethodTable:
         clip_scores: Mapping[str, ClipScores | str],
         columns: Sequence[Column],
     ) -> None:
-        self.name = name
-        self.folder = folder
-        self.columns = columns
+        self.name, self.folder, self.columns = name, folder, columns
         unusable = {clip: reason for clip, reason in sorted(clip_scores.items()) if isinstance(reason, str)}
         self.missing = replace(missing, unusable=unusable)
         self.provenance = read_provenance(Path(folder))
         self.rows = [(pair, scores) for pair in pairs if isinstance(scores := clip_scores[pair.clip], ClipScores)]
         if not self.rows:
             raise FaceDiffError(f"{folder}: {_why_nothing(self.missing)}")
-        self.clips = [pair.clip for pair, _ in self.rows]
-        values: Array = np.array([scores.values for _, scores in self.rows])
-        by_frames = np.array([column.pooling == "frames" for column in columns])
+        by_frames = [column.pooling == "frames" for column in columns]
         weights = np.where(by_frames, np.array([scores.weights for _, scores in self.rows]), 1.0)
-        self.weights: Array = np.where(np.isnan(values), 0.0, weights)
-        self.values: Array = np.nan_to_num(values)
+        values = np.array([scores.values for _, scores in self.rows])
+        self.table = ScoreTable.of([pair.clip for pair, _ in self.rows], values, weights)
+
+    def _pooled(self, column: Column) -> bool:
+        """Whether a score is a mean of the clips'; others are made of the sums of all clips."""
+        return column.source not in self.rows[0][1].states
+
+    def _by_name(self, values: Iterable[float]) -> dict[str, float | None]:
+        """Values of all columns by name, without those that single clips do not have."""
+        named = zip(self.columns, values, strict=True)
+        return {column.name: None if math.isnan(v) else v for column, v in named if self._pooled(column)}
 
     def groups(self, attributes: Mapping[str, dict[str, str]]) -> list[GroupScores]:
         """The scores of clips with equal attributes, by the name of the truth's file; pooled as over all clips."""
-        rows: dict[tuple[str, ...], list[int]] = {}
-        for place, (pair, _) in enumerate(self.rows):
+        clips: dict[tuple[tuple[str, str], ...], list[str]] = {}
+        for pair, _ in self.rows:
             if pair.truth.path.stem in attributes:
-                rows.setdefault(tuple(attributes[pair.truth.path.stem].values()), []).append(place)
-        groups = []
-        for key in sorted(rows):
-            chosen = rows[key]
-            names = attributes[self.rows[chosen[0]][0].truth.path.stem]
-            scores = {
-                column.name: None if math.isnan(value) else value
-                for column, value in zip(
-                    self.columns, pooled(self.values[chosen], self.weights[chosen]).tolist(), strict=True
-                )
-                if column.source not in self.rows[0][1].states
-            }
-            groups.append(GroupScores(self.name, dict(zip(names, key, strict=True)), len(chosen), scores))
-        return groups
+                clips.setdefault(tuple(attributes[pair.truth.path.stem].items()), []).append(pair.clip)
+        return [
+            GroupScores(self.name, dict(key), len(names), self._by_name(self.table.at(names).pool().tolist()))
+            for key, names in sorted(clips.items())
+        ]
 
     def result(self, bootstrap: Bootstrap, attributes: Mapping[str, dict[str, str]] | None = None) -> MethodResult:
         """The scores with their intervals, and the values of each clip."""
-        totals = self._totals()
-        intervals = bootstrap.intervals(bootstrap.scores(self.values, self.weights), len(self.columns))
         frames = sum(scores.frames for _, scores in self.rows)
-        return MethodResult(
-            self.name,
-            self.folder,
-            [
-                Score(
-                    column.protocol,
-                    column.metric,
-                    total,
-                    interval,
-                    frames,
-                    len(self.rows) if column.source in self.rows[0][1].states else int(np.count_nonzero(weights)),
-                    column.region,
-                    None if column.source in self.rows[0][1].states else column.pooling,
-                    column.better,
-                )
-                for column, total, interval, weights in zip(
-                    self.columns, totals, intervals, self.weights.T, strict=True
-                )
-            ],
-            [
-                replace(self._sequence(pair, scores), attributes=(attributes or {}).get(pair.truth.path.stem, {}))
-                for pair, scores in self.rows
-            ],
-            self.missing,
-            self.provenance,
-        )
+        counts = np.count_nonzero(self.table.weights, axis=0).tolist()
+        scores = []
+        for column, total, interval, count in zip(
+            self.columns, self._totals(), self.table.intervals(bootstrap), counts, strict=True
+        ):
+            sequences, pooling = (count, column.pooling) if self._pooled(column) else (len(self.rows), None)
+            facts = (frames, sequences, column.region, pooling, column.better)
+            scores.append(Score(column.protocol, column.metric, total, interval, *facts))
+        clips = [
+            SequenceScores(
+                self.name,
+                pair.clip,
+                pair.truth.name.subject,
+                pair.truth.name.sentence,
+                tuple(pair.predictions),
+                scored.frames,
+                scored.cut_prediction,
+                scored.cut_truth,
+                self._by_name(scored.values),
+                (attributes or {}).get(pair.truth.path.stem, {}),
+            )
+            for pair, scored in self.rows
+        ]
+        return MethodResult(self.name, self.folder, scores, clips, self.missing, self.provenance)
 
     def _totals(self) -> list[float]:
         """The score of each column over all clips."""
-        totals: list[float] = pooled(self.values, self.weights).tolist()
+        totals: list[float] = self.table.pool().tolist()
         for place, column in enumerate(self.columns):
-            if column.source in self.rows[0][1].states:
-                # Such a metric has no values of single clips, whose mean it would be; its sums are added, clip by clip.
+            if not self._pooled(column):
                 whole = self.rows[0][1].states[column.source].clone()
                 try:
                     for _, scores in self.rows[1:]:
@@ -280,56 +272,27 @@ class MethodTable:
                 )
         return totals
 
-    def _sequence(self, pair: Pair, scores: ClipScores) -> SequenceScores:
-        return SequenceScores(
-            self.name,
-            pair.clip,
-            pair.truth.name.subject,
-            pair.truth.name.sentence,
-            tuple(pair.predictions),
-            scores.frames,
-            scores.cut_prediction,
-            scores.cut_truth,
-            {
-                column.name: None if math.isnan(value) else value
-                for column, value in zip(self.columns, scores.values, strict=True)
-                if column.source not in scores.states
-            },
-        )
-
     def compare(self, baseline: MethodTable, bootstrap: Bootstrap) -> list[Comparison]:
         """This method's scores minus another's, over the clips of which both have a value and over the same resamples.
 
         Empty if they share no clip.
         """
-        common = set(self.clips) & set(baseline.clips)
-        if not common:
+        ours, theirs = self.table.common(baseline.table)
+        if not ours.clips:
             return []
-        ours, theirs = ([row for row, clip in enumerate(table.clips) if clip in common] for table in (self, baseline))
-        # Else a difficult clip would count for the one method that has a value of it.
-        both = (self.weights[ours] > 0) & (baseline.weights[theirs] > 0)
-        a = self.values[ours], self.weights[ours] * both
-        b = baseline.values[theirs], baseline.weights[theirs] * both
-        mine, other = bootstrap.scores(*a), bootstrap.scores(*b)
-        spread = None if mine is None or other is None else mine - other
+        one, other = ours.resampled(bootstrap), theirs.resampled(bootstrap)
+        spread = None if one is None or other is None else one - other
+        same = same_method(self.provenance, baseline.provenance)
+        facts = zip(
+            self.columns,
+            (ours.pool() - theirs.pool()).tolist(),
+            bootstrap.intervals(spread, len(self.columns)),
+            np.count_nonzero(ours.weights, axis=0).tolist(),
+            strict=True,
+        )
         return [
-            Comparison(
-                self.name,
-                baseline.name,
-                column.protocol,
-                column.metric,
-                float(difference),
-                interval,
-                int(count),
-                same_method(self.provenance, baseline.provenance),
-            )
-            for column, difference, interval, count in zip(
-                self.columns,
-                pooled(*a) - pooled(*b),
-                bootstrap.intervals(spread, len(self.columns)),
-                both.sum(0),
-                strict=True,
-            )
+            Comparison(self.name, baseline.name, column.protocol, column.metric, difference, interval, count, same)
+            for column, difference, interval, count in facts
             if not math.isnan(difference)
         ]
 
@@ -348,18 +311,20 @@ def runs_of(methods: Sequence[MethodResult]) -> list[Runs]:
             kinds.append([method])
         else:
             kind.append(method)
-    runs = []
-    for kind in [kind for kind in kinds if len(kind) > 1]:
-        names = tuple(method.name for method in kind)
-        seeds = tuple(method.provenance.seed for method in kind if method.provenance is not None)
-        for scores in zip(*(method.scores for method in kind), strict=True):
-            values = np.array([score.value for score in scores])
-            runs.append(
-                Runs(
-                    names, seeds, scores[0].protocol, scores[0].metric, float(values.mean()), float(values.std(ddof=1))
-                )
-            )
-    return runs
+    return [
+        _runs_of(kind, scores)
+        for kind in kinds
+        if len(kind) > 1
+        for scores in zip(*(method.scores for method in kind), strict=True)
+    ]
+
+
+def _runs_of(methods: Sequence[MethodResult], scores: Sequence[Score]) -> Runs:
+    """Mean and deviation of one score over the training runs of a method."""
+    values = np.array([score.value for score in scores])
+    names = tuple(method.name for method in methods)
+    seeds = tuple(method.provenance.seed for method in methods if method.provenance is not None)
+    return Runs(names, seeds, scores[0].protocol, scores[0].metric, float(values.mean()), float(values.std(ddof=1)))
 
 
 def _why_nothing(missing: Missing) -> str:
@@ -423,27 +388,32 @@ MOST_COLUMNS = 5
 """Scores of a protocol that stand side by side."""
 
 
+Rows = dict[str, dict[str, str]]
+"""Cells by row and column."""
+
+
+def _table(rows: Rows, counts: Sequence[str]) -> list[str]:
+    """A table whose last columns are counts."""
+    columns = dict.fromkeys(column for cells in rows.values() for column in cells if column not in counts)
+    body = [[row, *(cells.get(column) for column in (*columns, *counts))] for row, cells in rows.items()]
+    return format_table(["", *columns, *counts], body).splitlines()
+
+
 def _scores(report: EvaluationReport, protocol: str) -> list[str]:
-    rows = []
-    scored = [score for score in report.methods[0].scores if score.protocol == protocol]
+    rows: Rows = {}
+    scored = [[score for score in method.scores if score.protocol == protocol] for method in report.methods]
     # Names of metrics with their options are long, and some protocols have many scores: one row for each.
-    if protocol == METRICS or len(scored) > MOST_COLUMNS:
-        for score in scored:
-            same = [
-                score_of_method
-                for method in report.methods
-                for score_of_method in method.scores
-                if score_of_method.name == score.name
-            ]
-            counts = "/".join(dict.fromkeys(str(own.sequences) for own in same))
-            rows.append([score.metric, *(_cell(own.value, own.interval) for own in same), counts])
-        return format_table(["", *(method.name for method in report.methods), "sequences"], rows).splitlines()
-    for method in report.methods:
-        scores = [score for score in method.scores if score.protocol == protocol]
-        cells = [_cell(score.value, score.interval) for score in scores]
-        rows.append([method.name, *cells, str(scores[0].frames), str(scores[0].sequences)])
-    metrics = [score.metric for score in report.methods[0].scores if score.protocol == protocol]
-    return format_table(["", *metrics, "frames", "sequences"], rows).splitlines()
+    if protocol == METRICS or len(scored[0]) > MOST_COLUMNS:
+        for same in zip(*scored, strict=True):
+            cells = {
+                method.name: _cell(own.value, own.interval) for method, own in zip(report.methods, same, strict=True)
+            }
+            rows[same[0].metric] = cells | {"sequences": "/".join(dict.fromkeys(str(own.sequences) for own in same))}
+        return _table(rows, ["sequences"])
+    for method, scores in zip(report.methods, scored, strict=True):
+        counts = {"frames": str(scores[0].frames), "sequences": str(scores[0].sequences)}
+        rows[method.name] = {score.metric: _cell(score.value, score.interval) for score in scores} | counts
+    return _table(rows, ["frames", "sequences"])
 
 
 def _groups(report: EvaluationReport, protocol: str) -> list[str]:
@@ -470,37 +440,26 @@ def _comparisons(report: EvaluationReport, protocol: str) -> list[str]:
     comparisons = [comparison for comparison in report.comparisons if comparison.protocol == protocol]
     if not comparisons:
         return []
-    rows: dict[str, dict[str, str]] = {}
-    counts: dict[str, str] = {}
+    rows: Rows = {}
     for comparison in comparisons:
         row = f"{comparison.method} − {comparison.baseline}" + (f": {comparison.metric}" if protocol == METRICS else "")
         column = "difference" if protocol == METRICS else comparison.metric
         cell = _cell(comparison.difference, comparison.interval, "+") + ("*" if comparison.starred else "")
-        rows.setdefault(row, {})[column] = cell
-        counts[row] = str(comparison.sequences)
-    metrics = list(dict.fromkeys(column for cells in rows.values() for column in cells))
-    body = [[row, *(cells.get(column) for column in metrics), counts[row]] for row, cells in rows.items()]
+        rows.setdefault(row, {}).update({column: cell, "sequences": str(comparison.sequences)})
     head = "difference, over the sequences that both have (*: the interval over sentences does not contain 0)"
-    same = list(
-        dict.fromkeys(
-            f"{comparison.method} and {comparison.baseline}" for comparison in comparisons if comparison.same_method
-        )
-    )
+    same = dict.fromkeys(f"{one.method} and {one.baseline}" for one in comparisons if one.same_method)
     notes = [f"{pair} are training runs of one method: their difference is chance, and has no star" for pair in same]
-    return [head, *format_table(["", *metrics, "sequences"], body).splitlines(), *notes]
+    return [head, *_table(rows, ["sequences"]), *notes]
 
 
 def _runs(report: EvaluationReport, protocol: str) -> list[str]:
     """Mean ± standard deviation over the training runs of a method."""
-    repeated = [runs for runs in report.runs if runs.protocol == protocol]
-    rows: dict[tuple[str, ...], list[str]] = {}
-    for runs in repeated:
-        rows.setdefault(runs.methods, []).append(f"{runs.mean:.4e} ± {runs.deviation:.1e}")
-    if not rows:
-        return []
-    metrics = list(dict.fromkeys(runs.metric for runs in repeated))
-    body = [[", ".join(names), *cells, str(len(names))] for names, cells in rows.items()]
-    return ["over training runs (mean ± standard deviation)", *format_table(["", *metrics, "runs"], body).splitlines()]
+    rows: Rows = {}
+    for runs in report.runs:
+        if runs.protocol == protocol:
+            cell = f"{runs.mean:.4e} ± {runs.deviation:.1e}"
+            rows.setdefault(", ".join(runs.methods), {}).update({runs.metric: cell, "runs": str(len(runs.methods))})
+    return ["over training runs (mean ± standard deviation)", *_table(rows, ["runs"])] if rows else []
 
 
 def _cell(value: float, interval: Interval | None, sign: str = "") -> str:

@@ -1,0 +1,61 @@
+"""One table of scores for evaluations and benchmarks: a row a clip, a column a metric or a training run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from facediff.reporting.statistics import Array, Bootstrap, Interval, pooled
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """Scores of clips, and how much each counts.
+
+    Attributes:
+        clips: names of the rows.
+        values: (clips, columns), 0 where there is none.
+        weights: (clips, columns): frames where all frames count alike, else 1; 0 where there is no value.
+    """
+
+    clips: tuple[str, ...]
+    values: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, clips: Sequence[str], values: Array, weights: Array) -> ScoreTable:
+        """A table of values that are NaN where there is none."""
+        lacking = np.isnan(values)
+        return cls(tuple(clips), np.where(lacking, 0.0, values), np.where(lacking, 0.0, weights))
+
+    def at(self, clips: Sequence[str]) -> ScoreTable:
+        """The rows of some clips."""
+        rows = [self.clips.index(clip) for clip in clips]
+        return ScoreTable(tuple(clips), self.values[rows], self.weights[rows])
+
+    def valued(self) -> list[str]:
+        """Clips that have a value in some column."""
+        return [clip for clip, counts in zip(self.clips, (self.weights > 0).any(1), strict=True) if counts]
+
+    def common(self, other: ScoreTable) -> tuple[ScoreTable, ScoreTable]:
+        """Both tables with the clips that both have; one that has no value in a column of one counts in neither."""
+        clips = [clip for clip in self.clips if clip in set(other.clips)]
+        one, two = self.at(clips), other.at(clips)
+        both = (one.weights > 0) & (two.weights > 0)
+        return ScoreTable(one.clips, one.values, one.weights * both), ScoreTable(
+            two.clips, two.values, two.weights * both
+        )
+
+    def pool(self) -> Array:
+        """The score of each column; NaN where no clip has a value."""
+        return pooled(self.values, self.weights)
+
+    def resampled(self, bootstrap: Bootstrap) -> Array | None:
+        """The scores of every resample of the clips (resamples, columns); see :meth:`Bootstrap.scores`."""
+        return bootstrap.scores(self.values, self.weights)
+
+    def intervals(self, bootstrap: Bootstrap) -> list[Interval | None]:
+        """The interval of each column."""
+        return bootstrap.intervals(self.resampled(bootstrap), self.values.shape[1])
