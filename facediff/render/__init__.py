@@ -9,7 +9,7 @@ Example:
     >>> write_video("out.mp4", frames, 25, audio, 16000)  # doctest: +SKIP
 """
 
-from facediff.render.panels import check_motion, comparison, contact_sheet, heat_colours, save_image, side_by_side
+from facediff.render.panels import comparison, contact_sheet, heat_colours, save_image, side_by_side
 from facediff.render.rasteriser import EVEN, STUDIO, VIEWS, Camera, Light, Look, Renderer, portrait
 from facediff.render.video import write_video
 
@@ -21,7 +21,6 @@ __all__ = [
     "Light",
     "Look",
     "Renderer",
-    "check_motion",
     "comparison",
     "contact_sheet",
     "heat_colours",

@@ -17,39 +17,20 @@ Floats = npt.NDArray[np.floating[Any]]
 
 
 def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> Float64:
-    """Vertex positions (V, 3) as float64; refuses other shapes and kinds of number, and what is not finite."""
-    array = np.asarray(vertices)
-    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
-        raise FaceDiffError(f"{name} must have the shape (vertices, 3), got {array.shape}: x, y, z each.")
-    if n_vertices is not None and array.shape[0] != n_vertices:
-        raise FaceDiffError(
-            f"{name} has {array.shape[0]} vertices but the renderer's template has {n_vertices}: "
-            "draw a motion with the template and the faces of its own topology."
-        )
-    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-        raise FaceDiffError(f"{name} must hold real numbers, got {array.dtype}: convert it to float32.")
-    array = array.astype(np.float64)
-    if not np.isfinite(array).all():
-        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise FaceDiffError(f"{name} holds NaN or infinity (first at vertex {bad}): check its source.")
+    """Vertex positions (V, 3) as float64; refuses other shapes, another mesh's, and what is not finite."""
+    array = np.asarray(vertices, np.float64)
+    count = n_vertices or max(len(array), 1)
+    if array.shape != (count, 3) or not np.isfinite(array).all():
+        what = "NaN or infinity" if array.shape == (count, 3) else f"the shape {array.shape}"
+        raise FaceDiffError(f"{name}: {what}; expected finite positions ({count}, 3), of the template's own topology")
     return array
 
 
 def check_faces(faces: npt.ArrayLike, n_vertices: int) -> Faces:
-    """Triangles (F, 3) as int32; refuses another shape, and vertices that do not exist."""
+    """Triangles (F, 3) as int32; refuses vertices that do not exist, of which negative ones would be drawn."""
     array = np.asarray(faces)
-    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
-    if not shaped or not np.issubdtype(array.dtype, np.integer):
-        raise FaceDiffError(
-            f"faces must be whole numbers of the shape (faces, 3), got {array.dtype} {array.shape}: "
-            "pass the triangles of the template's mesh file."
-        )
-    low, high = int(array.min()), int(array.max())
-    if low < 0 or high >= n_vertices:
-        raise FaceDiffError(
-            f"faces name vertex {low if low < 0 else high} but the template has vertices 0 to "
-            f"{n_vertices - 1}: pass the faces of the same topology (counting from 0)."
-        )
+    if array.min() < 0 or array.max() >= n_vertices:
+        raise FaceDiffError(f"faces name vertices {array.min()} to {array.max()}; expected 0 to {n_vertices - 1}")
     return array.astype(np.int32)
 
 

@@ -44,8 +44,6 @@ def side_by_side(
 ) -> Iterator[Frame]:
     """Frames that show several motions in step, from left to right.
 
-    Everything is checked before the first frame is drawn.
-
     Args:
         renderers: one for all motions (the same camera for all), or one per motion where topologies differ; give those
             one camera (`Camera.framing` of all templates) if they share a unit.
@@ -58,23 +56,11 @@ def side_by_side(
         A generator of T pictures, drawn in several threads. They are as wide as all panels; strips for labels above
         and footer below add height.
     """
-    if not motions or len(labels) != len(motions):
-        raise FaceDiffError(f"{len(motions)} motions and {len(labels)} labels: give a label for each.")
     drawers = [renderers] * len(motions) if isinstance(renderers, Renderer) else list(renderers)
-    if len(drawers) != len(motions):
-        raise FaceDiffError(f"{len(motions)} motions but {len(drawers)} renderers: give one or one each.")
-    if len({drawer.height for drawer in drawers}) > 1:
-        raise FaceDiffError("the renderers' pictures differ in height: make them with one size.")
     tints = list(colours) if colours is not None else [None] * len(motions)
-    if len(tints) != len(motions):
-        raise FaceDiffError(f"{len(motions)} motions but {len(tints)} colours: give one (or None) for each.")
-    for drawer, motion, label, tint in zip(drawers, motions, labels, tints, strict=True):
-        check_motion(motion, drawer.n_vertices, label)
-        if tint is not None and np.shape(tint) not in (np.shape(motion), np.shape(motion)[1:]):
-            raise FaceDiffError(f'colours of "{label}" have the shape {np.shape(tint)}: not (V, 3) or (T, V, 3).')
-    if len({len(motion) for motion in motions}) > 1:
+    if len({len(motion) for motion in motions}) != 1:
         lengths = ", ".join(f'"{label}" {len(motion)}' for label, motion in zip(labels, motions, strict=True))
-        raise FaceDiffError(f"the motions differ in length (frames: {lengths}): cut them to one length.")
+        raise FaceDiffError(f"the motions differ in length (frames: {lengths}): cut them to one length")
     return _frames(drawers, motions, labels, tints, footer)
 
 
@@ -129,28 +115,6 @@ def _in_order(draw: Callable[[int], Frame], count: int, threads: int) -> Iterato
                 picture.cancel()
 
 
-def check_motion(motion: Motion, n_vertices: int, name: str) -> None:
-    """Refuse a motion that cannot be drawn.
-
-    Args:
-        motion: absolute positions (T, V, 3); read frame by frame, so a memory map stays on disk.
-        n_vertices: V of the template it is drawn with.
-        name: what the motion is called in the message.
-    """
-    if motion.ndim != 3 or motion.shape[2] != 3:
-        raise FaceDiffError(f'motion "{name}" must have the shape (frames, vertices, 3), got {motion.shape}.')
-    if len(motion) == 0:
-        raise FaceDiffError(f'motion "{name}" has no frames: there is nothing to draw.')
-    if motion.shape[1] != n_vertices:
-        raise FaceDiffError(
-            f'motion "{name}" has {motion.shape[1]} vertices but its template has {n_vertices}: '
-            "draw it with the faces and the template of its own topology."
-        )
-    for index, frame in enumerate(motion):
-        if not np.isfinite(frame).all():
-            raise FaceDiffError(f'motion "{name}" holds NaN or infinity (first in frame {index}): check its source.')
-
-
 def comparison(
     renderer: Renderer,
     truth: Motion,
@@ -162,8 +126,6 @@ def comparison(
     footer: str = "",
 ) -> Iterator[Frame]:
     """Frames of the truth, the prediction, and the prediction coloured by each vertex's distance from the truth.
-
-    Everything is checked before the first frame is drawn.
 
     Args:
         renderer: draws all three panels.
@@ -177,12 +139,6 @@ def comparison(
     Returns:
         A generator of T pictures, three panels wide, with strips above and below them.
     """
-    for motion, label in zip((truth, prediction), labels, strict=False):
-        check_motion(motion, renderer.n_vertices, label)
-    if len(truth) != len(prediction):
-        raise FaceDiffError(
-            f'"{labels[0]}" has {len(truth)} frames and "{labels[1]}" {len(prediction)}: cut them to one length.'
-        )
     heat = heat_colours(np.linalg.norm(np.asarray(prediction) - np.asarray(truth), axis=2), highest)
     frames = side_by_side(renderer, [truth, prediction, prediction], labels, colours=[None, None, heat])
     ground = renderer.backdrop[-1:]
@@ -216,10 +172,8 @@ def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float
     Returns:
         sRGB, of the values' shape and one axis of 3 more.
     """
-    if not highest > lowest:
-        raise FaceDiffError(f"a colour scale from {lowest} to {highest} has no extent: give a highest above the lowest")
-    if not np.isfinite(values).all():
-        raise FaceDiffError("a heat map of NaN or infinity cannot be drawn: check where the values come from")
+    if not (highest > lowest and np.isfinite(values).all()):
+        raise FaceDiffError(f"a heat map from {lowest} to {highest} has no extent, or its values are not finite")
     levels = np.rint((np.asarray(values, np.float64) - lowest) * (255 / (highest - lowest)))
     return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
 
@@ -247,13 +201,7 @@ def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str
         gap: pixels between pictures.
     """
     pictures = list(frames)
-    if not pictures or columns < 1:
-        raise FaceDiffError(f"contact sheet of {len(pictures)} frames in {columns} columns: give at least one of each.")
-    if len({picture.shape for picture in pictures}) > 1:
-        raise FaceDiffError("the frames of a contact sheet differ in size: draw them with one size.")
     if labels is not None:
-        if len(labels) != len(pictures):
-            raise FaceDiffError(f"contact sheet of {len(pictures)} frames has {len(labels)} labels: give one for each.")
         pictures = [_caption(picture, label, "top", INK) for picture, label in zip(pictures, labels, strict=True)]
     height, width, _ = pictures[0].shape
     columns = min(columns, len(pictures))
@@ -267,13 +215,8 @@ def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str
 
 def save_image(path: str | Path, image: Frame) -> None:
     """Write a picture (height, width, 3) as PNG; it appears under its name only when complete."""
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise FaceDiffError(f'picture file "{target}" must end in .png.')
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(f"image must be uint8 (height, width, 3), got {image.dtype} {image.shape}")
     picture = _pillow("Image").fromarray(image)
-    with atomic(target) as temporary:
+    with atomic(Path(path)) as temporary:
         picture.save(temporary)
 
 

@@ -1,16 +1,12 @@
-"""Normals, winding and the refusal of meshes that cannot be drawn."""
+"""Normals, winding, edges and hollows of meshes."""
 
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.render.meshes import (
     VertexSums,
-    check_faces,
-    check_vertices,
     face_outward,
     hollowness,
     is_open,
@@ -61,34 +57,3 @@ def test_hollowness_is_positive_in_hollows_and_negative_on_ridges(sphere: MakeSp
     sums = VertexSums(faces, len(vertices))
     assert hollowness(dented, vertex_normals(dented, faces), sums)[500] > 0.3
     assert hollowness(vertices, vertex_normals(vertices, faces, sums), sums).max() < 0
-
-
-@pytest.mark.parametrize(
-    ("vertices", "message"),
-    [
-        (np.zeros((4, 2)), "shape"),
-        (np.zeros((0, 3)), "shape"),
-        (np.full((4, 3), np.nan), "NaN"),
-        (np.full((4, 3), np.inf), "infinity"),
-        (np.zeros((5, 3)), "template has 4"),
-        (np.array([["a"] * 3] * 4), "numbers"),
-    ],
-)
-def test_check_vertices_refuses(vertices: np.ndarray, message: str) -> None:
-    with pytest.raises(FaceDiffError, match=message):
-        check_vertices(vertices, "vertices", 4)
-
-
-@pytest.mark.parametrize(
-    ("faces", "message"),
-    [
-        (np.array([[0, 1, 4]]), "vertex 4"),
-        (np.array([[-1, 1, 2]]), "vertex -1"),
-        (np.zeros((0, 3), int), "shape"),
-        (np.array([[0, 1, 2, 3]]), "shape"),
-        (np.array([[0.0, 1.0, 2.0]]), "whole numbers"),
-    ],
-)
-def test_check_faces_refuses(faces: np.ndarray, message: str) -> None:
-    with pytest.raises(FaceDiffError, match=message):
-        check_faces(faces, 4)

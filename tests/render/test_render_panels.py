@@ -68,28 +68,9 @@ def test_side_by_side_fits_a_very_long_label(renderer: Renderer) -> None:
     assert frame.shape[1] == 80
 
 
-def test_side_by_side_refuses_motions_before_the_first_frame(renderer: Renderer) -> None:
-    broken = MOTION.copy()
-    broken[1, 3, 2] = np.inf
-    other = Renderer(FACES, template=VERTICES, size=64)
-    calls: list[tuple[Callable[[], object], str]] = [
-        (lambda: side_by_side(renderer, [], []), "0 motions"),
-        (lambda: side_by_side(renderer, [MOTION], ["a", "b"]), "2 labels"),
-        (lambda: side_by_side(renderer, [MOTION[:0]], ["a"]), '"a" has no frames'),
-        (
-            lambda: side_by_side(renderer, [MOTION, broken], ["a", "b"]),
-            '"b" holds NaN or infinity .first in frame 1',
-        ),
-        (lambda: side_by_side(renderer, [MOTION[:, 1:]], ["a"]), "its template has"),
-        (lambda: side_by_side(renderer, [MOTION[0]], ["a"]), "shape"),
-        (lambda: side_by_side(renderer, [MOTION, MOTION[:2]], ["a", "b"]), '"a" 3, "b" 2'),
-        (lambda: side_by_side([renderer, other], [MOTION, MOTION], ["a", "b"]), "differ in height"),
-        (lambda: side_by_side([renderer], [MOTION, MOTION], ["a", "b"]), "1 renderers"),
-        (lambda: side_by_side(renderer, [MOTION], ["a"], colours=[MOTION[:2]]), "colours of"),
-    ]
-    for call, message in calls:
-        with pytest.raises(FaceDiffError, match=message):
-            call()
+def test_side_by_side_refuses_motions_of_different_lengths(renderer: Renderer) -> None:
+    with pytest.raises(FaceDiffError, match='"a" 3, "b" 2'):
+        side_by_side(renderer, [MOTION, MOTION[:2]], ["a", "b"])
 
 
 def test_contact_sheet_places_pictures_row_by_row() -> None:
@@ -99,24 +80,14 @@ def test_contact_sheet_places_pictures_row_by_row() -> None:
     assert [int(sheet[5, 5 + 14 * column, 0]) for column in range(3)] == [0, 10, 20]
     assert [int(sheet[17, 5 + 14 * column, 0]) for column in range(3)] == [30, 40, 255]
     assert contact_sheet(pictures, 3, labels=list("abcde")).shape[0] > 26
-    for bad, columns in (([], 3), (pictures, 0), ([*pictures, pictures[0][1:]], 3)):
-        with pytest.raises(FaceDiffError, match="contact sheet"):
-            contact_sheet(bad, columns)
 
 
-def test_save_image_round_trip_and_refusals(tmp_path: Path) -> None:
+def test_save_image_round_trip(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (9, 7, 3)).astype(np.uint8)
     save_image(tmp_path / "new" / "a.png", picture)
     with Image.open(tmp_path / "new" / "a.png") as image:
         np.testing.assert_array_equal(np.asarray(image), picture)
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["a.png"]
-    (tmp_path / "file").touch()
-    with pytest.raises(FaceDiffError, match="cannot be written"):
-        save_image(tmp_path / "file" / "a.png", picture)
-    with pytest.raises(FaceDiffError, match="must end in .png"):
-        save_image(tmp_path / "a.jpg", picture)
-    with pytest.raises(ValueError, match="uint8"):
-        save_image(tmp_path / "a.png", picture[..., 0])
 
 
 def test_letters_with_accents_are_drawn_and_no_boxes(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
