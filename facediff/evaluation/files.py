@@ -88,8 +88,6 @@ def list_names(
     Files whose names begin with a dot are ignored.
     """
     expected = "files of vertices (frames, 3V) or (frames, V, 3)" if len(suffixes) == 1 else "files of parameters"
-    if not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; expected one with {', '.join(suffixes)} {expected}")
     deep = any("/" in pattern.pattern for pattern in patterns)
     files = sorted(
         file
@@ -97,7 +95,7 @@ def list_names(
         if file.suffix.lower() in suffixes and not file.name.startswith(".")
     )
     if not files:
-        raise FaceDiffError(f"{folder}: holds no {' or '.join(suffixes)} file; expected {expected}")
+        raise FaceDiffError(f"{folder}: no {' or '.join(suffixes)} file; expected a folder of {expected}")
     names: dict[Path, Name] = {}
     unnamed = []
     for file in files:
@@ -152,9 +150,7 @@ def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
     truths: dict[str, Truth] = {}
     for path, name in names.items():
         if name.clip in truths:
-            raise FaceDiffError(
-                f"{path}: is the truth of {name.clip}, as {truths[name.clip].path} is; keep one of them"
-            )
+            raise FaceDiffError(f"{path}: a second truth of {name.clip}; keep it or {truths[name.clip].path}")
         truths[name.clip] = Truth(path, name)
     return truths
 
@@ -253,8 +249,6 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     """
     named = part.replace("_", " ")
     advice = f"give --regions FOLDER with {USUAL[part][0]} or FLAME_masks.pkl in it, or {OPTIONS[part]} FILE"
-    if source is None and folder is None:
-        raise FaceDiffError(f"nothing says which vertices are the {named}; {advice}")
     root = folder or Path()
     files = {name: root / name.partition(">")[0].partition(":")[0] for name in ([source] if source else USUAL[part])}
     chosen = next((name for name, path in files.items() if name == ALL or path.is_file()), None)

@@ -64,8 +64,6 @@ class RenderGraph:
     @cached_property
     def session(self) -> onnxruntime.InferenceSession:
         """The graph, ready to run."""
-        if not self.path.is_file():
-            raise FaceDiffError(f"{self.path}: no such file; expected a graph of ONNX (.onnx) with your network")
         return open_session(self.path, check_graph(self.path))
 
     @property
@@ -105,7 +103,7 @@ class OnnxScores(RenderMetric):
 
     def __init__(self, *, graph: str = "", part: str = "face") -> None:
         self.graph = RenderGraph(Path(graph))
-        self.part = _part(part)
+        self.part = cast(Literal["face", "mouth"], _one_of("part", part, "face", "mouth"))
         shape = self.graph.inputs.get("frames", [])
         if len(shape) != 5 or shape[4] != 3 or not self.graph.inputs.keys() <= {"frames", "speech"}:
             raise FaceDiffError(
@@ -150,10 +148,8 @@ class SyncScores(RenderMetric):
     part = "mouth"
 
     def __init__(self, *, video: str = "", audio: str = "", order: str = "bgr", reach: int = 15) -> None:
-        if order not in ("bgr", "rgb") or reach < 1:
-            raise FaceDiffError(f"sync: order is {order!r} and reach {reach}; expected bgr or rgb, and 1 or more")
         self.video, self.audio = RenderGraph(Path(video)), RenderGraph(Path(audio))
-        self.order, self.reach = order, reach
+        self.order, self.reach = _one_of("order", order, "bgr", "rgb"), reach
         ends = [list(graph.inputs.items()) for graph in (self.video, self.audio)]
         shapes = [end[0][1] if len(end) == 1 else [] for end in ends]
         self.flat = len(shapes[0]) == 4
@@ -226,10 +222,10 @@ def mel_spectrogram(speech: Speech) -> Array:
     return np.asarray(np.clip(8 * (decibels + 100) / 100 - 4, -4, 4), np.float32)
 
 
-def _part(part: str) -> Literal["face", "mouth"]:
-    if part not in ("face", "mouth"):
-        raise FaceDiffError(f"part is {part!r}; expected face or mouth")
-    return cast(Literal["face", "mouth"], part)
+def _one_of(name: str, value: str, *allowed: str) -> str:
+    if value not in allowed:
+        raise FaceDiffError(f"{name} is {value!r}; expected {' or '.join(allowed)}")
+    return value
 
 
 def _size(path: str, dims: Sequence[int | str | None]) -> tuple[int, int]:

@@ -116,7 +116,7 @@ def test_mistakes_on_the_command_line(files: Files, tmp_path: Path) -> None:
     shutil.copytree(files.truth, bare)
     ours = files.method()
     for words, message in (
-        ((ours, bare), "nothing says which vertices are the upper face; give --regions"),
+        ((ours, bare), "expected the upper face; give --regions"),
         ((ours, bare, "--lips", "all", "--upper-face", "all"), "give --templates"),
         ((ours, bare, "--regions", tmp_path), "lve.txt and .*FLAME_masks.pkl: not there|fdd.txt and"),
         ((ours, files.root, "--method", ours), 'already one called "ours"'),
@@ -159,9 +159,9 @@ def test_a_difference_stands_under_its_own_score(shared_files: Files) -> None:
 
 def test_clips_that_are_left_out_are_not_rendered(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
     rendered: list[Any] = []
-    monkeypatch.setattr("facediff.evaluation.evaluator.score_renders", lambda *given: rendered.append(given[2]) or {})
+    monkeypatch.setattr("facediff.evaluation.evaluator.score_renders", lambda tables, *_: rendered.extend(tables) or {})
     (files.method("ours") / "A_e03_condition_A.npy").write_bytes(b"damaged")
     report = files.evaluate("ours", protocols=["paper"], bootstrap=0, renders=["onnx"], workers=1)
     scored = [sequence.clip for sequence in report.methods[0].sequences]
     assert "A_e03" not in scored
-    assert [pair.clip for pair in rendered[0]["ours"][0]] == scored
+    assert [pair.clip for pair, _ in rendered[0].rows] == scored

@@ -240,7 +240,7 @@ class PlainError(Metric):
 
 def test_any_torchmetrics_class_can_be_registered(corpus: Files, monkeypatch: pytest.MonkeyPatch) -> None:
     registry.metric.load()
-    entry = registry.Entry("plain_error", PlainError, PlainError)
+    entry = registry.Entry("plain_error", PlainError)
     monkeypatch.setitem(registry.metric._entries, "plain_error", entry)
     report = scored(corpus, "plain_error:scale=2", bootstrap=20)
     pairs = [(batch["prediction"], batch["truth"]) for batch in batches(corpus)]

@@ -65,8 +65,6 @@ def gather(
     module = _recognise(topology, corpus or folder, manifest)
     if templates is None and corpus is not None and (corpus / "templates.pkl").is_file():
         templates = corpus / "templates.pkl"
-    if module is None and templates is None and not any(folder.glob("**/*.npy")):
-        raise FaceDiffError(f"{folder}: holds no .npy file; expected files of vertices (frames, 3V) or (frames, V, 3)")
     n_vertices = module.n_vertices if module else count_vertices(None, templates, folder)
     faces = {} if templates is None else read_templates(templates, n_vertices)
     found_mesh = _find_mesh(mesh, corpus or folder, module, n_vertices)

@@ -30,7 +30,6 @@ from facediff.render.rasteriser import FIELD_OF_VIEW
 TRUTH = "truth"  # Name of the truth in a figure
 CHUNK = 2**20  # Coordinates that are converted to float64 together: 8 MB, however long a clip is
 LISTED = 12  # The most clips that a message names
-SMALLEST_PICTURE = 40  # Fewest pixels of a picture that shows anything
 WHITE = (1.0, 1.0, 1.0)
 
 SHADED = Look(lights=EVEN, background_top=WHITE, background_bottom=WHITE)
@@ -88,32 +87,25 @@ class FigureData:
 
     def choose(self, clips: Sequence[str] | None = None) -> list[str]:
         """Clips to draw: those asked for, else all that the truth and every method have."""
-        common = [clip for clip in self.truths if all(clip in files for files in self.methods.values())]
+        sets: dict[str, Mapping[str, object]] = {TRUTH: self.truths, **self.methods}
         if clips is None:
-            if not common:
-                raise FaceDiffError(
-                    f"{' and '.join(self.names)} have no clip in common; the truth has {few(self.truths)}; "
-                    f"give --pattern and --truth-pattern, which say how files are named"
-                )
-            return common
+            clips = [clip for clip in self.truths if all(clip in files for files in sets.values())]
+        if not clips:
+            raise FaceDiffError(
+                f"{' and '.join(self.names)} have no clip in common; the truth has {few(self.truths)}; "
+                f"give --pattern and --truth-pattern, which say how files are named"
+            )
         for clip in clips:
-            if clip not in self.truths:
-                raise FaceDiffError(f'there is no clip "{clip}": {few(self.truths, clip)}')
-            for method, files in self.methods.items():
+            for name, files in sets.items():
                 if clip not in files:
-                    raise FaceDiffError(f'{method} has no prediction of clip "{clip}": {few(files, clip)}')
+                    raise FaceDiffError(f'{name} has no clip "{clip}": {few(files, clip)}')
         return list(dict.fromkeys(clips))  # one that was named twice counts once
 
     def open(self, clip: str) -> dict[str, Tensor]:
         """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length."""
         opened = {TRUTH: read_vertices(self.truths[clip].path, self.n_vertices, self.truth_stride)}
         for method, files in self.methods.items():
-            try:
-                opened[method] = read_vertices(files[clip], self.n_vertices)
-            except FaceDiffError as error:
-                raise FaceDiffError(
-                    f"{method}: {error}; all methods of a figure have the truth's mesh of {self.n_vertices} vertices"
-                ) from error
+            opened[method] = read_vertices(files[clip], self.n_vertices)
         return opened
 
     def path(self, clip: str, name: str) -> Path:
@@ -124,10 +116,8 @@ class FigureData:
         """Neutral face (V, 3) of a clip's speaker."""
         subject = self.truths[clip].name.subject
         if subject not in self.templates:
-            advice = (
-                f"there are templates of {', '.join(self.templates)}" if self.templates else "give --templates FILE"
-            )
-            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; {advice}")
+            known = f" with {subject}, not only {', '.join(self.templates)}" if self.templates else ""
+            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; give --templates FILE{known}")
         return np.asarray(self.templates[subject], np.float64)
 
     def mesh(self, clips: Sequence[str]) -> tuple[npt.NDArray[np.int32], Array]:
@@ -160,8 +150,6 @@ def find_clips(
         raise FaceDiffError(f'a method cannot be called "{TRUTH}"; name it with NAME=FOLDER')
     names, _ = list_names(truth, [NamePattern(truth_pattern, subjects)])
     truths = dict(sorted(index_truths(names).items()))
-    if not truths:
-        raise FaceDiffError(f"{truth}: no file is named like {truth_pattern}.npy; give --truth-pattern")
     readers = [NamePattern(pattern, subjects) for pattern in patterns]
     predictions: dict[str, dict[str, Path]] = {}
     for method, folder in methods.items():
@@ -170,7 +158,7 @@ def find_clips(
         if not pairs:
             raise FaceDiffError(
                 f"{folder}: no file is a prediction of a truth's clip under the condition {identity}; the truth has "
-                f"{few(truths)}; give --pattern, or choose another --identity"
+                f"{few(truths) or f'no file like {truth_pattern}.npy'}; give --pattern, --truth-pattern or --identity"
             )
         predictions[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
     return truths, predictions
@@ -203,10 +191,8 @@ def chunks(motion: Tensor, path: Path, frames: int) -> Iterator[Array]:
     step = max(1, CHUNK // max(1, motion[0].numel()))
     for first in range(0, frames, step):
         part = np.asarray(motion[first : min(first + step, frames)], np.float64)
-        finite = np.isfinite(part).all((1, 2))
-        if not finite.all():
-            bad = first + int(np.argmin(finite))
-            raise FaceDiffError(f"{path}: frame {bad} holds NaN or infinity (counted from 0); repair or omit the file")
+        if not np.isfinite(part).all():
+            raise FaceDiffError(f"{path}: holds NaN or infinity; repair or omit the file")
         yield part
 
 
@@ -244,8 +230,6 @@ class Painter:
         # The camera's picture is wider than the face, since perspective makes far parts small: it is cut to what is
         # seen. HALF is half the extent of the camera's picture at distance 1.
         self._seen = np.clip(seen.min(0) - margin, -HALF, HALF), np.clip(seen.max(0) + margin, -HALF, HALF)
-        self._cut = slice(0), slice(0)
-        self._renderer: Renderer | None = None
 
     @property
     def aspect(self) -> float:
@@ -255,10 +239,6 @@ class Painter:
 
     def set_size(self, width: int, height: int) -> None:
         """Choose how many pixels a picture has."""
-        if min(width, height) < SMALLEST_PICTURE:
-            raise FaceDiffError(
-                f"a picture of {width} × {height} pixels shows nothing; draw fewer columns, or raise --width or --dpi"
-            )
         low, high = self._seen
         scale = height / (high[1] - low[1])
         size = math.ceil(2 * HALF * scale)
@@ -275,9 +255,7 @@ class Painter:
         )
 
     def paint(self, vertices: Array, colours: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint8]:
-        """A picture (height, width, 3) of a face (V, 3) on pure white."""
-        if self._renderer is None:
-            raise ValueError("choose the size first, with set_size")
+        """A picture (height, width, 3), of the size that was set, of a face (V, 3) on pure white."""
         picture = self._renderer.render(vertices, colours=colours)[self._cut]
         picture[(picture == self._renderer.backdrop[self._cut]).all(-1)] = 255  # the backdrop darkens in its corners
         return picture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
 
 SUFFIXES = (".png", ".pdf", ".svg")
-WIDEST = 16_384  # Pixels across: as high, a figure fills a gibibyte
 COLUMN, PAGE = 85.0, 175.0  # Widths in mm of a column and of a page of the usual journals
 POINTS_PER_MM = 72 / 25.4
 
@@ -45,11 +43,6 @@ class Paper:
 
     def __post_init__(self) -> None:
         ranges.check_options(self)
-        if (across := self.pixels(self.width)) > WIDEST:
-            raise FaceDiffError(
-                f"--width {self.width:g} --dpi {self.dpi}: a figure {across} pixels wide; expected {WIDEST} at most, "
-                f"lower one of them"
-            )
 
     def pixels(self, mm: float) -> int:
         """Whole pixels of a length."""
@@ -73,14 +66,7 @@ def style(paper: Paper) -> Iterator[None]:
     if paper.font not in fonts:
         raise FaceDiffError(f'--font: there is no "{paper.font}": {choices(paper.font, fonts)}')
     with drawing_settings(paper.font):
-        warnings.filterwarnings("error", r"Glyph \d+ .*missing", UserWarning)
-        try:
-            yield
-        except UserWarning as warning:
-            if "Glyph" not in str(warning):
-                raise
-            letter = str(warning).partition(" missing")[0]
-            raise FaceDiffError(f"the font {paper.font} lacks a letter ({letter}); choose one with --font") from warning
+        yield
 
 
 def new_figure(paper: Paper, height: float, **options: object) -> Figure:

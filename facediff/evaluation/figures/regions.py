@@ -50,12 +50,10 @@ def draw_regions(
     """
     view = find_view(root, corpus)
     mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
-    if mesh is None and not view.mesh_files:
-        whose = "a person's folder" if view.data_module is None else view.corpus
-        raise FaceDiffError(f"{root}: {whose} has no mesh of its own; give a corpus folder of the same topology")
     if mesh is None:
         names = " or ".join(view.mesh_files)
-        raise FaceDiffError(f"{root}: no mesh to draw the regions on; put {names} into this folder")
+        advice = f"put {names} into this folder" if names else "give a corpus folder of the same topology"
+        raise FaceDiffError(f"{root}: no mesh to draw the regions on; {advice}")
     regions, lines = {}, {}
     for part, own in (("lips", lips), ("upper_face", upper_face)):
         sources = view.region_sources.get(part, ()) if own is None else (own,)
@@ -67,8 +65,6 @@ def draw_regions(
 
 def find_view(root: Path, corpus: str | None) -> CorpusView:
     """What a folder is, as ``facediff data check`` recognises it."""
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected a corpus folder with a mesh and regions/")
     findings = Findings()
     manifest = read_record(root, MANIFEST, findings)
     view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)

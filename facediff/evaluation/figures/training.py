@@ -67,25 +67,22 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
             for name, text in row.items():
                 if name not in ("step", "epoch", "") and text and place and np.isfinite(float(place)):
                     columns.setdefault(name, {})[float(place)] = float(text)
-    except ValueError as error:
-        raise FaceDiffError(f"{path}: not readable as a table of numbers ({error})") from error
+    except ValueError:
+        columns = {}
     if not columns:
-        raise FaceDiffError(f"{path}: holds no scalar over {axis}s; expected what CSVLogger writes during training")
+        raise FaceDiffError(f"{path}: holds no numbers over {axis}s; expected what CSVLogger writes during training")
     tables = {name: np.array(sorted(points.items()), np.float64) for name, points in sorted(columns.items())}
     return {name: Curve(table[:, 0], table[:, 1]) for name, table in tables.items()}
 
 
 def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str] | None) -> list[str]:
     """Scalars to draw: those asked for, else the loss of training and the LVE of validation if they were logged."""
-    if scalars is None:
-        scalars = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
-        if not scalars:
-            logged = ", ".join(dict.fromkeys(name for curves in runs.values() for name in curves))
-            raise FaceDiffError(f"no run logged {', '.join(USUAL_SCALARS)}; choose with --scalar from {logged}")
+    usual = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
+    scalars = scalars or usual or USUAL_SCALARS
     for run, curves in runs.items():
         for name in scalars:
             if name not in curves:
-                raise FaceDiffError(f'{run}: logged no scalar "{name}": {choices(name, curves)}')
+                raise FaceDiffError(f'{run}: logged no scalar "{name}"; choose with --scalar: {choices(name, curves)}')
     return list(dict.fromkeys(scalars))
 
 
@@ -156,8 +153,6 @@ def draw_training(
         for panel, scalar in zip(panels, scalars, strict=False):
             for number, (run, curves) in enumerate(runs.items()):
                 _draw_curve(panel, run, curves[scalar], number, smoothing, log=log)
-            if log and not any((curves[scalar].values > 0).any() for curves in runs.values()):
-                raise FaceDiffError(f'"{scalar}" has no value above 0, which --log needs; omit the option')
             if log:
                 _log_scale(panel)
             panel.set_xlabel(axis)

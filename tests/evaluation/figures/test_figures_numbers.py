@@ -62,19 +62,14 @@ def test_a_phoneme_is_found_at_its_middle(tmp_path: Path) -> None:
     }
     for name, middle in wanted.items():
         assert find_phoneme(name, phonemes, "A_e06").middle == pytest.approx(middle), name
-    with pytest.raises(FaceDiffError, match=r"m 2 times"):
+    with pytest.raises(FaceDiffError, match="not so often"):
         find_phoneme("m:3", phonemes, "A_e06")
-    with pytest.raises(FaceDiffError, match=r'"z": not spoken in clip A_e06: known are m, ɑː, f, ɑ, aʊ'):
+    with pytest.raises(
+        FaceDiffError, match=r'"z": not spoken, or not so often, in clip A_e06: known are m, ɑː, f'
+    ):
         find_phoneme("z", phonemes, "A_e06")
     assert Moment(0.15, phonemes[1]).heading.large == "/m/"
     assert Moment(0.15, replace(phonemes[1], word="map")).heading.large == "/m/ map"
-
-
-@pytest.mark.parametrize("text", ["a,b\n1,2\n", "start,end,ipa\n", "start,end,ipa\n0,x,m\n", "start,end,ipa\n2,1,m\n"])
-def test_damaged_phonemes(tmp_path: Path, text: str) -> None:
-    (tmp_path / "p.csv").write_text(text)
-    with pytest.raises(FaceDiffError, match=r"p\.csv: .*expected"):
-        read_phonemes(tmp_path / "p.csv")
 
 
 @pytest.mark.parametrize("time", [9.0, -0.1, float("nan"), float("inf")])
@@ -103,9 +98,9 @@ def test_curves_of_a_run(tmp_path: Path) -> None:
     np.testing.assert_array_equal(by_epoch["train/loss"].values, [2, np.nan])  # the epoch's last
     runs = {"one": curves, "two": curves}
     assert choose_scalars(runs, None) == ["train/loss", "val/lve"]
-    with pytest.raises(FaceDiffError, match=r'one: logged no scalar "val/lvee": did you mean "val/lve"'):
+    with pytest.raises(FaceDiffError, match=r'one: logged no scalar "val/lvee".*did you mean "val/lve"'):
         choose_scalars(runs, ["val/lvee"])
-    with pytest.raises(FaceDiffError, match="choose with --scalar from lr"):
+    with pytest.raises(FaceDiffError, match="choose with --scalar: known are lr"):
         choose_scalars({"one": {"lr": curves["lr"]}}, None)
 
 
@@ -116,11 +111,10 @@ def test_runs_without_metrics(tmp_path: Path) -> None:
     (tmp_path / "version_3" / "metrics.csv").write_text("epoch,step,a\n0,0,x\n")
     with pytest.raises(FaceDiffError, match=r"runs below are .*version_3"):
         find_metrics(tmp_path)
-    with pytest.raises(FaceDiffError, match="table of numbers"):
-        read_curves(find_metrics(tmp_path / "version_3"))
-    (tmp_path / "version_3" / "metrics.csv").write_text("epoch,step\n0,0\n")
-    with pytest.raises(FaceDiffError, match="holds no scalar"):
-        read_curves(find_metrics(tmp_path / "version_3"))
+    for text in ("epoch,step,a\n0,0,x\n", "epoch,step\n0,0\n"):
+        (tmp_path / "version_3" / "metrics.csv").write_text(text)
+        with pytest.raises(FaceDiffError, match="holds no numbers over steps"):
+            read_curves(find_metrics(tmp_path / "version_3"))
 
 
 def test_smoothing_is_the_weighted_mean_of_the_past() -> None:
