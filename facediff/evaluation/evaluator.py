@@ -110,7 +110,7 @@ class EvaluationOptions:
     progress: bool = False
 
     def __post_init__(self) -> None:
-        ranges.check_fields(self)
+        ranges.check_options(self)
 
     @property
     def regions(self) -> dict[str, tuple[int, ...]]:
