@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +95,50 @@ def test_decoys_say_something_else_and_are_as_long(tiny: Tiny) -> None:
         assert sample.decoy_audio is not None
         assert len(sample.decoy_audio) == len(sample.audio)
         assert not torch.equal(sample.decoy_audio, sample.audio)
+
+
+def test_a_decoy_is_the_next_clip_with_other_words(tiny: Tiny) -> None:
+    clips = [tiny.corpus.clips[name] for name in ("A_e01", "B_e01", "A_e02")]
+    dataset = MotionDataset(tiny.corpus, clips, tiny.identities, tiny.reference_policy(), training=False, decoys=True)
+    other = tiny.corpus.read_audio(clips[2], 0, tiny.corpus.frames(clips[2]))
+    for index in (0, 1):
+        decoy = dataset[index].decoy_audio
+        assert decoy is not None
+        assert torch.equal(decoy, other.repeat(2)[: len(decoy)])
+
+
+def test_cached_features_of_a_window_cover_its_partial_steps(tiny: Tiny) -> None:
+    """As HuBERT has it: a step less than two a frame, so that windows begin and end within steps."""
+    clips = tiny.clips("train")
+    steps = {clip.name: torch.arange(2.0 * tiny.corpus.frames(clip) - 1)[:, None] for clip in clips}
+    dataset = MotionDataset(
+        tiny.corpus,
+        clips,
+        tiny.identities,
+        tiny.reference_policy(),
+        training=True,
+        window=5,
+        features=lambda clip: steps[clip.name],
+    )
+    for seed in range(20):
+        index = seed % len(clips)
+        sample, frames = dataset.sample(Pick(index, seed), begin=seed % 7), tiny.corpus.frames(clips[index])
+        ratio = Fraction(2 * frames - 1, frames)
+        first, last = round(ratio * (seed % 7)), math.ceil(ratio * (seed % 7 + 5))
+        assert sample.features is not None
+        assert sample.features[:, 0].tolist() == list(range(first, last))
+
+
+def test_only_the_epoch_that_was_stopped_is_continued_within(tiny_root: Path) -> None:
+    loader = Tiny(root=str(tiny_root), batch_size=2).train_dataloader()
+    whole = {}
+    for epoch in range(3):
+        loader.sampler.set_epoch(epoch)
+        whole[epoch] = [batch.names for batch in loader]
+    loader.load_state_dict({"epoch": 1, "batches": 2, "seed": 0})
+    assert [batch.names for batch in loader] == whole[1][2:]
+    loader.sampler.set_epoch(2)
+    assert [batch.names for batch in loader] == whole[2]
 
 
 def test_unknown_people_have_identity_minus_one(tiny: Tiny) -> None:
