@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +20,9 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, choices
 from facediff.spaces.arkit import ARKIT
 from facediff.utils import ranges
-from facediff.utils.hints import shown
+from facediff.utils.hints import Range, read, shown
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_table, write_json, write_rows
-from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -452,9 +451,9 @@ def _read_key(row: object, frame_rate: float | None) -> Key:
     if isinstance(channel, str):
         limits = channel_of(channel).range
         if limits is not None and isinstance(value, str):  # a cell of a table
-            value = limits.read("value", value)
+            value = _read(limits, "value", value)
     if isinstance(slope, str):
-        slope = SLOPES.read("slope", slope)
+        slope = _read(SLOPES, "slope", slope)
     time = _time(row["time"], frame_rate) if "time" in row else _seconds("frame", row["frame"], frame_rate)
     return Key(time, cast(str, channel), value, row.get("interpolation", "smooth"), slope)
 
@@ -466,7 +465,7 @@ def _time(time: object, frame_rate: float | None) -> float:
         return cast(float, time)
     if not (timecode := _TIMECODE.fullmatch(time)):
         try:
-            return TIMES.read("time", time)
+            return _read(TIMES, "time", time)
         except FaceDiffError as error:
             raise FaceDiffError(f"{error}, or a timecode such as 00:00:01:12") from error
     hours, minutes, seconds = (int(number) for number in timecode.groups()[:3])
@@ -478,10 +477,18 @@ def _time(time: object, frame_rate: float | None) -> float:
     return whole + _seconds("time", int(timecode[5]), frame_rate)
 
 
+def _read(limits: Range, name: str, text: str) -> float:
+    """The number in a cell of a table."""
+    try:
+        return cast(float, read(Annotated[float, limits], text.strip()))
+    except ValueError as error:
+        raise FaceDiffError(f"{name} {shown(text)}: expected {error}") from error
+
+
 def _seconds(name: str, frame: object, frame_rate: float | None) -> float:
     limits = Range(0, TIMES.most * FRAME_RATES[1])
     if isinstance(frame, str):
-        frame = limits.read(name, frame)
+        frame = _read(limits, name, frame)
     _number(name, frame, limits)
     if frame_rate is None:
         raise FaceDiffError(f'{name} {shown(frame)}: counts frames; say how many there are a second, "frame_rate"')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +14,8 @@ from facediff.animation.options import Scales, scales_text
 from facediff.editing.eyes import Array, Eyes, Indices
 from facediff.editing.procedural import EDITED, in_words, noted, room_for
 from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step
-from facediff.utils.ranges import Range
 
 ALL = "all"  # The name of all vertices that no other name is given for
 FALL_OFF = 0.06
@@ -48,8 +49,8 @@ def read_factors(scales: Scales | None, option: str = "expressiveness", highest:
         if not name:
             raise OptionError(option, f"expected {expected}", text)
         try:
-            factor = Range(0, highest).read(name, number.strip())
-        except FaceDiffError as error:
+            factor = read(Annotated[float, Range(0, highest)], number.strip())
+        except ValueError as error:
             raise OptionError(option, f"expected {expected}", text) from error
         if name in factors:
             raise OptionError(option, f"names {name} twice; give one factor for it", text)

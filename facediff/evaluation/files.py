@@ -13,7 +13,6 @@ from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, MOTION_FOLDERS, f
 from facediff.errors import FaceDiffError
 from facediff.metrics import TOPOLOGIES, EyelidPairs, LipPairs, Region
 from facediff.utils.arrays import open_vertices
-from facediff.utils.ranges import Range
 
 # File names: who speaks, what is said, and whose style the prediction was given.
 
@@ -258,7 +257,7 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     if not above:
         return find_region(root, [chosen], chosen, n_vertices)
     try:
-        region = Region.from_weights(root / file, Range(-1e9, 1e9).read(chosen, threshold), name=chosen)
+        region = Region.from_weights(root / file, float(threshold), name=chosen)
         region.check(n_vertices)
     except ValueError as error:
         message = str(error)

@@ -1,7 +1,7 @@
 """A model as Python uses it: loaded from anywhere, it animates recordings, arrays and streams of speech.
 
-From top to bottom: :func:`load`; :class:`SpeechAnimator`, what every model can do; and :class:`Animator` and
-:class:`ExportedAnimator`, models with and without PyTorch.
+From top to bottom: :func:`load`; :class:`Animator`, which is the same for every model; and its backends, models with
+PyTorch, exported ones and folders of Audio2Face-3D.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ PRECISIONS: dict[str, Literal["32", "bf16"]] = {"float32": "32", "bfloat16": "bf
 
 def load(
     source: str | Path | None = None, device: str = "auto", commercial_only: bool = False, dtype: DType = "float32"
-) -> Animator | ExportedAnimator | Audio2FaceAnimator:
+) -> Animator:
     """A model, ready to animate.
 
     Args:
@@ -80,8 +80,12 @@ def load(
             checkpoint=named, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
         )
         if is_audio2face(named):
-            return Audio2FaceAnimator.load(options)
-        return ExportedAnimator.load(options)
+            from facediff.pipelines.audio2face import Audio2FacePipeline
+
+            return Audio2FaceAnimator(Audio2FacePipeline(options).model, named)
+        from facediff.pipelines.exported import ExportedPipeline
+
+        return Animator(ExportedPipeline(options).model, named)
     check_animating_source(named)  # before torch is imported
     from facediff.models import load_model
     from facediff.pipelines.trained import usable_device
@@ -119,32 +123,237 @@ def import_checkpoint(
     return Animator(import_model(paths, **options).to(usable_device(device)), first)
 
 
-class SpeechAnimator(ABC):
-    """A model: ``model.animate("speech.wav", identity="F1")`` makes an animation.
-
-    Every method leaves the model as it was: what is chosen for one call does not change the next one.
+class Backend(ABC):
+    """A kind of model under an :class:`Animator`.
 
     Attributes:
-        source: the file, folder or name of the hub that it comes from, for the metadata of animations.
-        dtype: in which it multiplies where a call does not choose, ``float32`` or ``bfloat16``.
+        identities: those that it was trained on; the first one is the default.
+        other_identities: further ones whose face it knows.
+        frame_rate: frames a second of its animations.
+        unit: unit of length of its animations.
+        n_vertices: vertices of its faces.
+        corpus: that it was trained on.
+        licence: the licences of its data and its weights, in a line.
+        commercial_use: whether the strictest of them allows commercial use.
+        device: where it computes.
     """
 
-    source: str | Path
-    dtype: str = "float32"
-
-    @property
-    @abstractmethod
-    def identities(self) -> list[str]:
-        """The identities that it was trained on; the first one is the default."""
-
-    @property
-    def device(self) -> str:
-        """Where it computes: without PyTorch, on the processor."""
-        return "cpu"
+    identities: list[str]
+    other_identities: list[str]
+    frame_rate: float
+    unit: str
+    n_vertices: int
+    corpus: str
+    licence: str
+    commercial_use: Commercial
+    device: str = "cpu"
 
     @abstractmethod
     def open(self, options: AnimationOptions) -> AbstractContextManager[AnimationPipeline]:
         """The model with its choices made, for as long as the context lasts."""
+
+    def extract_style(self, clips: list[StyleLike], identity: str) -> npt.NDArray[np.float32]:
+        """The mean style vector (S,) of clips; empty where the model has none."""
+        import numpy as np
+
+        return np.zeros(0, np.float32)
+
+
+class TrainedBackend(Backend):
+    """A LightningModule in evaluation mode, with the assets of its corpus."""
+
+    def __init__(self, module: AnimationModel) -> None:
+        self.module, assets = module.eval(), module.assets
+        self.identities = list(module.identities)
+        self.other_identities = sorted({*assets.templates} - {*module.identities})
+        self.frame_rate, self.unit, self.n_vertices = module.frame_rate, assets.unit, module.n_vertices
+        self.corpus = f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
+        self.licence, self.commercial_use = in_words(module.licences), commercial_use(module.licences)
+
+    @property
+    def device(self) -> str:  # type: ignore[override]
+        """Where it computes."""
+        return str(self.module.device)
+
+    @contextmanager
+    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
+        """The model with its choices made, which are forgotten at the end of the context."""
+        from facediff.pipelines.trained import TrainedPipeline
+
+        with self.module.choosing():
+            yield TrainedPipeline(options, model=self.module)
+
+    def extract_style(self, clips: list[StyleLike], identity: str) -> npt.NDArray[np.float32]:
+        """The mean style vector (S,) of clips; empty where the model has none."""
+        from facediff.models.styles import extract_style
+
+        return extract_style(clips, identity, self.module).numpy()
+
+
+class ExportedBackend(Backend):
+    """An open folder of ``facediff export-model``, without PyTorch."""
+
+    def __init__(self, model: RuntimeModel) -> None:
+        self.model, about = model, model.description
+        self.identities = about.known
+        self.other_identities = [name for name in about.faces if name not in self.identities]
+        self.frame_rate, self.unit, self.n_vertices = model.frame_rate, about.unit, model.arrays["templates"].shape[1]
+        self.corpus = f"{about.corpus} (synthetic)" if about.synthetic else about.corpus
+        self.licence = about.licences.get("licence", "")
+        self.commercial_use = cast("Commercial", about.licences.get("commercial_use", "unknown"))
+
+    @contextmanager
+    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
+        """The model with its choices made."""
+        from facediff.pipelines.exported import ExportedPipeline
+
+        yield ExportedPipeline(options, model=self.model)
+
+    def extract_style(self, clips: list[StyleLike], identity: str) -> npt.NDArray[np.float32]:
+        """The mean style vector (S,) of clips; empty where the model has none."""
+        import numpy as np
+
+        from facediff.runtime.styles import style_from
+
+        if self.model.description.style_source != "reference":
+            return super().extract_style(clips, identity)
+        return np.mean([style_from(clip, self.model, identity).vector for clip in clips], axis=0, dtype=np.float32)
+
+
+class Audio2FaceBackend(Backend):
+    """An open folder of Audio2Face-3D, without PyTorch.
+
+    Attributes:
+        weights: how weights of its blendshapes are solved for; may be changed.
+    """
+
+    def __init__(self, model: Audio2Face) -> None:
+        from facediff.pipelines.audio2face import FRAME_RATE, UNIT, Audio2FaceWeights, licences_of
+
+        self.model, facts = model, model.folder.facts
+        self.identities, self.other_identities = [facts.actor or "actor"], []
+        self.frame_rate, self.unit, self.n_vertices, self.corpus = (
+            FRAME_RATE,
+            UNIT,
+            facts.skin_vertices,
+            "Audio2Face-3D",
+        )
+        self.licence, self.commercial_use = in_words(licences_of(model)), commercial_use(licences_of(model))
+        self.weights: Audio2FaceWeights = Audio2FaceWeights()
+
+    @contextmanager
+    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
+        """The model with its choices made."""
+        from facediff.pipelines.audio2face import Audio2FacePipeline
+
+        yield Audio2FacePipeline(options, model=self.model, frame_rate=self.frame_rate, weights=self.weights)
+
+
+class Animator:
+    """A model: ``model.animate("speech.wav", identity="F1")`` makes an animation.
+
+    Every method leaves the model as it was: an option of one call does not change the next one.
+
+    Args:
+        model: the model as a LightningModule with the assets of its corpus, or an open exported folder.
+        source: the file, folder or name of the hub that it comes from, for the metadata of animations; the name of its
+            class if None.
+        dtype: in which it multiplies where a call does not choose, float32 or bfloat16.
+
+    Attributes:
+        model: the LightningModule, or the open folder.
+        backend: the kind of model with its facts.
+    """
+
+    def __init__(
+        self,
+        model: AnimationModel | RuntimeModel | Audio2Face,
+        source: str | Path | None = None,
+        *,
+        dtype: DType = "float32",
+    ) -> None:
+        precision_of(dtype)  # refuses what is none
+        self.model: Any = model
+        self.backend = backend_of(model)
+        self.source = type(model).__name__ if source is None else source
+        self.dtype = str(dtype).removeprefix("torch.")
+
+    @property
+    def module(self) -> AnimationModel:
+        """The LightningModule of a trained model."""
+        return cast("AnimationModel", self.model)
+
+    @property
+    def identities(self) -> list[str]:
+        """The identities that it was trained on; the first one is the default."""
+        return self.backend.identities
+
+    @property
+    def other_identities(self) -> list[str]:
+        """Further identities whose face it knows, and whose motion it was not trained on."""
+        return self.backend.other_identities
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames a second of its animations; that of Audio2Face-3D may be set."""
+        return self.backend.frame_rate
+
+    @frame_rate.setter
+    def frame_rate(self, value: float) -> None:
+        if not isinstance(self.backend, Audio2FaceBackend):
+            raise AttributeError("frame_rate: a model has that of its corpus")
+        self.backend.frame_rate = value
+
+    @property
+    def unit(self) -> str:
+        """Unit of length of its animations."""
+        return self.backend.unit
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of its faces."""
+        return self.backend.n_vertices
+
+    @property
+    def corpus(self) -> str:
+        """The corpus that it was trained on."""
+        return self.backend.corpus
+
+    @property
+    def licence(self) -> str:
+        """The licences of its data and its weights, in a line; see docs/publishing.md."""
+        return self.backend.licence
+
+    @property
+    def commercial_use(self) -> Commercial:
+        """Whether the strictest of its licences allows commercial use: allowed, forbidden or unknown."""
+        return self.backend.commercial_use
+
+    @property
+    def device(self) -> str:
+        """Where it computes: without PyTorch, on the processor."""
+        return self.backend.device
+
+    def to(self, device: str, dtype: DType | None = None) -> Self:
+        """Move the model: ``model.to("cuda")``.
+
+        Args:
+            device: cpu, cuda …; ``auto`` for a CUDA device where there is one.
+            dtype: in which it multiplies from now on, float32 or bfloat16; as before if None.
+
+        Returns:
+            the model itself.
+
+        Raises:
+            FaceDiffError: if the device cannot be used.
+        """
+        from facediff.pipelines.trained import usable_device
+
+        if dtype is not None:
+            precision_of(dtype)
+            self.dtype = str(dtype).removeprefix("torch.")
+        self.module.to(usable_device(str(device)))
+        return self
 
     @overload
     def animate(
@@ -228,7 +437,7 @@ class SpeechAnimator(ABC):
         from facediff.speech.audio import speech_of
 
         animations: list[Animation | Samples] = []
-        with self.open(chosen) as pipeline:
+        with self.backend.open(chosen) as pipeline:
             pipeline.progress = None if isinstance(progress, bool) else progress
             for recording in [speech] if several is None else several:
                 if not isinstance(recording, str | Path):
@@ -277,7 +486,7 @@ class SpeechAnimator(ABC):
         rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
         chosen = self._options(dtype, **options)
         refuse_folder(chosen.direction)
-        with self.open(chosen) as pipeline:
+        with self.backend.open(chosen) as pipeline:
             stream = pipeline.stream(rate)
 
         def frames() -> Iterator[npt.NDArray[np.float32]]:
@@ -301,120 +510,23 @@ class SpeechAnimator(ABC):
         check_options(chosen)
         return chosen
 
-
-class Animator(SpeechAnimator):
-    """A trained model, with PyTorch.
-
-    Args:
-        module: the model as a LightningModule, in evaluation mode, with the assets of its corpus.
-        source: the file, folder or name of the hub that it comes from, for the metadata of animations; the name of its
-            class if None.
-        dtype: in which it multiplies, float32 or bfloat16.
-
-    Attributes:
-        module: the LightningModule.
-    """
-
-    def __init__(self, module: AnimationModel, source: str | Path | None = None, *, dtype: DType = "float32") -> None:
-        precision_of(dtype)  # refuses what is none
-        self.module = module.eval()
-        self.source = type(module).__name__ if source is None else source
-        self.dtype = str(dtype).removeprefix("torch.")
-
-    @contextmanager
-    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
-        """The model with its choices made, which are forgotten at the end of the context."""
-        from facediff.pipelines.trained import TrainedPipeline
-
-        with self.module.choosing():
-            yield TrainedPipeline(options, model=self.module)
-
-    def to(self, device: str, dtype: DType | None = None) -> Self:
-        """Move the model: ``model.to("cuda")``.
-
-        Args:
-            device: cpu, cuda …; ``auto`` for a CUDA device where there is one.
-            dtype: in which it multiplies from now on, float32 or bfloat16; as before if None.
-
-        Returns:
-            the model itself.
-
-        Raises:
-            FaceDiffError: if the device cannot be used.
-        """
-        from facediff.pipelines.trained import usable_device
-
-        if dtype is not None:
-            precision_of(dtype)
-            self.dtype = str(dtype).removeprefix("torch.")
-        self.module.to(usable_device(str(device)))
-        return self
-
-    @property
-    def identities(self) -> list[str]:
-        """The identities that it was trained on; the first one is the default."""
-        return list(self.module.identities)
-
-    @property
-    def other_identities(self) -> list[str]:
-        """Further identities whose face it knows, and whose motion it was not trained on."""
-        return sorted({*self.module.assets.templates} - {*self.module.identities})
-
-    @property
-    def frame_rate(self) -> float:
-        """Frames a second of its animations."""
-        return self.module.frame_rate
-
-    @property
-    def unit(self) -> str:
-        """Unit of length of its animations."""
-        return self.module.assets.unit
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of its faces."""
-        return self.module.n_vertices
-
-    @property
-    def corpus(self) -> str:
-        """The corpus that it was trained on."""
-        assets = self.module.assets
-        return f"{assets.corpus} (synthetic)" if assets.synthetic else assets.corpus
-
-    @property
-    def licence(self) -> str:
-        """The licences of its data and its weights, in a line; see docs/publishing.md."""
-        return in_words(self.module.licences)
-
-    @property
-    def commercial_use(self) -> Commercial:
-        """Whether the strictest of its licences allows commercial use: allowed, forbidden or unknown."""
-        return commercial_use(self.module.licences)
-
-    @property
-    def device(self) -> str:
-        """Where it computes."""
-        return str(self.module.device)
-
     def extract_style(
         self, clips: StyleLike | Sequence[str | Path | Animation], *, identity: str | None = None
     ) -> npt.NDArray[np.float32]:
         """The style vector (S,) of clips, their mean if there are several; :meth:`animate` takes it as ``style``.
 
         Args:
-            clips: motion of one speaker: names of clips, files, animations or arrays; one, or a list of them.
+            clips: motion of one speaker: names of clips or styles, files, animations or arrays; one, or a list of them.
             identity: whose motion it is, where nothing else says it; the first one trained on if None.
 
         Raises:
             FaceDiffError: if a clip cannot be read, is a style vector already, or the model has no style.
         """
-        from facediff.models.styles import extract_style
-
         given: list[StyleLike] = list(clips) if isinstance(clips, list | tuple) else [cast("StyleLike", clips)]
-        vector = extract_style(given, identity or self.identities[0], self.module)
+        vector = self.backend.extract_style(given, identity or self.identities[0])
         if not len(vector):
             raise FaceDiffError(f"{self.source}: was trained without a dynamic style, so it has no style vectors")
-        return vector.numpy()
+        return vector
 
     def save_pretrained(
         self,
@@ -424,7 +536,7 @@ class Animator(SpeechAnimator):
         license: str | None = None,  # noqa: A002 - the hub's word
         **card: Any,  # noqa: ANN401
     ) -> Path:
-        """Write the model as a folder that :func:`facediff.load` reads, to be handed to others or sent to the hub.
+        """Write a trained model as a folder that :func:`facediff.load` reads, for others or for the hub.
 
         Args:
             folder: a folder that does not exist, or is empty.
@@ -441,150 +553,40 @@ class Animator(SpeechAnimator):
         known = f"identities {', '.join(self.identities)}"
         known += f" (not trained on: {', '.join(self.other_identities)})" if self.other_identities else ""
         return (
-            f"Animator({str(self.source)!r}: {type(self.module).__name__} of {self.corpus}, {known}, "
+            f"Animator({str(self.source)!r}: {type(self.model).__name__} of {self.corpus}, {known}, "
             f"{self.frame_rate:g} frames a second, {self.n_vertices} vertices in {self.unit}, on {self.device}; "
             f"{self.licence})"
         )
 
 
-class ExportedAnimator(SpeechAnimator):
-    """A folder of ``facediff export-model``, without PyTorch.
+def backend_of(model: AnimationModel | RuntimeModel | Audio2Face) -> Backend:
+    """The backend for a model of any kind; none imports the libraries of the others."""
+    from facediff.runtime.audio2face import Audio2Face
+    from facediff.runtime.model import RuntimeModel
 
-    Args:
-        model: the open folder.
-        source: where it lies.
-    """
-
-    def __init__(self, model: RuntimeModel, source: str | Path) -> None:
-        self.model, self.source = model, source
-
-    @classmethod
-    def load(cls, options: AnimationOptions) -> Self:
-        """Open the folder that options name; a device or a precision that it does not have is refused."""
-        from facediff.pipelines.exported import ExportedPipeline
-
-        return cls(ExportedPipeline(options).model, options.checkpoint)
-
-    @property
-    def identities(self) -> list[str]:
-        """The identities that it was trained on and whose faces it has; the first one is the default."""
-        return self.model.description.known
-
-    @property
-    def corpus(self) -> str:
-        """The corpus that it was trained on."""
-        about = self.model.description
-        return f"{about.corpus} (synthetic)" if about.synthetic else about.corpus
-
-    @property
-    def frame_rate(self) -> float:
-        """Frames a second of its animations."""
-        return self.model.frame_rate
-
-    @property
-    def other_identities(self) -> list[str]:
-        """Faces that it was not trained on."""
-        return [name for name in self.model.description.faces if name not in self.identities]
-
-    @property
-    def unit(self) -> str:
-        """The unit of its vertices."""
-        return self.model.description.unit
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of its faces."""
-        return int(self.model.arrays["templates"].shape[1])
-
-    @property
-    def licence(self) -> str:
-        """The licences that it inherits, as its animations' metadata have them."""
-        return self.model.description.licences.get("licence", "")
-
-    @property
-    def commercial_use(self) -> str:
-        """Whether the strictest of its licences allows commercial use: allowed, forbidden or unknown."""
-        return self.model.description.licences.get("commercial_use", "unknown")
-
-    def extract_style(
-        self, clips: StyleLike | Sequence[str | Path | Animation], *, identity: str | None = None
-    ) -> npt.NDArray[np.float32]:
-        """The style vector (S,) of clips, their mean if there are several; :meth:`animate` takes it as ``style``.
-
-        Args:
-            clips: names of the folder's styles, files, animations or arrays; one, or a list of them.
-            identity: whose motion it is, where nothing else says it; the first one trained on if None.
-
-        Raises:
-            FaceDiffError: if a clip cannot be read, or the model takes no styles from motion.
-        """
-        import numpy as np
-
-        from facediff.runtime.styles import style_from
-
-        if self.model.description.style_source != "reference":
-            raise FaceDiffError(f"{self.source}: was trained without a dynamic style, so it has no style vectors")
-        several = clips if isinstance(clips, list | tuple) else [clips]
-        vectors = [style_from(clip, self.model, identity or self.identities[0]).vector for clip in several]
-        return np.mean(vectors, axis=0, dtype=np.float32)
-
-    @contextmanager
-    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
-        """The model with its choices made."""
-        from facediff.pipelines.exported import ExportedPipeline
-
-        yield ExportedPipeline(options, model=self.model)
-
-    def __repr__(self) -> str:
-        about = self.model.description
-        return (
-            f"ExportedAnimator({str(self.source)!r}: {about.model}, identities {', '.join(self.identities)}, "
-            f"{self.frame_rate:g} frames a second, in {about.unit}; {about.licences.get('licence', '')})"
-        )
+    if isinstance(model, RuntimeModel):
+        return ExportedBackend(model)
+    return Audio2FaceBackend(model) if isinstance(model, Audio2Face) else TrainedBackend(model)
 
 
-class Audio2FaceAnimator(SpeechAnimator):
-    """A folder of Audio2Face-3D, without PyTorch; ``style="joy:0.7,pain:0.2"`` says how strong each emotion is.
+class Audio2FaceAnimator(Animator):
+    """A folder of Audio2Face-3D, with its blendshapes; ``style="joy:0.7,pain:0.2"`` says how strong each emotion is."""
 
-    Args:
-        model: the open folder.
-        source: where it lies.
-
-    Attributes:
-        frame_rate: frames a second of its animations; may be changed.
-        weights: how weights of its blendshapes are solved for; may be changed.
-    """
-
-    def __init__(self, model: Audio2Face, source: str | Path) -> None:
-        from facediff.pipelines.audio2face import FRAME_RATE, Audio2FaceWeights
-
-        self.model, self.source = model, source
-        self.frame_rate = FRAME_RATE
-        self.weights: Audio2FaceWeights = Audio2FaceWeights()
-
-    @classmethod
-    def load(cls, options: AnimationOptions) -> Self:
-        """Open the folder that options name; a device or a precision that it does not have is refused."""
-        from facediff.pipelines.audio2face import Audio2FacePipeline
-
-        return cls(Audio2FacePipeline(options).model, options.checkpoint)
-
-    @property
-    def identities(self) -> list[str]:
-        """The actor."""
-        return [self.model.folder.facts.actor or "actor"]
+    backend: Audio2FaceBackend
 
     @property
     def emotions(self) -> tuple[str, ...]:
         """The emotions that have a strength."""
-        return self.model.folder.facts.emotions
+        return cast("Audio2Face", self.model).folder.facts.emotions
 
-    @contextmanager
-    def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
-        """The model with its choices made."""
-        from facediff.pipelines.audio2face import Audio2FacePipeline
+    @property
+    def weights(self) -> Audio2FaceWeights:
+        """How weights of its blendshapes are solved for; may be set."""
+        return self.backend.weights
 
-        yield Audio2FacePipeline(options, model=self.model, frame_rate=self.frame_rate, weights=self.weights)
+    @weights.setter
+    def weights(self, weights: Audio2FaceWeights) -> None:
+        self.backend.weights = weights
 
     def solve(
         self, part: Part, vertices: npt.NDArray[np.float32], temporal: float | None = None
@@ -601,13 +603,6 @@ class Audio2FaceAnimator(SpeechAnimator):
         """
         weights = self.weights if temporal is None else replace(self.weights, temporal=temporal)
         return weights.solve(self.model, part, vertices)
-
-    def __repr__(self) -> str:
-        facts = self.model.folder.facts
-        return (
-            f"Audio2FaceAnimator({str(self.source)!r}: {facts.actor}, {facts.skin_vertices} vertices, "
-            f"{self.frame_rate:g} frames a second, emotions {', '.join(facts.emotions)})"
-        )
 
 
 def precision_of(dtype: DType) -> Literal["32", "bf16"]:

@@ -214,13 +214,12 @@ def perform(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | Non
 
 
 def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placement) -> CandidateMotion:
-    from facediff.pipelines.animator import Animator, ExportedAnimator, load
+    from facediff.pipelines.animator import load
 
     if candidate.model is None:
         raise FaceDiffError(f"{candidate.name}: names no model")
     animator = load(candidate.model, device="cpu")
-    others = animator.other_identities if isinstance(animator, Animator | ExportedAnimator) else []
-    faces = [*animator.identities, *others]
+    faces = [*animator.identities, *animator.other_identities]
     identity = candidate.identity or (SPEAKER if SPEAKER in faces else None)
     options: RecordingKeywords = {} if identity is None else {"identity": identity}
     if candidate.style is not None:

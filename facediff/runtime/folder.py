@@ -263,7 +263,7 @@ def _check_arrays(description: Description, arrays: Arrays) -> None:
     optional: dict[str, tuple[int | None, ...]] = {
         "noise": (description.state, description.state),
         "faces": (None, 3),
-        "colours": (faces, vertices, 3) if np.ndim(arrays.get("colours")) == 3 else (vertices, 3),
+        "colours": (faces, vertices, 3) if "colours" in arrays and arrays["colours"].ndim == 3 else (vertices, 3),
         "inner_lip_pairs": (None, 2),
     }
     shapes |= {name: shape for name, shape in optional.items() if name in arrays}

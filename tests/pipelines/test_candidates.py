@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.pipelines.animator import ExportedAnimator
+from facediff.pipelines.animator import Animator
 from facediff.pipelines.candidates import Candidate, Placement, perform
 from facediff.spaces import Space
 from facediff.spaces.arkit import ALPHABETICAL, ARKIT
@@ -79,11 +79,11 @@ def test_motion_of_another_program_is_read_by_the_clips_names(tmp_path: Path) ->
     assert np.abs(made.clips[clips[0].name].points - own.points).max() < 1e-5
 
 
-class Exported(ExportedAnimator):
+class Exported(Animator):
     """An exported model that was not trained on the face of the clips, and has it."""
 
-    identities = ["A"]  # noqa: RUF012 - in place of a property
-    other_identities = [SPEAKER]  # noqa: RUF012
+    identities = ["A"]  # type: ignore[assignment]  # noqa: RUF012 - in place of a property
+    other_identities = [SPEAKER]  # type: ignore[assignment]  # noqa: RUF012
 
     def __init__(self) -> None:
         self.asked: list[object] = []
