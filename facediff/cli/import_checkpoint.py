@@ -47,8 +47,7 @@ def import_checkpoint(
     if output.suffix != ".ckpt":
         raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
     for path in files:
-        # A checkpoint of TensorFlow is named by what its files' names begin with, too.
-        if not path.is_file() and not path.with_name(f"{path.name}.index").is_file():
+        if not path.is_file():
             raise FaceDiffError(f"{path}: no such file; expected the checkpoint of a published method")
     if doctor:
         from facediff.models.published.doctor import examine

@@ -24,7 +24,7 @@ from facediff.models.layers import Width, all_states, exporting, frame_mask, lon
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.limits import quoted
-from facediff.utils.tensorflow_files import read_graph
+from facediff.utils.torch_files import read_authors_checkpoint
 
 FRAME, HOP, SPECTRUM = 400, 160, 512
 """Samples of a frame (25 ms) and from one to the next (10 ms); those that the Fourier transform takes."""
@@ -265,7 +265,7 @@ class DeepSpeechEncoder(FrozenEncoder):
     Args:
         dim: channels of the result, by a linear map of the logits; the 29 logits as they are if None. Given by the
             model.
-        source: the frozen graph ``output_graph.pb`` of the release 0.1.0, which TensorFlow is not needed for.
+        source: the frozen graph ``output_graph.pb`` of the release 0.1.0, converted by ``tools/convert_tensorflow.py``.
         config: the network's sizes; if given, the weights are not read from ``source`` but left for a checkpoint to
             fill in. Checkpoints use it, so that they need no access to ``source``.
 
@@ -276,7 +276,7 @@ class DeepSpeechEncoder(FrozenEncoder):
     checkpoint_options = ("config",)  # without it, a file could have another one read
 
     def __init__(
-        self, *, dim: Width | None, source: str = "output_graph.pb", config: dict[str, Any] | None = None
+        self, *, dim: Width | None, source: str = "deepspeech.npz", config: dict[str, Any] | None = None
     ) -> None:
         super().__init__()
         state: dict[str, Tensor] = {}
@@ -284,10 +284,10 @@ class DeepSpeechEncoder(FrozenEncoder):
             path = Path(source).expanduser()
             if not path.is_file():
                 raise FaceDiffError(
-                    f"audio_encoder.source: no file {source}; expected the graph output_graph.pb of DeepSpeech 0.1.0, "
-                    f"unpack it from {RELEASE}"
+                    f"audio_encoder.source: no file {source}; expected the graph output_graph.pb of DeepSpeech 0.1.0 "
+                    f"({RELEASE}), converted by tools/convert_tensorflow.py"
                 )
-            state, config, _ = network_of(read_graph(path), source)
+            state, config, _ = network_of(read_authors_checkpoint(path)[0], source)
         self.sizes = checked_sizes(config)
         self.context = self.sizes["inputs"] // CEPSTRA // 2
         self.network = DeepSpeech(self.sizes)

@@ -10,7 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, Any
 
+import numpy as np
+
 from facediff.errors import FaceDiffError
+from facediff.utils.arrays import read_arrays
 from facediff.utils.limits import brief
 
 if TYPE_CHECKING:
@@ -110,7 +113,7 @@ def read_authors_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, An
     of which nothing is imported or run.
 
     Args:
-        path: the file.
+        path: a file of ``torch.save``, or arrays by name (``.npz``), as ``tools/convert_tensorflow.py`` writes them.
 
     Returns:
         tensors by name, without a leading ``module.``; and options by name: numbers, texts, lists of these, and paths
@@ -118,6 +121,8 @@ def read_authors_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, An
     """
     import torch
 
+    if path.suffix == ".npz":
+        return {name: torch.from_numpy(np.array(value)) for name, value in read_arrays(path).items()}, {}
     try:
         names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
     except Exception:  # an archive of before PyTorch 1.6, which may hold tensors alone; or damaged, as is said below

@@ -111,11 +111,10 @@ def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def deepspeech_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """DeepSpeech's frozen graph in miniature, with random weights."""
-    from tests.fakes.tensorflow import write_graph
-    from tests.fakes.voca import deepspeech_state
+    """DeepSpeech's converted graph in miniature, with random weights."""
+    from tests.fakes.voca import deepspeech_state, write_arrays
 
-    return write_graph(tmp_path_factory.mktemp("deepspeech") / "output_graph.pb", deepspeech_state())
+    return write_arrays(tmp_path_factory.mktemp("deepspeech") / "deepspeech.npz", deepspeech_state())
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Tiny checkpoints of VOCA and DeepSpeech in their authors' form, and what the published code makes of speech.
+"""Tiny checkpoints of VOCA and DeepSpeech as they are converted, and what the published code makes of speech.
 
 The reference is NumPy in float64 from the formulas; it shares no code with facediff.
 """
@@ -9,8 +9,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-
-from tests.fakes.tensorflow import write_bundle, write_graph
 
 VERTICES, LOGITS, COUNT = 12, 29, 3
 IDENTITIES = ["A", "B", "C"]
@@ -73,10 +71,19 @@ def deepspeech_state(seed: int = 1, units: int = 12, cells: int = 6) -> Arrays:
     return made
 
 
-def write_voca(folder: Path, seed: int = 0, **options: int) -> list[Path]:
-    """The checkpoint's index and DeepSpeech's graph as their authors distribute them."""
-    index = write_bundle(folder / "gstep_52280.model", voca_state(seed), **options)
-    return [index, write_graph(folder / "output_graph.pb", deepspeech_state())]
+def write_arrays(path: Path, arrays: Arrays) -> Path:
+    """Arrays as tools/convert_tensorflow.py writes them."""
+    with path.open("wb") as stream:
+        np.savez(stream, **arrays)
+    return path
+
+
+def write_voca(folder: Path, seed: int = 0) -> list[Path]:
+    """The checkpoint and DeepSpeech's graph, converted."""
+    return [
+        write_arrays(folder / "voca.npz", voca_state(seed)),
+        write_arrays(folder / "deepspeech.npz", deepspeech_state()),
+    ]
 
 
 # Cepstra, as python_speech_features computes them by default.

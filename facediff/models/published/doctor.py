@@ -14,9 +14,9 @@ from facediff import registry
 from facediff.errors import FaceDiffError
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import (
-    GRAPH,
     convert,
     facts_and_faces,
+    is_graph,
     read_weights,
     refuse_idle,
     with_options,
@@ -40,7 +40,8 @@ def examine(files: Sequence[Path], options: ImportOptions) -> Iterator[str]:
                 digest = hashlib.file_digest(stream, "sha256").hexdigest()
             yield f"{path}: {path.stat().st_size} bytes, sha256 {digest}"
     try:
-        weights = read_weights([path for path in files if path.suffix != GRAPH])
+        graphs = [path for path in files if is_graph(path)]
+        weights = read_weights([path for path in files if path not in graphs])
     except FaceDiffError as error:
         yield f"cannot be read: {error}"
         return
@@ -76,7 +77,7 @@ def compared(
     try:
         refuse_idle(options, method)
         options, _ = options.with_hparams()
-        facts, _ = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
+        facts, _ = facts_and_faces(weights, method, options, [path for path in files if is_graph(path)])
         converted = convert(weights, method, facts, options)
         arguments = with_options(method.method, converted, facts.model_options)
         model = registry.model.get(method.method)(**facts.sizes(), **arguments)

@@ -40,11 +40,11 @@ from facediff.models.published.recognition import (
 )
 from facediff.spaces.layouts import layout
 from facediff.utils import hints
+from facediff.utils.arrays import read_arrays
 from facediff.utils.hints import is_name, options_of
 from facediff.utils.licences import Licence, merged, network_licences
 from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
-from facediff.utils.tensorflow_files import read_bundle
 from facediff.utils.torch_files import read_authors_checkpoint
 
 if TYPE_CHECKING:
@@ -74,8 +74,8 @@ def import_checkpoint(paths: str | Path | Sequence[str | Path], **options: Any) 
     """An author's checkpoint of one of the published methods as a model.
 
     Args:
-        paths: the file, or the files of a method with several stages; of TensorFlow's checkpoints the ``.index``, the
-            ``.data-…`` or what both names begin with, and the frozen graph (``.pb``) that the method needs.
+        paths: the file, or the files of a method with several stages; of TensorFlow's checkpoints and
+            graphs those (``.npz``) of ``tools/convert_tensorflow.py``.
         options: fields of :class:`~facediff.models.published.import_options.ImportOptions`, such as ``templates``; and
             options of the model or its audio encoder, such as ``num_heads=4`` or ``long_speech="extend"``.
 
@@ -92,11 +92,12 @@ def import_checkpoint(paths: str | Path | Sequence[str | Path], **options: Any) 
 def import_files(paths: str | Path | Sequence[str | Path], options: ImportOptions) -> Imported:
     """As :func:`import_checkpoint`, with a report of what became of the files."""
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
-    weights = read_weights([path for path in files if path.suffix != GRAPH])
+    graphs = [path for path in files if is_graph(path)]
+    weights = read_weights([path for path in files if path not in graphs])
     method = recognise(weights)
     refuse_idle(options, method)
     options, unused = options.with_hparams()
-    facts, own = facts_and_faces(weights, method, options, [path for path in files if path.suffix == GRAPH])
+    facts, own = facts_and_faces(weights, method, options, graphs)
     converted = convert(weights, method, facts, options)
     if left := weights.left():
         raise OptionError.naming(
@@ -159,13 +160,6 @@ def facts_and_faces(
     return own_facts(own, method, options), own
 
 
-GRAPH, META = ".pb", ".meta"
-"""Suffixes of TensorFlow's graphs: of a frozen one with its weights, and of one without."""
-
-SHARD = re.compile(r"(.+)\.data-\d{5}-of-\d{5}")
-"""Names of files with the bytes of a TensorFlow checkpoint's tensors."""
-
-
 def the_graph(files: Sequence[Path], option: object, method: Recogniser) -> Path | None:
     """The frozen graph that a method needs, which is a further file, or that of an option.
 
@@ -180,27 +174,9 @@ def the_graph(files: Sequence[Path], option: object, method: Recogniser) -> Path
     return graphs[0] if graphs else None
 
 
-def bundles(files: Sequence[Path]) -> dict[Path, list[Path]]:
-    """The files of checkpoints, in their order, each with those that were given of its tensors' bytes.
-
-    A checkpoint of TensorFlow has several files, any of which stands for it, as does what their names begin with.
-    """
-    checkpoints: dict[Path, list[Path]] = {}
-    shards = [path for path in files if SHARD.fullmatch(path.name)]
-    for path in files:
-        named = SHARD.fullmatch(path.name)
-        if path.suffix == ".index":
-            index = path
-        elif named is not None or path.suffix == META:
-            name = f"{path.stem if named is None else named[1]}.index"
-            index = next((file for file in files if file.name == name), path.with_name(name))
-        elif not path.exists() and path.with_name(f"{path.name}.index").is_file():
-            index = path.with_name(f"{path.name}.index")
-        else:
-            checkpoints[path] = []
-            continue
-        checkpoints[index] = shards
-    return checkpoints
+def is_graph(path: Path) -> bool:
+    """Whether a file of arrays by name holds DeepSpeech's graph: its first layer is called ``h1``."""
+    return path.suffix == ".npz" and any(name.rpartition("/")[2] == "h1" for name in read_arrays(path))
 
 
 def read_weights(files: Sequence[Path]) -> AuthorsWeights:
@@ -213,9 +189,8 @@ def read_weights(files: Sequence[Path]) -> AuthorsWeights:
         raise FaceDiffError("import-checkpoint: no checkpoint was given; expected that of a published method")
     together: dict[str, Tensor] = {}
     arguments: dict[str, Mapping[str, Any]] = {}
-    for path, shards in bundles(files).items():
-        bundle = path.suffix == ".index"
-        state, options = (read_bundle(path, shards), {}) if bundle else read_authors_checkpoint(path)
+    for path in files:
+        state, options = read_authors_checkpoint(path)
         if "facediff_format" in state:
             raise FaceDiffError(f"{path}: is a checkpoint of facediff already; use it as it is")
         if twice := sorted(together.keys() & state.keys()):

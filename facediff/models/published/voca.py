@@ -30,7 +30,7 @@ from facediff.models.squared_errors import squared_errors
 from facediff.speech.windows import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
-from facediff.utils.tensorflow_files import read_graph
+from facediff.utils.torch_files import read_authors_checkpoint
 
 PUBLISHED_RATE = 60.0
 """Frames a second of VOCA's motion and of its windows' rows."""
@@ -323,11 +323,12 @@ def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> d
     if facts.graph is None:
         raise OptionError.naming(
             f"{weights.source}: holds VOCA without DeepSpeech, whose logits are its input; give the graph "
-            f"output_graph.pb of DeepSpeech 0.1.0 as a further file, or as {{option}} deepspeech=output_graph.pb"
+            f"output_graph.pb of DeepSpeech 0.1.0, converted by tools/convert_tensorflow.py, as a further file, or as "
+            f"{{option}} deepspeech=deepspeech.npz"
         )
     if facts.audio_config is not None:
         raise OptionError.naming("{audio_config}: DeepSpeech's graph says all of its sizes by itself; omit the option")
-    state, sizes, left = network_of(read_graph(facts.graph), str(facts.graph))
+    state, sizes, left = network_of(read_authors_checkpoint(facts.graph)[0], str(facts.graph))
     weights.renamed.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
     weights.ignored.update({f"{facts.graph.name}: {name}": "a constant of the graph" for name in left})
     count, heard = len(facts.identities), sizes["logits"]

@@ -25,9 +25,9 @@ from facediff.models.deepspeech import DeepSpeechEncoder, cepstra
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files, save_model
 from facediff.models.styles import read_styles
-from tests.fakes import tensorflow, voca
+from tests.fakes import voca
 from tests.fakes.tiny import Tiny
-from tests.fakes.voca import IDENTITIES, VERTICES, write_voca
+from tests.fakes.voca import IDENTITIES, VERTICES, write_arrays, write_voca
 from tests.models.published.test_laws import clips, with_assets
 
 Make = Callable[..., Any]
@@ -103,22 +103,18 @@ def test_a_style_mixes_vertices(shares: tuple[float, ...], tmp_path: Path) -> No
     torch.testing.assert_close(made.flatten(1), torch.from_numpy(sum(parts)).float(), rtol=0, atol=1e-5)
 
 
-def test_any_file_of_a_checkpoint_stands_for_it(tmp_path: Path) -> None:
-    index, graph = write_voca(tmp_path, per_block=5)
-    (tmp_path / "gstep_52280.model.meta").write_bytes(b"")
-    prefix = index.with_suffix("")
-    data = prefix.with_name(f"{prefix.name}.data-00000-of-00001")
+def test_the_graph_may_come_first_or_as_an_option(tmp_path: Path) -> None:
+    model, graph = write_voca(tmp_path)
     speech = speech_of(3000)
-    expected = imported([index, graph]).animate(speech, identity="C").vertices
-    for files in ([graph, prefix], [data, graph], [prefix.with_name(f"{prefix.name}.meta"), data, index, graph]):
-        assert torch.equal(imported(files).animate(speech, identity="C").vertices, expected)
-    assert torch.equal(imported(prefix, deepspeech=graph).animate(speech, identity="C").vertices, expected)
+    expected = imported([model, graph]).animate(speech, identity="C").vertices
+    assert torch.equal(imported([graph, model]).animate(speech, identity="C").vertices, expected)
+    assert torch.equal(imported(model, deepspeech=graph).animate(speech, identity="C").vertices, expected)
 
 
 def test_variables_may_have_no_scope(tmp_path: Path) -> None:
     state = {name.removeprefix("VOCA/"): value for name, value in voca.voca_state().items()}
-    index = tensorflow.write_bundle(tmp_path / "bare", state)
-    made = imported([index, tensorflow.write_graph(tmp_path / "g.pb", voca.deepspeech_state())])
+    index = write_arrays(tmp_path / "bare.npz", state)
+    made = imported([index, write_arrays(tmp_path / "g.npz", voca.deepspeech_state())])
     assert torch.equal(
         made.network.expression.bias.detach(), torch.from_numpy(state["ExpressionLayer/expression_offset/biases"])
     )
@@ -132,8 +128,8 @@ def test_the_command_and_its_checkpoint(
     monkeypatch.chdir(tmp_path)
     words = [
         "import-checkpoint",
-        "gstep_52280.model",
-        "output_graph.pb",
+        "voca.npz",
+        "deepspeech.npz",
         "--dataset",
         "vocaset",
         "--identities",
@@ -143,7 +139,7 @@ def test_the_command_and_its_checkpoint(
     printed = "".join(capsys.readouterr())
     for expected in ("60 frames", "frame_rate=30", "global_step", "MPL-2.0", "forbidden"):
         assert expected in printed
-    for name in ("output_graph.pb", "gstep_52280.model.index"):
+    for name in ("deepspeech.npz", "voca.npz"):
         (tmp_path / name).unlink()
     made = load_model(tmp_path / "voca.ckpt").animate(speech_of(3000), identity="A").vertices
     expected = voca.voca_reference(speech_of(3000).numpy(), 0, templates()["A"])
@@ -186,8 +182,8 @@ def test_a_checkpoint_that_does_not_fit_is_named(name: str, tmp_path: Path) -> N
     change, named = CHECKPOINTS[name]
     state = voca.voca_state()
     change(state)
-    index = tensorflow.write_bundle(tmp_path / "model", state)
-    graph = tensorflow.write_graph(tmp_path / "graph.pb", voca.deepspeech_state())
+    index = write_arrays(tmp_path / "model.npz", state)
+    graph = write_arrays(tmp_path / "graph.npz", voca.deepspeech_state())
     with pytest.raises(FaceDiffError, match=named) as caught:
         imported([index, graph])
     assert str(caught.value).count(". ") <= 1
@@ -197,7 +193,7 @@ GRAPHS: dict[str, tuple[Callable[[voca.Arrays], object], str]] = {
     "a layer is missing": (drop("h3"), "h3"),
     "a cell is missing": (drop("bidirectional_rnn/bw/basic_lstm_cell/bias"), "bw"),
     "another shape": (lambda s: s.update(h2=np.ones((3, 4), np.float32)), "second"),
-    "another rank": (lambda s: s.update(h2=np.ones((3, 4, 5), np.float32)), "graph.pb"),
+    "another rank": (lambda s: s.update(h2=np.ones((3, 4, 5), np.float32)), "graph.npz"),
     "other features": (lambda s: s.update(h1=np.ones((80, 12), np.float32)), "inputs"),
     "not finite": (lambda s: s["h6"].fill(np.inf), "logits.weight"),
     "two networks": (lambda s: s.update({"tower/h1": s["h1"]}), "several"),
@@ -210,7 +206,7 @@ def test_a_graph_of_another_network_is_named(name: str, tmp_path: Path) -> None:
     index, _ = write_voca(tmp_path)
     state = voca.deepspeech_state()
     change(state)
-    graph = tensorflow.write_graph(tmp_path / "graph.pb", state)
+    graph = write_arrays(tmp_path / "graph.npz", state)
     with pytest.raises(FaceDiffError, match=named):
         imported([index, graph])
 
@@ -218,13 +214,11 @@ def test_a_graph_of_another_network_is_named(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "named"),
     [
-        (["gstep_52280.model"], "deepspeech"),
-        (["output_graph.pb"], "checkpoint"),
-        (["gstep_52280.model.index", "absent.pb"], r"absent\.pb"),
-        (["gstep_52280.model", "output_graph.pb", "second.pb"], r"second\.pb"),
-        (["author.pth", "output_graph.pb"], r"output_graph\.pb"),
-        (["absent.model"], r"absent\.model"),
-        (["alone.model.data-00000-of-00001", "output_graph.pb"], r"alone\.model\.index"),
+        (["voca.npz"], "deepspeech"),
+        (["deepspeech.npz"], "checkpoint"),
+        (["voca.npz", "absent.npz"], r"absent\.npz"),
+        (["voca.npz", "deepspeech.npz", "second.npz"], r"second\.npz"),
+        (["author.pth", "deepspeech.npz"], r"deepspeech\.npz"),
     ],
 )
 def test_files_that_do_not_make_a_model_are_named(
@@ -232,9 +226,8 @@ def test_files_that_do_not_make_a_model_are_named(
 ) -> None:
     from tests.fakes.published import write_author_files
 
-    index, graph = write_voca(tmp_path)
-    shutil.copy(graph, tmp_path / "second.pb")
-    (tmp_path / "alone.model.data-00000-of-00001").write_bytes(b"")
+    _, graph = write_voca(tmp_path)
+    shutil.copy(graph, tmp_path / "second.npz")
     write_author_files(tmp_path)
     given = [str(tmp_path / name) for name in files]
     options = ["--dataset", "vocaset", "--identities", "A,B,C", "--templates", str(tmp_path / "faces.pkl")]
@@ -315,7 +308,7 @@ def test_deepspeech_is_an_encoder_of_any_model(tmp_path: Path, make_method: Make
 def test_what_is_not_needed_is_reported(tmp_path: Path) -> None:
     files = write_voca(tmp_path)
     state = voca.deepspeech_state() | {"other/table": np.ones(3, np.float32)}
-    tensorflow.write_graph(files[1], state)
+    write_arrays(files[1], state)
     made = import_files(files, ImportOptions(dataset="vocaset", identities=IDENTITIES, templates=templates()))
-    assert "output_graph.pb: other/table" in made.ignored
+    assert "deepspeech.npz: other/table" in made.ignored
     assert "VOCA/SpeechEncoder/conv1/weights/Adam_1" in made.ignored
