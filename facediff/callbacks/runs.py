@@ -14,10 +14,11 @@ from typing import Any
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
 from lightning.pytorch import Trainer
+from lightning.pytorch.core.saving import save_hparams_to_yaml
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
-from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
 from facediff.errors import FaceDiffError
+from facediff.models.checkpoint import read_checkpoint
 from facediff.utils.files import LockedError, atomic, locked, sweep
 from facediff.utils.hub import check_model_source, check_training_source, local_model
 
@@ -35,6 +36,9 @@ LOCK = "fit.lock"
 
 CONFIG = "config.yaml"
 """The config of a run, in its folder."""
+
+Entries = Sequence[Mapping[str, Any]]
+"""The trainer's loggers as its options state them: ``class_path`` and ``init_args`` of each."""
 
 
 def run_folder(trainer: Trainer) -> Path:
@@ -67,7 +71,7 @@ def runs_folder(trainer: Trainer) -> Path:
     return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name or "")
 
 
-def newest_run(trainer: Trainer) -> Path:
+def newest_run(trainer: Trainer, entries: Entries, asked: str = "last") -> Path:
     """The run that was written to last, among those that the trainer's first logger would add one to.
 
     A run that has no ``last.ckpt`` was stopped before its first step, and begins again.
@@ -77,13 +81,13 @@ def newest_run(trainer: Trainer) -> Path:
     """
     logger, folder = trainer.logger, runs_folder(trainer)
     runs = [path for path in folder.glob("*") if (path / LAST).is_file() or _began_training(path / CONFIG)]
-    if logger is None or _has_version(logger):
+    if logger is None or _has_version(entries):
         folder = run_folder(trainer)  # there is one only
         runs = [folder] if (folder / LAST).is_file() or (logger and folder.is_dir()) else []
     if not runs:
         raise FaceDiffError(
-            f"--ckpt_path last: there is no run to continue in {folder}; give the config and the options of the run, "
-            f"or omit --ckpt_path to start one"
+            f"--ckpt_path {asked}: there is no run to continue in {folder}; give the config and the options of the "
+            f"run, or omit --ckpt_path to start one"
         )
 
     def written(run: Path) -> float:
@@ -94,15 +98,34 @@ def newest_run(trainer: Trainer) -> Path:
     if not (newest / LAST).is_file() and saved:
         other = max(saved, key=written)
         raise FaceDiffError(
-            f"--ckpt_path last: the newest run, {newest}, was stopped before its first step; give --ckpt_path "
+            f"--ckpt_path {asked}: the newest run, {newest}, was stopped before its first step; give --ckpt_path "
             f"{other / LAST} to continue the one before, or omit --ckpt_path to start again"
         )
     return newest
 
 
-def _has_version(logger: Logger) -> bool:
+def best_checkpoint(run: Path) -> Path:
+    """The best checkpoint of a run by the bookkeeping of its ``ModelCheckpoint``, which ``last.ckpt`` holds.
+
+    Raises:
+        FaceDiffError: if there is none.
+    """
+    callbacks = read_checkpoint(run / LAST).get("callbacks", {}) if (run / LAST).is_file() else {}
+    paths = [Path(state["best_model_path"]) for state in callbacks.values() if state.get("best_model_path")]
+    # The folder may have another name by now.
+    found = [path for own in paths for path in ((run / LAST).with_name(own.name), own) if path.is_file()]
+    if not found:
+        raise FaceDiffError(
+            f"--ckpt_path best: {run} has none; expected a run that has validated, with a ModelCheckpoint that "
+            f"monitors a score"
+        )
+    return found[0]
+
+
+def _has_version(entries: Entries) -> bool:
     """Whether the options say in which of the runs' folders the run is."""
-    return getattr(logger, "_version", None) is not None and not isinstance(logger, WandbLogger)
+    first = entries[0] if entries else {}
+    return (first.get("init_args") or {}).get("version") is not None and not first["class_path"].endswith("WandbLogger")
 
 
 def _began_training(config: Path) -> bool:
@@ -112,14 +135,16 @@ def _began_training(config: Path) -> bool:
     return re.search(r"^(verbose|return_predictions):", config.read_text("utf-8", "replace"), re.MULTILINE) is None
 
 
-def find_scored(trainer: Trainer, asked: str | None) -> Path | None:
-    """The checkpoint to score, where ``last`` is that of the run that training would continue; None if none is given.
+def find_scored(trainer: Trainer, entries: Entries, asked: str | None) -> Path | None:
+    """The checkpoint to score: a path, or ``last`` or ``best`` of the run that training would continue; None for none.
 
     Raises:
         FaceDiffError: if it is not there.
     """
+    if asked == "best":
+        return best_checkpoint(newest_run(trainer, entries, asked))
     if asked is None or asked == "last":
-        path = None if asked is None else newest_run(trainer) / LAST
+        path = None if asked is None else newest_run(trainer, entries) / LAST
         if path is not None and not path.is_file():
             raise FaceDiffError(f"--ckpt_path {asked}: there is no {path}; expected a .ckpt file of `facediff fit`")
         return path
@@ -127,19 +152,21 @@ def find_scored(trainer: Trainer, asked: str | None) -> Path | None:
     return local_model(asked)
 
 
-def find_checkpoint(trainer: Trainer, asked: str | None) -> Path | None:
+def find_checkpoint(trainer: Trainer, entries: Entries, asked: str | None) -> Path | None:
     """The checkpoint to continue from, which may not be there yet; None for a new run.
 
     Args:
         trainer: its loggers say where the runs are.
-        asked: a path, ``last``, or None; a job that SLURM has started again continues its run then.
+        entries: the loggers' options.
+        asked: a path, ``last``, ``best``, or None; a job that SLURM has started again continues its run then.
 
     Raises:
         FaceDiffError: if a checkpoint is asked for, and there is none.
     """
     if asked is not None:
-        if asked == "last":
-            return newest_run(trainer) / LAST
+        if asked in ("last", "best"):
+            run = newest_run(trainer, entries, asked)
+            return run / LAST if asked == "last" else best_checkpoint(run)
         check_training_source(asked)
         return Path(asked)
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
@@ -155,114 +182,111 @@ def job_text() -> str:
     return f"{os.environ.get('SLURM_JOB_ID', '')}\n{sys.argv[1:]!a}"
 
 
-def share_folder(loggers: Sequence[Logger]) -> None:
-    """Let TensorBoard write into the folder that the first logger makes for a new run, if both count runs in one place.
-
-    Each logger takes the first number that is free when it is asked: the second would find the first one's folder.
-    """
-    for logger in loggers[1:]:
-        same = (logger.save_dir, logger.name) == (loggers[0].save_dir, loggers[0].name)
-        if isinstance(logger, TensorBoardLogger) and same and getattr(logger, "_version", None) is None:
-            logger._version = loggers[0].version
-
-
-def continue_run(trainer: Trainer, path: Path | None, content: Mapping[str, Any], arguments: Sequence[str]) -> bool:
-    """Prepare the trainer's loggers; whether a run is continued in its folder.
+def continued_run(
+    trainer: Trainer, entries: Entries, path: Path | None, content: Mapping[str, Any], arguments: Sequence[str]
+) -> Path | None:
+    """The folder of the run that training continues; None for a new run.
 
     Training that begins from any other file than a ``last.ckpt``, or with a place for its run on the command line, is
     a new run.
 
     Args:
         trainer: with loggers that have not been used yet.
+        entries: the loggers' options.
         path: the checkpoint that training begins from.
         content: what is in it; empty if it is not there.
         arguments: the command line.
     """
-    logger = trainer.logger
-    run = None if path is None or logger is None else run_of(path)
+    run = None if path is None or trainer.logger is None else run_of(path)
     place = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
-    if run is not None and logger is not None and any(place.match(word) for word in arguments):
-        stated, present = (run_folder(trainer), run) if _has_version(logger) else (runs_folder(trainer), run.parent)
+    if run is not None and any(place.match(word) for word in arguments):
+        one = _has_version(entries)
+        stated, present = (run_folder(trainer), run) if one else (runs_folder(trainer), run.parent)
         run = run if os.path.realpath(present) == os.path.realpath(stated) else None
     if run is not None and not content:
         print(f"{run}: was stopped before its first step; training starts from the beginning", flush=True)
-    state = content.get(STATE_KEY, {})
-    trainer.loggers = resumable(trainer.loggers, run, state.get("versions", ()), content.get("global_step", 0))
-    return run is not None
+    return run
 
 
 @contextmanager
-def locked_run(trainer: Trainer, *, new: bool) -> Iterator[None]:
-    """Keep a second ``fit`` out of the run's folder while the block runs.
+def entered_run(
+    trainer: Trainer, entries: Entries, run: Path | None = None, content: Mapping[str, Any] | None = None
+) -> Iterator[None]:
+    """Give the trainer the loggers of a run, and keep a second ``fit`` out of the run's folder while the block runs.
 
     Args:
         trainer: with loggers that have not been used yet.
-        new: whether the run is a new one: where another process has just taken the number that its loggers would
-            take, it gets the next.
+        entries: the loggers' options.
+        run: the folder of the run that is continued; None for a new run. Where another process has just taken the
+            number that its loggers would take, it gets the next.
+        content: the checkpoint that is continued from.
 
     Raises:
         FaceDiffError: if another process trains in the folder.
     """
-    logger, checkpoints = trainer.logger, trainer.checkpoint_callbacks
-    if not trainer.is_global_zero or (logger is None and not checkpoints):
-        yield
-        return
-    if isinstance(logger, WandbLogger) and logger._id is None:  # the folder is known from now on, not once it uploads
-        logger._id = logger._wandb_init["id"] = os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
-    counts = new and isinstance(logger, CSVLogger | TensorBoardLogger) and logger._version is None
-    with ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(locked(run_folder(trainer) / LOCK, "facediff fit"))
-            except LockedError:
-                if not counts:
+    checkpoints = trainer.checkpoint_callbacks
+    numbered = run is None and isinstance(trainer.logger, CSVLogger | TensorBoardLogger) and not _has_version(entries)
+    while True:
+        trainer.loggers = run_loggers(trainer.loggers, entries, run, content or {})
+        with ExitStack() as stack:
+            if trainer.is_global_zero and (trainer.logger is not None or checkpoints):
+                try:
+                    stack.enter_context(locked(run_folder(trainer) / LOCK, "facediff fit"))
+                except LockedError:
+                    if numbered and entries:
+                        continue  # new loggers look for a free number again
                     raise
-                logger._version = None  # type: ignore[union-attr] # it looks for a free number again
-            else:
-                break
-        for earlier in run_folder(trainer).parent.glob("*/checkpoints"):
-            sweep(earlier)  # what a run left that was killed in its first save, which nobody continues
-        yield
+                for earlier in run_folder(trainer).parent.glob("*/checkpoints"):
+                    sweep(earlier)  # what a run left that was killed in its first save, which nobody continues
+            yield
+            return
 
 
 # The loggers of a run that is continued.
 
 
-def resumable(
-    loggers: Sequence[Logger], run: Path | None = None, versions: Sequence[Any] = (), step: int = 0
+def run_loggers(
+    loggers: Sequence[Logger], entries: Entries, run: Path | None = None, content: Mapping[str, Any] | None = None
 ) -> list[Logger]:
-    """The loggers of a run, such that they continue what they have logged.
+    """The loggers that options state, such that they continue what they have logged.
 
     Args:
-        loggers: as the config describes them, with nothing logged yet.
+        loggers: the trainer's.
+        entries: their options; loggers without any stay as they are.
         run: the folder of the run that is continued; None for a new run.
-        versions: what :func:`logger_versions` was when the run was saved.
-        step: optimiser steps that had been taken then; TensorBoard hides what it was shown of later ones.
+        content: the checkpoint; it says what :func:`logger_versions` was, and the optimiser steps that had been taken:
+            TensorBoard hides what it was shown of later ones.
     """
+    versions = (content or {}).get(STATE_KEY, {}).get("versions", ())
     ready: list[Logger] = []
     for place, logger in enumerate(loggers):
-        version = versions[place] if place < len(versions) else None
-        if type(logger) is CSVLogger:
-            logger = ResumableCSVLogger(  # noqa: PLW2901
-                logger.save_dir,
-                name=logger.name,
-                version=logger._version,
-                prefix=logger._prefix,
-                flush_logs_every_n_steps=logger._flush_logs_every_n_steps,
-            )
-        if run is not None and isinstance(logger, ResumableCSVLogger | TensorBoardLogger):
-            if place == 0:
-                logger._root_dir, logger._name, version = str(run.parent), "", run.name
-                if isinstance(logger, ResumableCSVLogger):
-                    logger._save_dir = logger._root_dir
-            logger._version = version if version is not None else logger._version
-            if isinstance(logger, ResumableCSVLogger):
-                logger.continues = version is not None
-            else:
-                logger._kwargs.setdefault("purge_step", step)
-        if run is not None and isinstance(logger, WandbLogger):
-            logger._id = logger._wandb_init["id"] = version or (run.name if place == 0 else None)
-        ready.append(logger)
+        entry = entries[place] if place < len(entries) else {}
+        options = {**(entry.get("init_args") or {}), **(entry.get("dict_kwargs") or {})}
+        version = versions[place] if place < len(versions) and run is not None else None
+        if run is not None and place == 0:
+            version = version or run.name
+            if isinstance(logger, CSVLogger | TensorBoardLogger):
+                options |= {"save_dir": str(run.parent), "name": ""}
+                version = run.name
+        made = logger
+        if isinstance(logger, CSVLogger) and entry:
+            made = ResumableCSVLogger(**{**options, **({} if version is None else {"version": version})})
+            made.continues = version is not None
+        elif isinstance(logger, TensorBoardLogger) and entry:
+            # A second logger would find the folder that the first has made, and take the next number.
+            first = entries[0].get("init_args") or {}
+            shared = place and all(first.get(name) == options.get(name) for name in ("save_dir", "name"))
+            if version is None and shared and options.get("version") is None:
+                version = ready[0].version
+            options |= {} if version is None else {"version": version}
+            options |= {} if run is None else {"purge_step": (content or {}).get("global_step", 0)}
+            made = TensorBoardLogger(**options)
+        elif isinstance(logger, WandbLogger) and entry and (run is not None or place == 0):
+            # The folder is known from now on, and not once wandb uploads.
+            stated = options.get("version") or options.get("id") or os.environ.get("WANDB_RUN_ID")
+            options["version"] = version if run is not None else stated or secrets.token_hex(4)
+            made = WandbLogger(**options)
+        ready.append(made)
     return ready
 
 
@@ -282,18 +306,19 @@ class ResumableCSVLogger(CSVLogger):
     """
 
     continues = False
+    table: MetricsFile | None = None
 
     def rows(self) -> int:
         """Rows written so far; whatever is pending is written first."""
         self.save()
-        path = Path(self.experiment.metrics_file_path)
-        return len(read_rows(path)[1]) if self.experiment.begun and path.is_file() else 0
+        table = self.experiment
+        return len(read_rows(table.path)[1]) if table.columns and table.path.is_file() else 0
 
     def keep(self, rows: int) -> None:
         """Keep the first rows only: the steps after them will be repeated."""
-        path = Path(self.experiment.metrics_file_path)
+        path = self.experiment.path
         if self.continues and not rows:  # the file may be that of a run before
-            self._experiment = _Writer(log_dir=self.log_dir)
+            self.table = MetricsFile(Path(self.log_dir))
         elif self.continues and path.is_file():
             header, written = read_rows(path)
             write_table(path, header, written[:rows])
@@ -301,41 +326,55 @@ class ResumableCSVLogger(CSVLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:  # noqa: ANN401 - as in Lightning's logger
-        """The writer."""
-        if self._experiment is None:
-            os.makedirs(self.root_dir, exist_ok=True)
-            self._experiment = (_ContinuedWriter if self.continues else _Writer)(log_dir=self.log_dir)
-        return self._experiment
+        """The file."""
+        if self.table is None:
+            self.table = MetricsFile(Path(self.log_dir), continues=self.continues)
+        return self.table
+
+    def finalize(self, status: str) -> None:
+        """Write what is pending."""
+        if self.table is not None:
+            self.save()
 
 
-class _Writer(ExperimentWriter):
-    """The file of an earlier run stays until the first rows replace it."""
+class MetricsFile:
+    """``metrics.csv`` and ``hparams.yaml`` of a run; the file of an earlier run stays until the first rows replace it.
 
-    begun = False
+    Args:
+        folder: that of the run.
+        continues: add to the file that is there.
+    """
 
-    def _check_log_dir_exists(self) -> None:
-        """Do nothing; Lightning's deletes the file."""
+    def __init__(self, folder: Path, *, continues: bool = False) -> None:
+        self.path = folder / "metrics.csv"
+        self.metrics: list[dict[str, Any]] = []  # not written yet
+        self.columns = read_rows(self.path)[0] if continues and self.path.is_file() else []
+        self.hparams: dict[str, Any] = {}
+
+    def log_metrics(self, metrics: Mapping[str, Any], step: int) -> None:
+        """Add a row."""
+        values = {name: value.item() if hasattr(value, "item") else value for name, value in metrics.items()}
+        self.metrics.append({**values, "step": step})
+
+    def log_hparams(self, params: Mapping[str, Any]) -> None:
+        """Add to ``hparams.yaml``."""
+        self.hparams.update(params)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        save_hparams_to_yaml(str(self.path.with_name("hparams.yaml")), self.hparams)
 
     def save(self) -> None:
-        """Write the rows that are pending."""
-        if self.begun:
-            super().save()
-        elif self.metrics:
-            self._record_new_keys()
-            write_table(Path(self.metrics_file_path), self.metrics_keys, self.metrics)
-            self.metrics, self.begun = [], True
-
-    def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
-        path = Path(self.metrics_file_path)
-        write_table(path, fieldnames, read_rows(path)[1])
-
-
-class _ContinuedWriter(_Writer):
-    def _check_log_dir_exists(self) -> None:
-        path = Path(self.metrics_file_path)
-        self.begun = path.is_file()
-        if self.begun:
-            self.metrics_keys = read_rows(path)[0]
+        """Write the rows that are pending; a new column is written to the rows before it, too."""
+        columns = sorted({*self.columns, *(name for row in self.metrics for name in row)})
+        if not self.metrics:
+            return
+        if columns == self.columns:
+            with self.path.open("a", newline="", encoding="utf-8") as stream:
+                csv.DictWriter(stream, columns).writerows(self.metrics)
+        else:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            before = read_rows(self.path)[1] if self.columns else []
+            write_table(self.path, columns, [*before, *self.metrics])
+        self.columns, self.metrics = columns, []
 
 
 def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:

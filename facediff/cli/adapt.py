@@ -137,7 +137,7 @@ def adapt(
         return
     from lightning.pytorch import Trainer, seed_everything
 
-    from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal
+    from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
     from facediff.cli.lightning import exit_statuses
     from facediff.cli.trainer_options import IDLE_WARNINGS, explained, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
@@ -169,6 +169,7 @@ def adapt(
     imported = {key: value for key, value in model.provenance.items() if key == IMPORTED}
     model.provenance = {**imported, "parent": model_name(checkpoint)}
     model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
+    model.parameter_groups = None
     train_only(model.train(), train)
     with explained({"max_epochs": epochs, "accelerator": accelerator}, prefix="--"):
         trainer = Trainer(
@@ -181,7 +182,7 @@ def adapt(
             enable_checkpointing=False,
             enable_model_summary=False,
             enable_progress_bar=not quiet and on_terminal(),
-            plugins=[AtomicCheckpointIO()],
+            plugins=[AtomicCheckpointIO(), *slurm_plugins()],
         )
     requeue_on_signal(trainer)
     with exit_statuses(), without_warnings(*IDLE_WARNINGS):

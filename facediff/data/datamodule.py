@@ -108,6 +108,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             than the window sets it in its ``setup``.
         aligner: lets the windows of two neighbours that speak the same sentence begin at the same sound; a model sets
             it in its ``setup``, too.
+        training_state: where in which epoch the next training loader continues, as a checkpoint holds it.
 
     Args:
         root: the corpus folder; or a packed corpus, its folder or an address such as ``s3://bucket/corpus.zarr``.
@@ -248,6 +249,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.window_context = (0, 0)
         self.aligner: Aligner | None = None
         self.further = {name: further_corpus(name, options) for name, options in (further_corpora or {}).items()}
+        self.training_state: dict[str, int] | None = None
         self._assets: Assets | None = None
 
     options_path = "data"
@@ -652,14 +654,17 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         }
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Shuffled training batches, each process its own."""
-        return self._mixed("train", training=True)
+        """Shuffled training batches, each process its own; the rest of an epoch that is resumed."""
+        loader = self._mixed("train", training=True)
+        if self.training_state is not None:
+            loader.load_state_dict(self.training_state)
+        return loader
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Validation batches."""
         return self._mixed("val")
 
-    def _mixed(self, split: str, *, training: bool = False) -> DataLoader[Any]:
+    def _mixed(self, split: str, *, training: bool = False) -> ResumableLoader:
         """A loader of this corpus, or of this and all further ones."""
         own = self._loader(split, training=training)
         if not self.further:
@@ -681,7 +686,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         split: str = self.predict_split or [*self.test_splits, "test_a"][0]
         return DataLoader(self.dataset(split), batch_size=self.batch_size, collate_fn=collate, **self._loader_options())
 
-    def _loader(self, split: str, *, training: bool = False) -> DataLoader[list[Sample]]:
+    def _loader(self, split: str, *, training: bool = False) -> ResumableLoader:
         samples = self.dataset(split, training=training)
         trainer = self.trainer
         batches = ClipBatches(

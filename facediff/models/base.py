@@ -14,12 +14,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, Self
+from typing import IO, Annotated, Any, Self
 
 import torch
 from jaxtyping import Bool, Float
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torchmetrics import MeanMetric
 
 from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
@@ -34,13 +35,13 @@ from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, 
 from facediff.models.inference import Prediction, noise_stream
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.motion_space import PrincipalComponents, Projection
+from facediff.models.optimizers import FactorSchedule, Schedule, apply_at_resume, lr_factor, parameter_groups
 from facediff.models.pretrained import publish
 from facediff.spaces import Space
 from facediff.speech.windows import WindowPlan
 from facediff.utils.licences import merged, network_licences
 from facediff.utils.ranges import Range, Vertices
 
-Schedule = Literal["constant", "cosine", "exponential", "step"]
 Decay = Annotated[float, Range(0, 1000)]
 
 
@@ -67,39 +68,6 @@ def read_space(space: object, points: int) -> Space:
             f"has {len(record.channels)} channels and the motion {points}; give the corpus's own",
         )
     return record
-
-
-def lr_factor(
-    step: int,
-    *,
-    total: int,
-    warmup_steps: int,
-    schedule: Schedule,
-    epoch_steps: int = 1,
-    decay: float = 0.9,
-    decay_epoch: int = 30,
-) -> float:
-    """What the learning rate is multiplied by at an optimiser step.
-
-    Args:
-        step: the step, counted from 0.
-        total: steps of the whole training.
-        warmup_steps: steps over which the factor rises from zero.
-        schedule: constant; half a cosine down to zero at the end; exponential, which multiplies by ``decay`` in
-            every epoch from ``decay_epoch`` on; or step, which does so once in every ``decay_epoch`` epochs.
-        epoch_steps: steps of an epoch.
-        decay: the factor of an epoch.
-        decay_epoch: the first epoch with the factor, counted from 0 as Lightning counts; of step, how many epochs lie
-            between two decays.
-    """
-    warm = min(1.0, (step + 1) / max(1, warmup_steps))
-    if schedule == "constant":
-        return warm
-    if schedule == "exponential":
-        return warm * decay ** max(0, step // max(1, epoch_steps) - decay_epoch + 1)
-    if schedule == "step":
-        return warm * decay ** (step // max(1, epoch_steps) // max(1, decay_epoch))
-    return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / max(1, total))))
 
 
 class AnimationModel(PersonStyles, ABC):
@@ -132,6 +100,8 @@ class AnimationModel(PersonStyles, ABC):
             ``step`` once in every ``lr_decay_epoch`` epochs.
         lr_decay_epoch: the first epoch that ``exponential`` does so, counted from 0; see ``lr_decay`` for ``step``.
         warmup_steps: optimiser steps over which the learning rate rises from zero.
+        parameter_groups: options of the optimiser for some parts, by their name among the modules, such as
+            ``{audio_encoder: {lr: 1e-5}}``; the schedule holds for all.
         protocol: the metrics' protocol for validation and test.
         metrics: further metrics for validation and test, by name with their options, such as
             ``lip_warping_distance`` or ``temporal_misalignment:at=path``; see docs/metrics.md.
@@ -165,6 +135,7 @@ class AnimationModel(PersonStyles, ABC):
         lr_decay: Annotated[float, Range(0, 1, above=True)] = 0.9,
         lr_decay_epoch: Annotated[int, Range(0, 10**9)] = 30,
         warmup_steps: Annotated[int, Range(0, 10**9)] = 0,
+        parameter_groups: dict[str, dict[str, Any]] | None = None,
         protocol: str = "paper",
         metrics: Sequence[str] = (),
         unseen_identity: IdentityPolicy = "style_only",
@@ -189,6 +160,7 @@ class AnimationModel(PersonStyles, ABC):
         self.lr_decay = float(lr_decay)
         self.lr_decay_epoch = lr_decay_epoch
         self.warmup_steps = warmup_steps
+        self.parameter_groups = parameter_groups
         self.unseen_identity: IdentityPolicy = unseen_identity
         self.protocol = protocol
         self.metrics = list(metrics)
@@ -197,6 +169,7 @@ class AnimationModel(PersonStyles, ABC):
         self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.style_source: StyleSource = style_source
+        self._validation_means: dict[str, MeanMetric] = {}
 
     geometry: Tensor | None
 
@@ -298,14 +271,22 @@ class AnimationModel(PersonStyles, ABC):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW on everything trainable, with the learning-rate schedule per optimiser step."""
-        parameters = [p for p in self.parameters() if p.requires_grad]
+        return self.scheduled(self.default_optimizer())
+
+    def default_optimizer(self) -> torch.optim.Optimizer:
+        """AdamW with the model's options."""
+        groups = parameter_groups(self, self.parameter_groups)
         # Fused: one pass over all parameters instead of several operations for each.
-        optimizer = torch.optim.AdamW(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
         # A fused optimiser could undo a loss scale itself, so Lightning refuses to clip its gradients in mixed
         # precision. Without this mark, the scale is undone before gradients are clipped.
         optimizer._step_supports_amp_scaling = False
+        return optimizer
+
+    def scheduled(self, optimizer: torch.optim.Optimizer) -> OptimizerLRScheduler:
+        """An optimiser with the model's schedule; it takes its options, and not a checkpoint's, at a resume."""
         if self.lr_schedule == "constant" and not self.warmup_steps:
-            return optimizer
+            return apply_at_resume(optimizer)
         total = self.trainer.estimated_stepping_batches if self.lr_schedule == "cosine" else 0
         if math.isinf(total):
             raise ArgumentError(
@@ -321,8 +302,8 @@ class AnimationModel(PersonStyles, ABC):
             decay=self.lr_decay,
             decay_epoch=self.lr_decay_epoch,
         )
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+        scheduler = FactorSchedule(optimizer, factor)
+        return {"optimizer": apply_at_resume(optimizer), "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def _steps_an_epoch(self) -> int:
         """Optimiser steps of an epoch."""
@@ -360,15 +341,29 @@ class AnimationModel(PersonStyles, ABC):
         # The same steps and noise in every epoch; otherwise the curve would show their chance. They follow from the
         # clips and not from the batch's number, which is another one where several processes share the batches.
         losses = self.losses(batch, noise_stream(" ".join(batch.names), 0, self.device))
-        logged = {f"val/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=0 if batch.repeated else len(batch), sync_dist=True)
+        for name, value in losses.items():
+            if name not in self._validation_means:
+                self._validation_means[name] = MeanMetric(nan_strategy="disable").to(self.device)
+            self._validation_means[name].update(value, 0 if batch.repeated else len(batch))
         model = self.model_of(batch)
         model.evaluation.score(model, "val", model.with_person_styles(batch))
 
+    def on_validation_epoch_start(self) -> None:
+        """Encode the speakers; begin new means, also after a validation that was stopped."""
+        super().on_validation_epoch_start()
+        self._validation_means = {}
+
     def on_validation_epoch_end(self) -> None:
-        """Log the metrics as ``val/mve`` …."""
-        # The metrics have been summed over the processes already; averaging equal values changes nothing.
-        self.log_dict(self.evaluation.scalars("val"), prog_bar=False, sync_dist=True)
+        """Log the loss terms and the metrics as ``val/mve`` …."""
+        # All have been summed over the processes already; averaging equal values changes nothing.
+        self.log_dict({**self.validation_terms(), **self.evaluation.scalars("val")}, prog_bar=False, sync_dist=True)
+
+    def validation_terms(self) -> dict[str, Tensor]:
+        """The loss terms as ``val/<term>``: means over the clips of all processes.
+
+        Lightning's own reduction averages the number of clips over the processes as a whole number.
+        """
+        return {f"val/{name}": mean.compute() for name, mean in self._validation_means.items()}
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Score generated motion, faces that do not move, and the model's motion for another sentence's speech."""

@@ -119,7 +119,7 @@ class ManyFaces(DualPathDiffusion):
         self._validated.clear()
         shared = [key for key in scores[0] if all(key in one for one in scores)] if scores else []
         means = {key: mean_over_faces([float(one[key]) for one in scores]) for key in shared}
-        self.log_dict(means, prog_bar=False, sync_dist=True)
+        self.log_dict({**self.validation_terms(), **means}, prog_bar=False, sync_dist=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what the further faces' own models keep."""
