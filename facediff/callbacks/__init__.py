@@ -1,5 +1,7 @@
 """Callbacks: what happens around training and testing."""
 
+from lightning.pytorch import Callback
+
 from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.callbacks.checkpoints import LastCheckpoint
 from facediff.callbacks.dashboard import GradientNorm, RunDescription
@@ -18,4 +20,17 @@ __all__ = [
     "SamplingPreview",
     "ScoreTable",
     "SpeechFeatureCache",
+    "defaults",
 ]
+
+
+def defaults() -> list[Callback]:
+    """The callbacks of every run of the command line, for a ``Trainer`` of one's own.
+
+    They keep ``last.ckpt``, print and write the scores of a test and the files of ``predict``, and log what a run is
+    made of and the norm of the gradient.
+
+    Example:
+        >>> Trainer(callbacks=[*facediff.callbacks.defaults(), EmaWithWarmup()])  # doctest: +SKIP
+    """
+    return [LastCheckpoint(), ScoreTable(), RunDescription(), GradientNorm(), PredictionWriter()]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
-from lightning.pytorch.utilities import rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
@@ -53,8 +53,28 @@ class RunDescription(Callback):
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Describe a run that only validates."""
+        self._validates |= not trainer.sanity_checking
         if trainer.state.fn == TrainerFn.VALIDATING:
             self.on_fit_start(trainer, pl_module)
+
+    _validates = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say at the beginning that a training will never validate, where its epochs tell."""
+        every, epochs = trainer.check_val_every_n_epoch, trainer.max_epochs
+        self._validates = bool(trainer.fast_dev_run) or not trainer.enable_validation  # type: ignore[attr-defined]
+        if every and epochs is not None and 0 <= epochs < every:
+            self.on_train_end(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say that a training has never validated."""
+        if not self._validates:
+            rank_zero_info(
+                f"this training does not validate, so that no best checkpoint is chosen: it has {trainer.max_epochs} "
+                f"epochs or {trainer.max_steps} steps, and trainer.check_val_every_n_epoch is "
+                f"{trainer.check_val_every_n_epoch}, trainer.val_check_interval {trainer.val_check_interval}"
+            )
+            self._validates = True
 
 
 def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from lightning.pytorch.callbacks import BasePredictionWriter, ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
 
 from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_media, worst_clips
+from facediff.data import SpeechMotionDataModule
 from facediff.models import AnimationModel
 from facediff.models.evaluation import METHODS
 from facediff.models.inference import Prediction
@@ -30,8 +31,14 @@ class EpochLines(Callback):
     """Prints a line after each epoch of training, where no terminal would show a progress bar.
 
     The line has the training loss, what is monitored in validation (names that a run logs, see ``docs/monitoring.md``)
-    where that has been measured, and the seconds since training began. It goes to standard error.
+    where that has been measured in this epoch, and the seconds since training began. It goes to standard error.
     """
+
+    _validated = False
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note that there are new scores."""
+        self._validated = not trainer.sanity_checking
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remember when training began."""
@@ -41,8 +48,11 @@ class EpochLines(Callback):
         """Print the line, on one process."""
         if not trainer.is_global_zero:
             return
-        names = ["train/loss", *dict.fromkeys(checkpoint.monitor for checkpoint in trainer.checkpoint_callbacks
-                                              if isinstance(checkpoint, ModelCheckpoint))]  # fmt: skip
+        monitored = [
+            callback.monitor for callback in trainer.checkpoint_callbacks if isinstance(callback, ModelCheckpoint)
+        ]
+        names = ["train/loss", *(dict.fromkeys(monitored) if self._validated else ())]
+        self._validated = False
         metrics = trainer.callback_metrics
         values = ", ".join(f"{name} {float(metrics[name]):.4g}" for name in names if name in metrics)
         last = f" of {trainer.max_epochs}" if trainer.max_epochs not in (None, -1) else ""
@@ -242,6 +252,7 @@ class PredictionWriter(BasePredictionWriter):
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say which training run the files are of, and print where they are."""
         if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
-            if isinstance(pl_module, AnimationModel):
-                provenance_of(trainer, pl_module, trainer.datamodule).write_next_to(self.folder)  # type: ignore[attr-defined]
+            data = trainer.datamodule  # type: ignore[attr-defined]
+            if isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
+                provenance_of(trainer, pl_module, data).write_next_to(self.folder)
             print(f"written: {self.folder}")

@@ -139,7 +139,7 @@ def adapt(
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
     from facediff.cli.lightning import exit_statuses
-    from facediff.cli.trainer_options import IDLE_WARNINGS, explained, without_warnings
+    from facediff.cli.trainer_options import IDLE_WARNINGS, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
     from facediff.models.checkpoint import build_model, read_checkpoint
     from facediff.models.checkpoint_content import IMPORTED
@@ -171,19 +171,18 @@ def adapt(
     model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
     model.parameter_groups = None
     train_only(model.train(), train)
-    with explained({"max_epochs": epochs, "accelerator": accelerator}, prefix="--"):
-        trainer = Trainer(
-            max_epochs=epochs,
-            accelerator=accelerator,
-            devices=1,
-            gradient_clip_val=1.0,
-            limit_val_batches=0,
-            logger=False,
-            enable_checkpointing=False,
-            enable_model_summary=False,
-            enable_progress_bar=not quiet and on_terminal(),
-            plugins=[AtomicCheckpointIO(), *slurm_plugins()],
-        )
+    trainer = Trainer(
+        max_epochs=epochs,
+        accelerator=accelerator,
+        devices=1,
+        gradient_clip_val=1.0,
+        limit_val_batches=0,
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        enable_progress_bar=not quiet and on_terminal(),
+        plugins=[AtomicCheckpointIO(), *slurm_plugins()],
+    )
     requeue_on_signal(trainer)
     with exit_statuses(), without_warnings(*IDLE_WARNINGS):
         trainer.fit(model, data)

@@ -34,6 +34,12 @@ def keys_of(path: Path | str) -> set[str]:
     return {str(key.value) for key, _ in root.value} if isinstance(root, yaml.MappingNode) else set()
 
 
+def name_of(path: Path | str) -> str | None:
+    """The experiment's name that a config, which :func:`check_config` has let through, states; None for none."""
+    content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only
+    return content.get("name")
+
+
 def loggers_of(path: Path | str) -> list[str]:
     """Class names of the loggers that a config, which :func:`check_config` has let through, states itself."""
     content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of
+from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of, name_of
 from facediff.cli.process import StoppedBySignal, tell
-from facediff.errors import FaceDiffError, choices, printable
+from facediff.errors import FaceDiffError, printable
 from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
 from facediff.utils.hints import defaults
@@ -32,12 +32,35 @@ if TYPE_CHECKING:
     from facediff.cli.lightning_cli import FaceDiffCLI
     from facediff.data import SpeechMotionDataModule
 
-OPTIONS = (
-    *("config", "name", "model", "data", "trainer", "seed_everything", "ckpt_path"),
-    *("print_config", "weights_only", "help"),
-)
-OWN_OPTIONS = {"validate": ("verbose",), "test": ("verbose",), "predict": ("return_predictions",)}
-"""What options begin with, of every subcommand and of some."""
+HELP = """usage: facediff {name} [--config FILE] [--OPTION=VALUE ...]
+
+{summary}, by Lightning's command line (LightningCLI).
+
+  -c, --config FILE       options in YAML; later files and flags override earlier ones
+  --model, --data         class of the model and of the corpus, and their options: --model.dim=64
+  --trainer.OPTION        options of Lightning's Trainer: --trainer.max_epochs=20, --trainer.callbacks+=EarlyStopping
+  --optimizer, --lr_scheduler
+                          class and options in place of the model's: --optimizer=SGD --optimizer.lr=0.1
+  --ckpt_path FILE        checkpoint to {purpose}; last and best are those of the newest run of the config
+  --name NAME             name of the experiment, and of the folder below runs/
+  --seed_everything SEED  seed of all random numbers
+  --print_config          print the whole configuration, and stop
+
+  --model.help=NAME, --data.help=NAME, --model.decoder.help=NAME
+                          list the options of a class; `facediff components` lists the names
+  --trainer.help          list the options of everything else
+
+examples: facediff fit --config configs/experiment/puppet.yaml --trainer.max_epochs=20
+          facediff test --ckpt_path runs/puppet/version_0/checkpoints/best.ckpt
+"""
+"""Without Lightning, whose import takes most of the seconds that its own help takes."""
+
+SUMMARIES = {
+    "fit": ("Train a model", "continue from"),
+    "validate": ("Validate a checkpoint", "validate"),
+    "test": ("Score a checkpoint on the test splits", "score"),
+    "predict": ("Predict the clips of a split", "predict with"),
+}
 
 REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--trainer.plugins", "--print_config")
 """What options begin with that add to what is there."""
@@ -51,6 +74,11 @@ FREE = (
 
 def lightning(name: str, arguments: Sequence[str]) -> int:
     """Run one of Lightning's subcommands; the exit status."""
+    if list(arguments) in (["-h"], ["--help"]):
+        summary, purpose = SUMMARIES[name]
+        tell(*HELP.format(name=name, summary=summary, purpose=purpose).splitlines())
+        return 0
+    arguments = ["--help" if word == "--trainer.help" else word for word in arguments]
     refuse_repeated(arguments)
     run_cli(name, arguments)
     return 0
@@ -62,7 +90,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
     tell_replaced_loggers(options)
     checkpoint = value_of(options, "--ckpt_path")
-    if checkpoint is not None and checkpoint != "last":  # that depends on the config
+    if checkpoint not in (None, "last", "best"):  # which depend on the config
         check_model_source(checkpoint, "--ckpt_path")
         if name == "fit":
             check_training_source(checkpoint)
@@ -139,24 +167,16 @@ def exit_statuses() -> Iterator[None]:
 
 
 def check_options(name: str, arguments: Sequence[str]) -> None:
-    """Refuse options that no model or corpus can have, and too few of them."""
-    names = [*OPTIONS, *OWN_OPTIONS.get(name, ())]
-    for word in arguments:
-        match = re.match(r"--(\w[\w-]*)", word)
-        if match and match[1] not in names:
-            raise FaceDiffError(
-                f"{word.partition('=')[0]}: `facediff {name}` has no such option: {choices(match[1], names)}"
-            )
+    """Refuse too few options."""
     if not any(re.match(r"-c|-h|--(config|model|data|help|ckpt_path)\b", word) for word in arguments):
         needs = {"fit": "--config FILE, such as configs/experiment/puppet.yaml, or --model=NAME and --data=NAME"}
         scoring = "--ckpt_path CHECKPOINT, a file that `facediff fit` has written; it holds everything else"
         raise FaceDiffError(f"`facediff {name}` needs {needs.get(name, scoring)}")
-    if value_of(arguments, "--ckpt_path") == "last" and not any(
-        re.match(r"-c|-h|--(config|model|help)\b", w) for w in arguments
-    ):
+    checkpoint = value_of(arguments, "--ckpt_path")
+    if checkpoint in ("last", "best") and not any(re.match(r"-c|-h|--(config|model|help)\b", w) for w in arguments):
         raise FaceDiffError(
-            "--ckpt_path last: the config says where the runs are; add the --config that training began with, or give "
-            "the path of the run's checkpoints/last.ckpt"
+            f"--ckpt_path {checkpoint}: the config says where the runs are; add the --config that training began with, "
+            f"or give the path of the run's checkpoints/{checkpoint}.ckpt"
         )
 
 
@@ -221,6 +241,7 @@ def import_model(arguments: Sequence[str]) -> str | None:
         the class; None if none is named.
     """
     from facediff.cli.data import find_own_module
+    from facediff.cli.named_classes import place_of
     from facediff.utils.hints import is_path
 
     named = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
@@ -231,7 +252,7 @@ def import_model(arguments: Sequence[str]) -> str | None:
             importlib.import_module(chosen.rpartition(".")[0])
         except Exception as error:  # a module can fail in any way while it is imported
             raise FaceDiffError(
-                f"--model {chosen}: cannot be imported ({error}); expected package.module.Class"
+                f"--model {chosen}: cannot be imported ({place_of(error)}); expected package.module.Class"
             ) from error
     return chosen
 
@@ -333,11 +354,15 @@ def tell_replaced_loggers(arguments: Sequence[str]) -> None:
 
 
 def experiment_name(arguments: Sequence[str]) -> str | None:
-    """The file name, without suffix, of the first config that says what is trained, or on what; None if none does.
+    """What the runs are called: the option ``name``, or the file name of the first config of an experiment.
 
-    Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it.
+    Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it. None if
+    nothing names it.
     """
-    return next((Path(file).stem for file in config_files(arguments) if {"model", "data"} & keys_of(file)), None)
+    files = config_files(arguments)
+    stated = [value_of(arguments, "--name"), *(name_of(file) for file in reversed(files))]
+    named = (Path(file).stem for file in files if {"model", "data"} & keys_of(file))
+    return next((name for name in stated if name is not None), next(named, None))
 
 
 def config_files(arguments: Sequence[str]) -> list[str]:

@@ -172,6 +172,9 @@ def report(error: BaseException) -> int:
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
     if isinstance(error, UnicodeError):
         return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
+    refusal = next((cause for cause in _chain(error) if _refuses(cause)), None)
+    if refusal is not None:
+        return fail(f"{' '.join(str(refusal).split())} ({more})")
     if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
         error = list(_chain(error))[-1]
         text = " ".join(str(error).split())
@@ -192,6 +195,20 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         seen.add(id(error))
         yield error
         error = error.__cause__ or error.__context__
+
+
+LIBRARIES = ("lightning", "omegaconf", "wandb")
+"""They say themselves what is wrong with an option."""
+
+
+def _refuses(error: BaseException) -> bool:
+    """Whether a statement of one of these libraries has raised an error on purpose."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
+    fault = isinstance(error, AttributeError | KeyError | IndexError | AssertionError | OSError)
+    return module.partition(".")[0] in LIBRARIES and not fault
 
 
 def _own_classes(error: BaseException) -> str:

@@ -421,11 +421,21 @@ class AnimationModel(PersonStyles, ABC):
         """
 
     def setup(self, stage: str) -> None:
-        """Take the assets from the data module; a checkpoint's own replace them when it is loaded."""
+        """Take the assets from the data module; a checkpoint's own replace them when it is loaded.
+
+        A trained model has its assets already, and takes plain loaders of batches: not for a test, which also scores
+        faces of the training split.
+        """
         self._styles_of_step = None
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        data = getattr(self.trainer, "datamodule", None)
+        if data is None and self._assets is not None and stage != "test":
+            if stage != "predict":
+                self.evaluation.prepare(self, ["val"], self.trainer.strategy.root_device, None)
+            return
         if not isinstance(data, SpeechMotionDataModule):
-            raise FaceDiffError("facediff's models train and test on a SpeechMotionDataModule; pass datamodule=…")
+            raise FaceDiffError(
+                "a model that was never trained, and a test, need a SpeechMotionDataModule; pass datamodule=…"
+            )
         faces = dict(self.heads())
         if stage in ("fit", "validate") and data.further.keys() != faces.keys():
             raise FaceDiffError(
@@ -502,7 +512,7 @@ class AnimationModel(PersonStyles, ABC):
 
     def on_fit_start(self) -> None:
         """Say in which form training motion is wanted, before the first clip is read."""
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        data = getattr(self.trainer, "datamodule", None)
         if isinstance(data, SpeechMotionDataModule):
             data.projection.choose(self.training_projection())
 

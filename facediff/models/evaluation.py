@@ -159,9 +159,11 @@ class Evaluation:
         self._validation_seeds = range(1)
 
     def prepare(
-        self, model: Inference, splits: Sequence[str], device: torch.device, data: SpeechMotionDataModule
+        self, model: Inference, splits: Sequence[str], device: torch.device, data: SpeechMotionDataModule | None
     ) -> None:
         """Make empty metrics for a corpus, on the device where processes reduce them."""
+        if data is None and (self.requests or self.score_by):
+            raise FaceDiffError("model.metrics and model.score_by need a SpeechMotionDataModule; pass datamodule=…")
         assets, corpus = model.assets, ScoredCorpus(data, model.assets)
         self._corpus = corpus
         self._check_space(assets)
@@ -384,13 +386,15 @@ class Evaluation:
     def _attributes(self, clip: str) -> dict[str, str | None]:
         """What scores may be grouped by, such as a clip's emotion."""
         data = self.corpus.data
+        if data is None:
+            return {}
         names = dict.fromkeys((*data.score_attributes, *self.score_by))
         attributes = data.corpus.clips[clip].attributes
         return {name: attributes.get(name) for name in names}
 
-    def _check_attributes(self, data: SpeechMotionDataModule) -> None:
+    def _check_attributes(self, data: SpeechMotionDataModule | None) -> None:
         """Refuse to group scores by what no clip of the splits has."""
-        clips = [clip for split in self.splits for clip in data.clips(split)] if self.score_by else []
+        clips = [clip for split in self.splits for clip in data.clips(split)] if self.score_by and data else []
         attributes = sorted({name for clip in clips for name in clip.attributes})
         for name in self.score_by:
             if name not in attributes:

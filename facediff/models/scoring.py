@@ -38,13 +38,14 @@ class ScoredCorpus:
     Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
 
     Args:
-        data: the corpus.
+        data: the corpus; None where batches are scored by the protocol alone.
         assets: its templates, regions and rig.
         speakers: who are told apart, by number; everybody with a template if None.
     """
 
-    def __init__(self, data: SpeechMotionDataModule, assets: Assets, speakers: Sequence[str] | None = None) -> None:
-        self.data, self.assets = data, assets
+    def __init__(self, data: SpeechMotionDataModule | None, assets: Assets, speakers: Sequence[str] | None = None) -> None:
+        self.data: Any = data
+        self.assets = assets
         self.regions = regions_of(assets.scored)
         self.speakers = sorted(assets.templates) if speakers is None else list(speakers)
 

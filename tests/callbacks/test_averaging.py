@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +11,11 @@ import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from facediff.callbacks import EmaWithWarmup
-from facediff.errors import FaceDiffError
+from facediff.models import DualPathDiffusion
+from tests.fakes.tiny import Tiny
 
 
 class Weights(pl.LightningModule):
@@ -63,7 +67,22 @@ def test_the_average_follows_a_line_at_a_tenth_of_the_steps() -> None:
     np.testing.assert_allclose(found[[499, 999]], [450, 900], rtol=0.01)
 
 
-@pytest.mark.parametrize("wrong", [{"decay": 1.5}, {"decay": "much"}, {"warmup": 0.5}])
-def test_a_wrong_option_is_named(wrong: dict[str, Any]) -> None:
-    with pytest.raises(FaceDiffError, match=f"EmaWithWarmup.{next(iter(wrong))}"):
-        EmaWithWarmup(**wrong)
+def test_scores_of_a_checkpoint_by_path_are_those_of_the_average(
+    make_model: Callable[..., DualPathDiffusion], tiny: Tiny, tmp_path: Path
+) -> None:
+    """After ``fit`` with the same trainer, as users of Lightning write it."""
+    quiet = {f"limit_{part}_batches": 1 for part in ("val", "test", "predict")}
+    quiet |= {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+    best = ModelCheckpoint(tmp_path, monitor="val/loss")
+    trainer = pl.Trainer(max_epochs=2, callbacks=[EmaWithWarmup(decay=0.9), best], **quiet)
+    model = make_model()
+    trainer.fit(model, datamodule=tiny)
+    average = torch.load(best.best_model_path, weights_only=True)["state_dict"]
+    raw = torch.load(best.best_model_path, weights_only=True)["current_model_state"]
+    assert any(not torch.equal(raw[name], value) for name, value in average.items())
+    for scored in (trainer.test, trainer.validate, trainer.predict):
+        for path in ("best", best.best_model_path):
+            with torch.no_grad():
+                model.network.unembed.weight.zero_()
+            scored(model, datamodule=tiny, ckpt_path=path)
+            assert all(torch.equal(model.state_dict()[name], value) for name, value in average.items()), scored

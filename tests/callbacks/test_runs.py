@@ -12,7 +12,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger
 
 from facediff.callbacks import LastCheckpoint, checkpoints
-from facediff.callbacks.runs import continue_run, find_checkpoint, locked_run
+from facediff.callbacks.runs import continued_run, entered_run, find_checkpoint, run_folder
 from facediff.utils import files
 
 
@@ -26,7 +26,7 @@ def test_what_a_run_that_was_killed_in_its_first_save_left_is_swept(tmp_path: Pa
     for path in (own, left):
         path.write_bytes(b"x")
     trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", enable_progress_bar=False)
-    with locked_run(trainer, new=True):
+    with entered_run(trainer, []):
         assert [*checkpoints.iterdir()] == [own]  # this process is at work
 
 
@@ -47,11 +47,11 @@ def test_a_job_of_slurm_that_was_stopped_continues_its_run(
     with pytest.raises(SystemExit):
         last.stop(trainer, signal.Signals[name])
     assert len(asked) == (name == "SIGUSR1")  # a job that makes room for another is requeued by SLURM itself
-    assert find_checkpoint(trainer, None) is None
+    assert find_checkpoint(trainer, [], None) is None
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert find_checkpoint(trainer, None) == last.path(trainer)
+    assert find_checkpoint(trainer, [], None) == last.path(trainer)
     monkeypatch.setattr("sys.argv", ["facediff", "fit", "--model=another"])  # which the same job ran before
-    assert find_checkpoint(trainer, None) is None
+    assert find_checkpoint(trainer, [], None) is None
 
 
 @pytest.mark.parametrize(
@@ -67,11 +67,12 @@ def test_a_job_of_slurm_that_was_stopped_continues_its_run(
 def test_a_run_continues_unless_the_command_line_names_another_place(
     place: list[str], version: int | None, name: str, continues: bool, tmp_path: Path
 ) -> None:
-    logger = CSVLogger(tmp_path, name=name, version=version)
-    trainer = Trainer(logger=logger, accelerator="cpu", devices=1, enable_progress_bar=False)
+    options = {"save_dir": str(tmp_path), "name": name, "version": version}
+    entries = [{"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": options}]
+    trainer = Trainer(logger=CSVLogger(**options), accelerator="cpu", devices=1, enable_progress_bar=False)
     path = tmp_path / "small" / "version_0" / "checkpoints" / "last.ckpt"
-    assert continue_run(trainer, path, {"global_step": 3}, place) == continues
-    if not continues:
-        assert trainer.logger is not None
-        assert trainer.logger.version == (version or 0)
-        assert trainer.logger.name == name
+    run = continued_run(trainer, entries, path, {"global_step": 3}, place)
+    assert (run is not None) == continues
+    with entered_run(trainer, entries, run, {"global_step": 3}):
+        expected = path.parents[1] if continues else tmp_path / name / f"version_{version or 0}"
+        assert run_folder(trainer) == expected

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -16,8 +16,6 @@ import torch
 import yaml
 
 from facediff.cli.app import main
-from facediff.cli.trainer_options import check_trainer
-from facediff.errors import ArgumentError, MissingExtraError
 from tests.cli.conftest import SMALL
 from tests.fakes.waiting import free_port
 
@@ -25,55 +23,6 @@ Fit = Callable[..., int]
 ROOT = Path(__file__).parents[2]
 SWEEP = ROOT / "configs" / "sweep" / "puppet.yaml"
 NO_GPU = not torch.cuda.is_available()
-
-
-@pytest.mark.skipif(not NO_GPU, reason="refused on machines without a GPU")
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"strategy": "fsdp", "accelerator": "auto"},
-        {"strategy": "fsdp_cpu_offload", "accelerator": "cpu"},
-        {"strategy": "deepspeed_stage_2", "accelerator": "cpu"},
-        {"strategy": {"class_path": "lightning.pytorch.strategies.FSDPStrategy"}},
-    ],
-)
-def test_a_strategy_that_spreads_a_model_over_gpus_is_refused_without_one(options: dict[str, object]) -> None:
-    if isinstance(options["strategy"], Mapping):
-        from jsonargparse import Namespace
-
-        options["strategy"] = Namespace(**options["strategy"])
-    with pytest.raises(ArgumentError) as caught:
-        check_trainer(options)
-    assert list(caught.value.values) == ["trainer.strategy"]
-    assert "ddp" in str(caught.value)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not NO_GPU, reason="refused on machines without a GPU")
-def test_fsdp_and_gpus_that_are_not_there_are_one_sentence(fit: Fit, capsys: pytest.CaptureFixture[str]) -> None:
-    for words, option in (
-        (["--trainer.strategy=fsdp", "--trainer.accelerator=cpu"], "--trainer.strategy fsdp"),
-        (["--trainer.accelerator=gpu"], "--trainer.accelerator gpu"),
-    ):
-        assert fit(*words) == 2
-        (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-        assert option in line
-
-
-def test_ddp_and_single_devices_are_left_alone() -> None:
-    for strategy in ("auto", "ddp", "ddp_find_unused_parameters_true", None):
-        check_trainer({"strategy": strategy, "accelerator": "cpu"})
-
-
-def test_tensorboard_without_its_package_names_the_extra(fit: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
-    import facediff.cli.lightning_cli as module
-
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    monkeypatch.setenv("FACEDIFF_TRACEBACK", "")
-    with pytest.raises(MissingExtraError) as caught:
-        module.run_lightning_cli("fit", ["--config", str(ROOT / "configs/experiment/puppet.yaml"),
-                                         "--config", str(ROOT / "configs/logger/tensorboard.yaml")], "x")  # fmt: skip
-    assert caught.value.arguments[1] == "tensorboard"
 
 
 @pytest.mark.slow

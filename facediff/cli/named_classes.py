@@ -1,0 +1,108 @@
+"""Classes that words and configs name: why one cannot be taken, from the file that the user wrote."""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from facediff import registry
+from facediff.errors import choices, lacking
+from facediff.utils.hints import is_path
+
+YAML = (".yaml", ".yml")
+
+
+def explain(words: Sequence[str]) -> str:
+    """What is wrong with a class that words or the files in them name; empty if nothing is.
+
+    An error inside a file of the user's comes with its file and line; a name of a model, a corpus or a component that
+    does not exist, with the nearest. Everything else is the parser's to say.
+
+    Args:
+        words: the options of the command line.
+    """
+    from facediff.cli.lightning import change_values
+
+    named: list[tuple[str, str]] = []
+
+    def note(flag: str, value: str) -> str:
+        option = "" if flag in ("-c", "--config") else flag.lstrip("-").removesuffix("+").removesuffix(".help")
+        try:
+            content = yaml.load(value, yaml.BaseLoader)  # noqa: S506 - makes texts only
+        except yaml.YAMLError:
+            content = value
+        named.extend(classes_in(option, content, Path.cwd()))
+        return value
+
+    change_values(words, note)
+    return next(filter(None, (fault_of(option, name) for option, name in dict.fromkeys(named))), "")
+
+
+def classes_in(option: str, content: Any, folder: Path) -> Iterator[tuple[str, str]]:  # noqa: ANN401
+    """Names and import paths of classes in a config's content, each with the option that it stands for.
+
+    Args:
+        option: its path, as the command line has it, without dashes.
+        content: texts, in lists and dicts.
+        folder: that of the file, in which further files are named.
+    """
+    if isinstance(content, dict):
+        for name, value in content.items():
+            path = option if name in ("class_path", "init_args") else f"{option}.{name}".strip(".+")
+            yield from classes_in(path, value, folder)
+    elif isinstance(content, list):
+        for value in content:
+            yield from classes_in(option, value, folder)
+    elif isinstance(content, str) and content.endswith(YAML):
+        if (file := folder / content).is_file():
+            text = file.read_text("utf-8-sig")
+            yield from classes_in(option, yaml.load(text, yaml.BaseLoader), file.parent)  # noqa: S506
+    elif isinstance(content, str) and content not in ("", "null"):
+        yield option, content
+
+
+def fault_of(option: str, name: str) -> str:
+    """What is wrong with a class by its name or import path; empty if nothing is, or it is none of ours to say."""
+    if is_path(name):
+        return import_fault(option, name)
+    kinds = {**registry.COMPONENTS, "model": registry.model, "data": registry.corpus}
+    kind = kinds.get(option.rpartition(".")[2])
+    if kind is None or not name.isidentifier() or name in kind.names() or name in subclasses(kind):
+        return ""
+    return kind.unknown(name)
+
+
+def subclasses(kind: registry.Kind) -> set[str]:
+    """Names of the imported classes that extend a base of the registered ones."""
+    bases = {base for entry in kind for base in entry.implementation.__mro__ if base.__module__.startswith("facediff.")}
+    return {cls.__name__ for base in bases for cls in base.__subclasses__()}
+
+
+def import_fault(option: str, path: str) -> str:
+    """Why an import path leads to no class that can be made; empty if it does, or leads to no file."""
+    module, _, name = path.rpartition(".")
+    try:
+        cls = vars(importlib.import_module(module)).get(name)
+    except Exception as error:  # a module can fail in any way while it is imported
+        missing = getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None
+        return "" if missing and f"{module}.".startswith(f"{missing}.") else f"--{option} {path}: {place_of(error)}"
+    if cls is None and not module.startswith(("facediff.", "torch.", "lightning.")):
+        classes = [n for n, value in vars(importlib.import_module(module)).items() if isinstance(value, type)]
+        return f"--{option} {path}: {module} has no {name}: {choices(name, classes)}"
+    return f"--{option} {path}: {fault}" if (fault := lacking(cls)) else ""
+
+
+def place_of(error: BaseException) -> str:
+    """File, line and reason of an error in a module that was to be imported."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.filename}, line {error.lineno}: {error.msg}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.startswith("<")]
+    own = [frame for frame in frames if "site-packages" not in frame.filename and frame.filename != importlib.__file__]
+    last = (own or frames)[-1:]
+    where = f"{last[0].filename}, line {last[0].lineno}: " if last else ""
+    return f"{where}{type(error).__name__}: {' '.join(str(error).split())}"
