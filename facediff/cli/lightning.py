@@ -14,7 +14,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from facediff import registry
 from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of, name_of
 from facediff.cli.process import StoppedBySignal, tell
+from facediff.cli.words import change_values, place_of, value_of
 from facediff.errors import FaceDiffError, printable
 from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
@@ -241,7 +242,6 @@ def import_model(arguments: Sequence[str]) -> str | None:
         the class; None if none is named.
     """
     from facediff.cli.data import find_own_module
-    from facediff.cli.named_classes import place_of
     from facediff.utils.hints import is_path
 
     named = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
@@ -294,27 +294,6 @@ def prepared(data: SpeechMotionDataModule) -> SpeechMotionDataModule:
     data.prepare_data()
     _ = data.corpus
     return data
-
-
-def change_values(arguments: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
-    """The words with ``change(flag, value)`` in place of every value, written ``--flag value`` or ``--flag=value``."""
-    changed, flag = [], ""
-    for word in arguments:
-        if word.startswith("-"):
-            flag, joined, value = word.partition("=")
-            changed.append(f"{flag}={change(flag, value)}" if joined else word)
-            flag = "" if joined else flag
-        else:
-            changed.append(change(flag, word))
-            flag = ""
-    return changed
-
-
-def value_of(arguments: Sequence[str], flag: str) -> str | None:
-    """The first value of a flag; None if it is not given."""
-    values: dict[str, str] = {}
-    change_values(arguments, lambda option, value: values.setdefault(option, value))
-    return values.get(flag)
 
 
 def find_config(flag: str, value: str) -> str:

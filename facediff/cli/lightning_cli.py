@@ -36,8 +36,8 @@ from facediff.callbacks import EpochLines, LastCheckpoint, defaults
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
 from facediff.callbacks.runs import continued_run, entered_run, find_checkpoint, find_scored, run_loggers
 from facediff.cli.configs import guard_configs
-from facediff.cli.named_classes import explain
 from facediff.cli.trainer_options import IDLE_WARNINGS, check_trainer, without_warnings
+from facediff.cli.words import explain
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
 from facediff.hyperparameters import plain

@@ -43,7 +43,9 @@ class ScoredCorpus:
         speakers: who are told apart, by number; everybody with a template if None.
     """
 
-    def __init__(self, data: SpeechMotionDataModule | None, assets: Assets, speakers: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, data: SpeechMotionDataModule | None, assets: Assets, speakers: Sequence[str] | None = None
+    ) -> None:
         self.data: Any = data
         self.assets = assets
         self.regions = regions_of(assets.scored)

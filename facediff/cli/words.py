@@ -1,10 +1,10 @@
-"""Classes that words and configs name: why one cannot be taken, from the file that the user wrote."""
+"""The words of Lightning's subcommands: their values, and why a class that they or their files name cannot be taken."""
 
 from __future__ import annotations
 
 import importlib
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,27 @@ from facediff.utils.hints import is_path
 YAML = (".yaml", ".yml")
 
 
+def change_values(arguments: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
+    """The words with ``change(flag, value)`` in place of every value, written ``--flag value`` or ``--flag=value``."""
+    changed, flag = [], ""
+    for word in arguments:
+        if word.startswith("-"):
+            flag, joined, value = word.partition("=")
+            changed.append(f"{flag}={change(flag, value)}" if joined else word)
+            flag = "" if joined else flag
+        else:
+            changed.append(change(flag, word))
+            flag = ""
+    return changed
+
+
+def value_of(arguments: Sequence[str], flag: str) -> str | None:
+    """The first value of a flag; None if it is not given."""
+    values: dict[str, str] = {}
+    change_values(arguments, lambda option, value: values.setdefault(option, value))
+    return values.get(flag)
+
+
 def explain(words: Sequence[str]) -> str:
     """What is wrong with a class that words or the files in them name; empty if nothing is.
 
@@ -26,8 +47,6 @@ def explain(words: Sequence[str]) -> str:
     Args:
         words: the options of the command line.
     """
-    from facediff.cli.lightning import change_values
-
     named: list[tuple[str, str]] = []
 
     def note(flag: str, value: str) -> str:
