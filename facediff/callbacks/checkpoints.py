@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.plugins.environments import ClusterEnvironment, SLURMEnvironment
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ThroughputMonitor
 from lightning.pytorch.plugins.io import TorchCheckpointIO
@@ -405,9 +405,14 @@ def requeue_on_signal(trainer: Trainer) -> None:
         signal.signal(signal.SIGUSR1, stop)
 
 
-def slurm_plugins() -> list[SLURMEnvironment]:
-    """What a trainer needs in a job of SLURM, so that Lightning leaves SIGUSR1 alone; empty elsewhere."""
-    return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
+def slurm_plugins(plugins: object = None) -> list[Any]:
+    """The plug-ins of a trainer with what it needs in a job of SLURM, so that Lightning leaves SIGUSR1 alone."""
+    stated = [] if plugins is None else plugins if isinstance(plugins, list) else [plugins]
+    for plugin in stated:
+        if isinstance(plugin, SLURMEnvironment):
+            plugin.auto_requeue = False
+    needed = SLURMEnvironment.detect() and not any(isinstance(plugin, ClusterEnvironment) for plugin in stated)
+    return [*stated, *([SLURMEnvironment(auto_requeue=False)] if needed else [])]
 
 
 def throughput_monitors(trainer: Trainer) -> list[ThroughputMonitor]:

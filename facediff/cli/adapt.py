@@ -181,7 +181,7 @@ def adapt(
         enable_checkpointing=False,
         enable_model_summary=False,
         enable_progress_bar=not quiet and on_terminal(),
-        plugins=[AtomicCheckpointIO(), *slurm_plugins()],
+        plugins=slurm_plugins([AtomicCheckpointIO()]),
     )
     requeue_on_signal(trainer)
     with exit_statuses(), without_warnings(*IDLE_WARNINGS):

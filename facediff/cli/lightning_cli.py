@@ -232,10 +232,7 @@ class FaceDiffCLI(LightningCLI):
         bar_in_a_pipe = stated.get("enable_progress_bar") is None and not on_terminal()
         if bar_in_a_pipe:
             kwargs["enable_progress_bar"] = False
-        if slurm := slurm_plugins():
-            plugins = stated.get("plugins") or []
-            kwargs["plugins"] = [*(plugins if isinstance(plugins, list) else [plugins]), *slurm]
-        trainer = super().instantiate_trainer(**kwargs)
+        trainer = super().instantiate_trainer(**kwargs, plugins=slurm_plugins(stated.get("plugins")))
         requeue_on_signal(trainer)
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]

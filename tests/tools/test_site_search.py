@@ -36,6 +36,17 @@ def test_headings_count_more_than_text_and_beginnings_of_words_match(tmp_path: P
         ("low latency", "streaming.md"),
         ("vocaset", "data.md"),
         ("own mesh", "own_mesh.md"),
+        ("optimizer", "lightning.md"),
+        ("LightningCLI", "lightning.md"),
+        ("OmegaConf", "lightning.md"),
+        ("profiler", "lightning.md"),
+        ("reproducible", "lightning.md"),
+        ("checkpointing", "lightning.md"),
+        ("best checkpoint", "lightning.md"),
+        ("own callback", "lightning.md"),
+        ("normalization", "training.md"),
+        ("quantization", "exported_models.md"),
+        ("own dataset", "own_data.md"),
     ],
 )
 def test_the_right_page_is_found_first(query: str, page: str) -> None:
