@@ -24,8 +24,8 @@ from facediff.data import Puppet, collate
 from facediff.data.batch import FORMAT_KEY
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, DualPathDiffusion, load_model
-from facediff.models.optimizers import Schedule, lr_factor
 from facediff.models.checkpoint import read_assets
+from facediff.models.optimizers import Schedule, lr_factor
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]

@@ -18,8 +18,8 @@ from facediff.data.dataset import ClipBatches
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import read_masks
 from facediff.models import Style, load_model
-from facediff.models.optimizers import lr_factor
 from facediff.models.checkpoint_content import STYLES_KEY
+from facediff.models.optimizers import lr_factor
 from facediff.models.style_content.losses import squared_distance, style_distance
 from tests.fakes.style_content import make
 from tests.fakes.tiny import Tiny, write_tiny
