@@ -19,7 +19,6 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.live.frames import Performance, open_receiver
 from facediff.live.receivers.browser import ON_THE_WAY, STEP, Browser
 from tests.fakes.waiting import PATIENCE, free_port, wait_until
@@ -193,25 +192,6 @@ def test_noise_and_half_open_connections_stop_nothing(served: Browser, visitor: 
         client.close()
     served.send(frame(0))
     assert isinstance(visitor.recv(PATIENCE), bytes)
-
-
-def test_a_taken_port_is_named(performance: Performance, served: Browser) -> None:
-    with pytest.raises(FaceDiffError, match=str(served.port)), serving(performance, served.port):
-        pass
-
-
-def test_a_model_without_triangles_is_refused(performance: Performance) -> None:
-    with (
-        pytest.raises(FaceDiffError, match="triangles"),
-        serving(replace(performance, faces=np.zeros((0, 3), np.int32))),
-    ):
-        pass
-
-
-def test_the_package_that_is_missing_is_named(performance: Performance, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "websockets", None)
-    with pytest.raises(MissingExtraError, match="websockets"), serving(performance):
-        pass
 
 
 def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,30 +89,6 @@ def test_receiver_that_cannot_open_closes_those_before_it(speech: Path) -> None:
     assert not MADE[0].frames
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        ({"speech": None}, "speech"),
-        ({"microphone": "default"}, "speech"),
-        ({"rate": 8000}, "rate"),
-        ({"to": []}, "--to.*keep"),
-        ({"to": ["kep:1"]}, "--to kep:1.*keep"),
-        ({"to": ["keep:1", "keep:1"]}, "--to keep:1"),
-        ({"to": ["keep:1?weights=true"]}, "shapes"),
-        ({"to": ["keep:1?weights=true"], "shapes": Path("nowhere")}, "shapes nowhere"),
-        ({"sound": "loud"}, "sound loud"),
-        ({"speech": "nowhere.wav"}, "nowhere.wav"),
-        ({"seconds": 0.0}, "seconds"),
-    ],
-)
-def test_what_cannot_be_is_refused_before_a_model_is_opened(words: dict[str, Any], named: str, speech: Path) -> None:
-    def never() -> LiveModel:
-        raise AssertionError("opened")
-
-    with pytest.raises(FaceDiffError, match=named):
-        perform(LiveOptions(**{"speech": str(speech), "to": ["keep:1"], **words}), never, str)
-
-
 def test_weights_of_a_model_of_channels_are_sent_as_they_are(speech: Path) -> None:
     """Without shapes; receivers of vertices get what the rig makes of them."""
     space = Space("arkit", ("jawOpen", "HeadYaw", "HeadPitch", "HeadRoll"), rotations=(Rotation("head", 1, "euler"),))

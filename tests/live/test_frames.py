@@ -76,16 +76,6 @@ def test_options_of_an_address_are_the_constructors() -> None:
 
 
 @pytest.mark.usefixtures("noted")
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [("notd://a:1", "noted"), ("noted?rat=3", "rate"), ("noted?rate=x", "rate"), ("noted?rate=10", "receiver.rate")],
-)
-def test_what_a_receiver_does_not_take_is_refused_by_name(text: str, named: str) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        open_receiver(text)
-
-
-@pytest.mark.usefixtures("noted")
 def test_one_receiver_is_given_once() -> None:
     assert len(open_receivers(["noted:1", "noted:2"])) == 2
     with pytest.raises(FaceDiffError, match="noted:1"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import socket
@@ -14,10 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError, counted
-from facediff.live.receivers import json_lines
+from facediff.errors import counted
 from facediff.live.receivers.json_lines import MOST_CLIENTS
-from facediff.live.receivers.sending import listen
 from facediff.spaces.arkit import ARKIT
 from tests.fakes.waiting import PATIENCE, free_port, wait_until
 from tests.live.conftest import FRAME_RATE, VERTICES, Opened, frame, weights_of
@@ -109,41 +106,6 @@ def test_a_frame_that_is_not_finite_is_left_out(opened: Opened, tmp_path: Path) 
     assert end == {"type": "end", "frames": 1, "dropped": 1}
 
 
-class Gone(socket.socket):
-    """A socket that takes no options, as macOS has it of a client that has left."""
-
-    def setsockopt(self, *_: object) -> None:  # type: ignore[override]
-        raise OSError(errno.EINVAL, "Invalid argument")
-
-
-class OnceFull:
-    """A listening socket that has no file left for its first client, and whose second one has left already."""
-
-    def __init__(self, listening: socket.socket) -> None:
-        self._listening, self._calls = listening, 0
-
-    def accept(self) -> object:
-        self._calls += 1
-        if self._calls == 1:
-            raise OSError(errno.EMFILE, "Too many open files")
-        if self._calls == 2:
-            return Gone(), None
-        return self._listening.accept()
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._listening, name)
-
-
-def test_a_client_that_cannot_be_accepted_does_not_keep_out_the_next(
-    opened: Opened, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(json_lines, "listen", lambda *place: OnceFull(listen(*place)))
-    port = free_port()
-    receiver = opened(f"jsonl:{port}")
-    with connect(port):
-        wait_for(receiver, "1 client")
-
-
 def test_a_client_that_left_is_forgotten(opened: Opened) -> None:
     port = free_port()
     receiver = opened(f"jsonl:{port}")
@@ -168,20 +130,6 @@ def test_more_clients_than_are_served_are_refused(opened: Opened) -> None:
         assert late.recv(1) == b""
     for client in clients:
         client.close()
-
-
-def test_a_taken_port_is_named(opened: Opened) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(FaceDiffError, match=str(port)):
-            opened(f"jsonl:{port}")
-
-
-@pytest.mark.parametrize("name", ["a.csv", "file/a.jsonl"])
-def test_a_file_that_cannot_be_is_refused(opened: Opened, tmp_path: Path, name: str) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with pytest.raises(FaceDiffError, match=name):
-        opened(f"jsonl:{tmp_path / name}")
 
 
 PROGRAM = """

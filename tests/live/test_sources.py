@@ -5,7 +5,6 @@ No sound device is used: what stands for ``sounddevice`` here has the part of it
 
 from __future__ import annotations
 
-import io
 import os
 import sys
 import threading
@@ -19,12 +18,12 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.live.frames import Performance
 from facediff.live.sound import SoundOut
 from facediff.live.sources import Microphone, Pcm, Played, SpeechSource
 from facediff.live.timing import Pacer, SpokenClock
-from tests.fakes.live import FakeSound, PortAudioError, device
+from tests.fakes.live import FakeSound, device
 from tests.fakes.simulated_time import SimulatedTime
 from tests.fakes.waiting import PATIENCE, wait_until
 
@@ -79,23 +78,6 @@ def test_file_through_a_pipe_is_played_in_real_time(standard_input: Callable[[by
     assert times[-1] > 0.4
 
 
-@pytest.mark.parametrize(("data", "named"), [(b"", "ended before"), (b"RIFF1234", "sound file")])
-def test_standard_input_that_cannot_be(data: bytes, named: str, standard_input: Callable[[bytes], None]) -> None:
-    standard_input(data)
-    with pytest.raises(FaceDiffError, match=f"standard input.*{named}"):
-        heard(Pcm())
-
-
-@pytest.mark.parametrize(
-    "stdin",
-    [None, SimpleNamespace(closed=True), SimpleNamespace(closed=False, buffer=io.BytesIO(), isatty=lambda: True)],
-)
-def test_closed_standard_input_and_terminals_are_refused(stdin: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", stdin)
-    with pytest.raises(FaceDiffError, match="standard input"):
-        Pcm()
-
-
 CARDS = (device("Line out", 0, 2), device("Webcam", 1, 0, 32_000.0), device("USB Mic", 2, 2), device("USB Mic 2", 1, 0))
 
 
@@ -112,45 +94,6 @@ def library(monkeypatch: pytest.MonkeyPatch, *cards: dict[str, Any], **words: An
 def test_microphone_is_found_by_number_or_name(wanted: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     library(monkeypatch, *CARDS, usual=2)
     assert Microphone(wanted).name == f"microphone {name}"
-
-
-@pytest.mark.parametrize(("wanted", "named"), [("7", "Webcam"), ("Line out", "USB Mic"), ("usb", "several")])
-def test_unknown_microphone_names_the_devices(wanted: str, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    library(monkeypatch, *CARDS)
-    with pytest.raises(FaceDiffError, match=rf"--microphone {wanted}.*{named}"):
-        Microphone(wanted)
-
-
-def test_machine_without_a_microphone_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    library(monkeypatch, device("Line out", 0, 2), usual=-1)
-    with pytest.raises(FaceDiffError, match="--microphone"):
-        Microphone()
-    library(monkeypatch)
-    with pytest.raises(FaceDiffError, match="--microphone"):
-        Microphone()
-
-
-def test_missing_library_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sounddevice", None)
-    with pytest.raises(MissingExtraError, match=r"sounddevice.*facediff\[live\]"):
-        Microphone()
-
-    class Finder:
-        @staticmethod
-        def find_spec(name: str, *_: object) -> None:
-            if name == "sounddevice":
-                raise OSError("PortAudio library not found")
-
-    monkeypatch.delitem(sys.modules, "sounddevice")
-    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
-    with pytest.raises(FaceDiffError, match="PortAudio"):
-        Microphone()
-
-
-def test_busy_microphone_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    library(monkeypatch, *CARDS, refuse=PortAudioError("Device unavailable"))
-    with pytest.raises(FaceDiffError, match="Webcam.*Device unavailable"):
-        heard(Microphone("Webcam"))
 
 
 def test_microphone_hands_over_blocks_with_the_time_at_which_they_were_spoken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,6 @@ from pythonosc.osc_message import OscMessage
 from pythonosc.osc_packet import OscPacket
 from scipy.spatial.transform import Rotation
 
-from facediff.errors import FaceDiffError
 from facediff.live.frames import Performance, open_receiver
 from facediff.live.receivers.sending import Outbox
 from facediff.spaces import Space
@@ -257,28 +256,6 @@ def test_another_machine_is_warned_of_and_this_one_is_not(caplog: pytest.LogCapt
 def test_the_usual_ports_of_this_machine(text: str, port: int) -> None:
     receiver = open_receiver(text)
     assert (receiver.host, receiver.port) == ("127.0.0.1", port)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("livelink://127.0.0.1:1/path", "path"),
-        ("livelink://127.0.0.1?subject=%C3%BC", "subject"),
-        ("livelink://no.such.host.invalid:1", "no.such.host.invalid"),
-        ("vmc?names=vrn", "names"),
-        ("osc?prefix=face", "prefix"),
-        ("osc?prefix=/a%00b", "prefix"),
-    ],
-)
-def test_what_cannot_be_sent_is_refused(text: str, named: str, performance: Performance) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        open_receiver(text).open(performance)
-
-
-@pytest.mark.parametrize("scheme", ["livelink", "vmc", "osc"])
-def test_a_face_without_arkits_shapes_is_refused(scheme: str, performance: Performance) -> None:
-    with pytest.raises(FaceDiffError, match=scheme):
-        open_receiver(scheme).open(replace(performance, shapes=("A", "B")))
 
 
 def test_shapes_that_a_face_lacks_stay_at_zero_and_others_are_left_out(

@@ -179,22 +179,6 @@ def test_wrong_things_meet_one_sentence_in_the_words_of_python(
     assert sorted(speech.parent.rglob("*")) == before
 
 
-@pytest.mark.parametrize(
-    ("source", "named"),
-    [("none.ckpt", "none.ckpt"), ("folder", "config.json"), ("a/b/c", "a/b/c"), (3, "source"), ("text.ckpt", "text")],
-)
-def test_what_is_no_model_is_refused(
-    source: object, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("folder").mkdir()
-    Path("text.ckpt").write_text("no checkpoint")
-    with pytest.raises(facediff.FaceDiffError, match=named):
-        facediff.load(source)  # type: ignore[arg-type]
-    with pytest.raises(facediff.FaceDiffError, match="device"):
-        facediff.pipelines.trained.usable_device("cuda:99")
-
-
 def test_stream_is_the_recording_by_windows_however_it_is_cut(model: facediff.Animator, tmp_path: Path) -> None:
     bursts = np.sin(np.arange(16000 * 3) * 2 * np.pi * 3 / 16000) > 0  # a steady sound is no speech
     samples = (0.1 * bursts * np.random.default_rng(0).normal(size=16000 * 3)).astype(np.float32)

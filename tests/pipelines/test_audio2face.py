@@ -148,22 +148,6 @@ def test_the_command_writes_vertices_and_weights(
     assert set(TONGUE_POSES) - {"tongueOut"} <= set(about["not_in_table"])
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"style": "envy:1"}, "envy"),
-        ({"style": "joy:much"}, "style"),
-        ({"identity": "Mark"}, "identity"),
-        ({"sampler": "ddim"}, "sampler"),
-        ({"window": 4.0}, "window"),
-        ({"seed": 7}, "seed"),
-    ],
-)
-def test_options_without_a_meaning_are_refused(model: Audio2FaceAnimator, options: dict[str, Any], named: str) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        model.animate((SPEECH, 16_000), **options)
-
-
 def test_it_needs_neither_pytorch_nor_scipy(folder: Path, content: dict[str, Any], tmp_path: Path) -> None:
     program = """
 import sys
@@ -208,9 +192,3 @@ def test_live_needs_no_windows(
     assert main(words) == 0
     lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     assert len(lines) >= 5  # a slow machine drops frames
-
-
-@pytest.mark.usefixtures("content")
-def test_the_page_of_serve_refuses_it(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["serve", str(folder), "-o", str(tmp_path / "site")]) == 2
-    assert "Audio2Face-3D" in capsys.readouterr().err

@@ -202,31 +202,6 @@ def test_finished_animations_follow_what_needs_no_model(model: facediff.Animator
     assert after.metadata[METADATA] == within.metadata[METADATA]
 
 
-@pytest.mark.parametrize(
-    ("keys", "options", "named"),
-    [
-        (rows("style", "F1_e99"), {}, "style"),
-        (rows("style", "F1_e03"), {"style": "M2_e05"}, "style"),
-        (rows("sway", 1), {"sway": 3}, "sway"),
-        (rows("expressiveness.nose", 1, 2), {}, "nose"),
-        (rows("expressivity.nose", 1, 2), {}, "expressivity"),
-        (rows("guidance.style", 1, 2), {}, "guidance.style"),
-        (rows("condition", "X"), {}, "condition"),
-        (rows("acting", 1), {}, "acting"),
-        (rows("brows", 9), {}, "value"),
-        (rows("sway", 1), {"acting": "mime"}, "acting"),
-        (rows("sway", 1), {"acting": "prosody:brows=100"}, "brows"),
-        ("keys.json", {}, "keys.json"),
-    ],
-)
-def test_what_cannot_be_followed_is_named(
-    model: facediff.Animator, speech: np.ndarray, keys: object, options: dict[str, object], named: str
-) -> None:
-    with pytest.raises(FaceDiffError) as raised:
-        model.animate(speech, 16_000, direction=keys, **QUICK, **options)
-    assert named in str(raised.value)
-
-
 def test_acting_is_off_unless_it_is_asked_for_and_rests_in_silence(model: facediff.Animator) -> None:
     silence = np.zeros(48_000, np.float32)
     plain = model.animate(silence, 16_000, **QUICK)

@@ -55,17 +55,3 @@ def test_animation_closes_its_lips_by_alignment_and_by_transcript(
         assert not np.array_equal(expected.vertices, free.vertices)
         np.testing.assert_array_equal(made.vertices, expected.vertices)
         assert "lips closed" in made.metadata["edited"]
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"alignment": "a.csv", "transcript": "hello"}, "alignment.*transcript"),
-        ({"closure_budget": 3}, "closure_budget"),
-        ({"alignment": "none.TextGrid"}, "none.TextGrid: no such file"),
-    ],
-)
-def test_impossible_options_are_named(model: facediff.Animator, options: dict[str, object], named: str) -> None:
-    speech = 0.1 * np.random.default_rng(0).standard_normal(16_000)
-    with pytest.raises(FaceDiffError, match=named):
-        model.animate(speech, 16_000, **options)

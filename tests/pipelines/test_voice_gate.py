@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import facediff
-from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
 from facediff.speech.pitch import shifted_by_pieces
 from facediff.speech.voice_activity import openness, read_gate
@@ -86,13 +85,3 @@ def test_a_shifted_voice_is_heard_and_the_recording_kept(model: facediff.Animato
     np.testing.assert_array_equal(plain.speech, lower.speech)
     assert lower.metadata["voice shift"] == "-4 semitones"
     assert "voice shift" not in plain.metadata
-
-
-def test_missing_extra_is_named(model: facediff.Animator, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    for library in ("webrtcvad", "noisereduce"):
-        monkeypatch.setitem(sys.modules, library, None)
-    for options in ({"voice_gate": "webrtc"}, {"denoise": True}):
-        with pytest.raises(FaceDiffError, match=r"facediff\[voice\]"):
-            model.animate(0.1 * np.ones(16_000), 16_000, **options)

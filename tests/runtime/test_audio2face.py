@@ -249,14 +249,6 @@ def test_a_graph_may_name_operators_that_it_does_not_use_and_leave_lengths_open(
         Audio2Face.open(tmp_path)
 
 
-def test_infer_refuses_results_of_another_size(tmp_path: Path) -> None:
-    write_audio2face(tmp_path)
-    edit(INFO, "params", "num_shapes_tongue", value=2)(tmp_path)
-    arrays("model_data.npz", shapes_matrix_tongue=np.zeros((2, 9, 3), np.float32))(tmp_path)
-    with pytest.raises(FaceDiffError, match="network_info"):
-        Audio2Face.open(tmp_path).infer(SPEECH, 30)
-
-
 def test_emotions_are_those_of_the_folder(model: Audio2Face) -> None:
     assert model.folder.facts.emotions == EMOTIONS
     assert model.emotion({"anger": 0.5}).tolist()[4:] == [0.0, 0.5, 0.0, 0.0]

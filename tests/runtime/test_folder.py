@@ -103,27 +103,6 @@ def spoilt(record: str, value: object) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    "space",
-    [
-        [],
-        {"kind": "arkit"},
-        spoilt("kind", "vertices"),
-        spoilt("kind", "faces"),
-        spoilt("channels", ["jawOpen"] * STATE),
-        spoilt("channels", list(CHANNELS.channels[:-1])),
-        spoilt("rotations", [{"joint": "head", "start": STATE - 2, "form": "euler"}]),
-        spoilt("rotations", []),
-        {},
-    ],
-)
-def test_a_space_that_does_not_fit_is_refused(folder: Path, space: object) -> None:
-    path = folder / DESCRIPTION
-    path.write_text(json.dumps({**json.loads(path.read_text()), "space": space}))
-    with pytest.raises(FaceDiffError, match=r"model\.json|arrays\.npz"):
-        RuntimeModel.open(folder)
-
-
-@pytest.mark.parametrize(
     ("name", "value"),
     [
         ("resting", None),

@@ -243,20 +243,6 @@ def test_stored_numbers_of_16_bits_may_stay_narrow(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_command_says_it_in_one_sentence(tmp_path: Path) -> None:
-    import soundfile
-
-    soundfile.write(tmp_path / "speech.wav", SPEECH, 16_000)
-    for case in ("loop", "computed size"):
-        change = {**REFUSED, **RUN}[case][0]
-        folder = write_exported(tmp_path / case, change)
-        words = ["animate", str(tmp_path / "speech.wav"), "--checkpoint", str(folder), "-o", str(tmp_path / "out.npz")]
-        done = subprocess.run([sys.executable, "-m", "facediff", *words], capture_output=True, text=True, timeout=60)
-        assert done.returncode == 2, done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1
-        assert "step.onnx" in done.stderr
-
-
 def test_serving_reads_the_graphs_first(tmp_path: Path) -> None:
     from facediff.runtime.site import make_site
 

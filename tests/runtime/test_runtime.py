@@ -24,7 +24,6 @@ from facediff import registry
 from facediff.animation import write_archive
 from facediff.animation.options import AnimationOptions
 from facediff.animation.style_files import marked
-from facediff.cli.app import main
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
@@ -285,17 +284,6 @@ def test_a_bare_motion_is_completed_by_a_folder(folder: Path, tmp_path: Path) ->
         exported.animate(sound(0.5), 16_000, direction=keys)
 
 
-@pytest.mark.parametrize("words", ["nobody.npz", "A:0.5,nobody", "short.npy", "A_2.npy", "bent.npy"])
-def test_impossible_style_is_refused(words: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runtime = RuntimeModel.open(folder)
-    monkeypatch.chdir(tmp_path)
-    np.save("short.npy", np.zeros(3, np.float32))
-    np.save("A_2.npy", np.zeros((5, 24, 3), np.float32))  # not on the face of A
-    np.save("bent.npy", np.zeros((5, 7, 3), np.float32))
-    with pytest.raises(FaceDiffError, match="style"):
-        runtime.animate(sound(0.5), style=words)
-
-
 def test_gate_holds_the_mouth_at_rest_in_silence(folder: Path) -> None:
     still = facediff.load(folder).animate(np.zeros(32_000, np.float32), 16_000)
     weights = RuntimeModel.open(folder).arrays["rest_weights"][0]
@@ -413,45 +401,6 @@ def test_damaged_folder_is_refused(case: str, folder: Path, tmp_path: Path) -> N
         RuntimeModel.open(tmp_path / "copy")
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("frame_rate", 0),
-        ("table", [[1.0]]),
-        ("steps", []),
-        ("steps", [2**70, 0]),
-        ("last_step", 2**70),
-        ("windows", {"seconds": -1}),
-        ("version", 99),
-        ("faces", []),
-        ("decoded", "maybe"),
-        ("state", True),
-        ("styles", ["only one"]),
-    ],
-)
-def test_impossible_description_is_refused(field: str, value: object, folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(folder, tmp_path / "copy")
-    path = tmp_path / "copy" / "model.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), field: value}))
-    with pytest.raises(FaceDiffError, match=r"model\.json|arrays\.npz"):
-        RuntimeModel.open(tmp_path / "copy")
-
-
-@pytest.mark.parametrize(
-    ("given", "named"),
-    [
-        ({"identity": "Z"}, "identity"),
-        ({"condition": "Z"}, "condition"),
-        ({"style": "Z"}, "style"),
-        ({"seed": -1}, "seed"),
-        ({"expressivity": 3.0}, "expressivity"),
-    ],
-)
-def test_unknown_choice_is_refused(given: dict[str, object], named: str, folder: Path) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        RuntimeModel.open(folder).animate(sound(1.0), **given)  # type: ignore[arg-type]
-
-
 REFUSED = {
     "--sampler ddim": "--sampler",
     "--steps 3": "--steps",
@@ -464,36 +413,6 @@ REFUSED = {
     "--window 0.1": "window",
 }
 """Options that an exported model cannot follow, and what the error of both commands names."""
-
-
-def test_commands_say_what_an_exported_model_cannot_do(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import soundfile
-
-    soundfile.write(tmp_path / "speech.wav", sound(1.0), 16_000)
-    speech, output = str(tmp_path / "speech.wav"), str(tmp_path / "out.npz")
-    wrong = []
-    for option, named in REFUSED.items():
-        for command in (["animate", speech, "-o", output], ["live", speech, "--to", "jsonl:-?weights=false"]):
-            status = main([*command, "--checkpoint", str(folder), *option.split()])
-            error = capsys.readouterr().err
-            if status != 2 or named not in error or len(error.splitlines()) != 1:
-                wrong.append(f"{command[0]} {option}: {status} {error}")
-    assert not wrong, "\n".join(wrong)
-    assert not (tmp_path / "out.npz").exists()
-
-
-def test_model_that_cannot_be_exported_is_refused(tiny: Tiny, tmp_path: Path) -> None:
-    class Deaf(DualPathDiffusion):
-        graphs = AnimationModel.graphs
-
-    made = Deaf.__new__(Deaf)
-    torch.nn.Module.__init__(made)
-    made._assets = tiny.assets()
-    with pytest.raises(FaceDiffError, match="Deaf"):
-        export_model(made, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("precision", "stored"), [("float16", "FLOAT16"), ("int8", "INT8"), ("float32", "FLOAT")])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import socket
 import sys
 import urllib.error
 import urllib.request
@@ -132,20 +131,6 @@ def test_folder_that_is_interrupted_leaves_nothing(site: Site, tmp_path: Path, m
     assert set(tmp_path.iterdir()) == before
 
 
-def test_model_without_triangles_is_refused(runtime: dict[str, Path], tmp_path: Path) -> None:
-    folder = write_exported(tmp_path / "model")
-    with np.load(folder / "arrays.npz") as archive:
-        arrays = {name: archive[name] for name in archive if name != "faces"}
-    np.savez_compressed(folder / "arrays.npz", **arrays)
-    text = (folder / "model.json").read_text()
-    size = (folder / "arrays.npz").stat().st_size
-    content = json.loads(text)
-    content["sizes"]["arrays.npz"] = size
-    (folder / "model.json").write_text(json.dumps(content))
-    with pytest.raises(FaceDiffError, match="triangles"):
-        make_site(folder, runtime)
-
-
 def test_command_writes_a_folder_and_says_errors_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,13 +150,3 @@ def test_command_writes_a_folder_and_says_errors_in_one_line(
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         assert named in said
-
-
-def test_port_that_is_taken_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(onnxruntime_web, "FILES", {})
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert main(["serve", str(write_exported(tmp_path / "face")), "--port", port]) == 2
-    assert f"--port {port}" in capsys.readouterr().err
