@@ -28,10 +28,6 @@ def perform(
         open_model: opens the model, after everything else has been checked.
         report: prints a sentence.
         weights: whether the model may give weights of ARKit's shapes by itself.
-
-    Raises:
-        FaceDiffError: if something cannot work at all. Failures of the receiving programs are no errors once the
-            performance has begun.
     """
     options.check()
     # What fails quickly comes first: a model takes seconds to open.
@@ -97,11 +93,7 @@ def needs_shapes(name: str) -> FaceDiffError:
 
 
 def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:
-    """Names of a set of blendshapes, and the solver of their weights for a frame.
-
-    Raises:
-        FaceDiffError: if the shapes do not fit the face.
-    """
+    """Names of a set of blendshapes, and the solver of their weights for a frame."""
     from facediff.editing.live_weights import FrameSolver
     from facediff.editing.shapes import read_shapes
 

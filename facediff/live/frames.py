@@ -176,9 +176,6 @@ class Receiver(ABC):
 def read_address(text: str) -> Address:
     """An address: ``scheme://host:port?option=value``, ``scheme:port``, ``scheme:file``, or the scheme alone.
 
-    Raises:
-        FaceDiffError: if it is malformed.
-
     Example:
         >>> read_address("livelink://127.0.0.1:11111?subject=Ann").port
         11111
@@ -231,11 +228,7 @@ def open_receiver(text: str) -> Receiver:
 
 
 def open_receivers(texts: Sequence[str]) -> list[Receiver]:
-    """The receivers at several addresses, none of which is given twice.
-
-    Raises:
-        FaceDiffError: as :func:`open_receiver`.
-    """
+    """The receivers at several addresses, none of which is given twice."""
     for place, text in enumerate(texts):
         if text in texts[:place]:
             raise FaceDiffError(f"{OPTION} {text}: is given twice; give every receiver once")

@@ -222,11 +222,7 @@ class Loop:
         self._failing: set[str] = set()  # names of receivers that have raised
 
     def run(self) -> LiveSummary:
-        """Perform until the speech ends, ``seconds`` have been heard, or Ctrl-C.
-
-        Raises:
-            FaceDiffError: if the source or the model fails.
-        """
+        """Perform until the speech ends, ``seconds`` have been heard, or Ctrl-C."""
         listening = threading.Thread(target=self._guard(self._listen), name="speech", daemon=True)
         animating = threading.Thread(target=self._guard(self._animate), name="model", daemon=True)
         listening.start()

@@ -30,10 +30,6 @@ class SoundOut(Receiver):
 
     Args:
         device: number or part of the name; ``default`` for the system's choice.
-
-    Raises:
-        MissingExtraError: if sounddevice is not installed.
-        FaceDiffError: if PortAudio is missing, or there is no such device.
     """
 
     def __init__(self, device: str = USUAL) -> None:

@@ -55,11 +55,7 @@ class SpeechSource(ABC):
 
     @abstractmethod
     def run(self, deliver: Deliver, stopped: threading.Event) -> None:
-        """Hand over all speech, as it comes, until it ends or is stopped.
-
-        Raises:
-            FaceDiffError: if it cannot be heard, or not any more.
-        """
+        """Hand over all speech, as it comes, until it ends or is stopped."""
 
 
 class Played(SpeechSource):
@@ -91,9 +87,6 @@ class Pcm(SpeechSource):
 
     Args:
         rate: samples a second.
-
-    Raises:
-        FaceDiffError: if standard input is closed or a terminal.
     """
 
     name = "standard input"
@@ -128,10 +121,6 @@ class Microphone(SpeechSource):
 
     Args:
         device: number or part of the name; ``default`` for the system's choice.
-
-    Raises:
-        MissingExtraError: if sounddevice is not installed.
-        FaceDiffError: if PortAudio is missing, there is no such device, or it cannot be opened.
     """
 
     def __init__(self, device: str = USUAL) -> None:
@@ -181,12 +170,7 @@ class Microphone(SpeechSource):
 
 
 def sound_library(feature: str) -> Any:  # noqa: ANN401 - a module without types
-    """The library that speaks to sound devices.
-
-    Raises:
-        MissingExtraError: if it is not installed.
-        FaceDiffError: if PortAudio, which it needs, is not.
-    """
+    """The library that speaks to sound devices."""
     try:
         import sounddevice
     except ImportError as error:

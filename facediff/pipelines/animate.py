@@ -117,9 +117,6 @@ class AnimationPipeline(ABC):
         progress: called while motion is generated; None for a bar on the terminal, if the options ask for one.
 
         target_notes: what a user should know of the motion on the target mesh, where it was carried to it anew.
-
-    Raises:
-        FaceDiffError: if an option decides nothing or does not fit the face.
     """
 
     style_name = ""
@@ -342,9 +339,6 @@ class AnimationPipeline(ABC):
         Args:
             rate: sample rate of the speech.
             channels: give the channels (m, C, 1) of the model's motion instead of vertices; see :attr:`gives_channels`.
-
-        Raises:
-            FaceDiffError: if a control needs the whole animation.
         """
         from facediff.speech.stream import AnimationStream
 
@@ -558,11 +552,7 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
 
 
 def direction_for(direction: DirectionLike, recording: Path, *, streamed: bool = False) -> DirectionLike:
-    """The keys over time of one recording, where a folder has a file for each.
-
-    Raises:
-        FaceDiffError: if the folder has none for this recording.
-    """
+    """The keys over time of one recording, where a folder has a file for each."""
     folder = keys_file(direction)
     if folder is None or not folder.is_dir():
         return direction

@@ -62,9 +62,6 @@ class Audio2FaceWeights:
             model: the model.
             part: whose shapes.
             vertices: absolute positions (T, V, 3) of all of its vertices.
-
-        Raises:
-            FaceDiffError: if the folder has no such shapes, or the vertices are others.
         """
         poses = model.folder.poses.get(part)
         if poses is None:
@@ -122,9 +119,6 @@ class Audio2FacePipeline(AnimationPipeline):
         model: a model that is open already. None to open the folder.
         frame_rate: frames a second.
         weights: how weights are solved for.
-
-    Raises:
-        FaceDiffError: if an option decides nothing in such a model.
     """
 
     def __init__(

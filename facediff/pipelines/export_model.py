@@ -79,11 +79,6 @@ def export_model(
 
     Returns:
         the description, with the comparison in ``check``.
-
-    Raises:
-        FaceDiffError: if the model cannot be exported, knows no such identity, or float32 differs from PyTorch by more
-            than 1e-4 of the motion's range.
-        MissingExtraError: if the packages for ONNX are not installed.
     """
     from facediff.pipelines.trained import with_rig
 
@@ -125,11 +120,7 @@ def export_model(
 
 
 def require_onnx() -> None:
-    """Refuse to begin without the packages.
-
-    Raises:
-        MissingExtraError: naming the extra.
-    """
+    """Refuse to begin without the packages."""
     import importlib.util
 
     for package in ("onnx", "onnxscript", "onnxruntime"):

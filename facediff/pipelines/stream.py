@@ -33,9 +33,6 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
         output: a .npy file, or ``-`` for raw float32 vertices to standard output.
         export: what the whole animation needs of it is refused as well.
         rate: sample rate of the 16-bit mono samples.
-
-    Raises:
-        FaceDiffError: if an option is impossible, or the speech ends before a frame.
     """
     check_stream(options, output, export)
 

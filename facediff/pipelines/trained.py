@@ -276,11 +276,7 @@ def with_rig(assets: Assets) -> Assets:
 
 
 def decoder_of(assets: Assets, identity: str) -> ChannelDecoder | None:
-    """What turns a corpus's channels into the vertices of one of its speakers; None for a corpus of vertices.
-
-    Raises:
-        FaceDiffError: if no rig is known.
-    """
+    """What turns a corpus's channels into the vertices of one of its speakers; None for a corpus of vertices."""
     if assets.space.is_vertices:
         return None
     from facediff.spaces.decoding import ChannelDecoder

@@ -85,9 +85,6 @@ class Audio2Face:
         Args:
             folder: as NVIDIA distributes it.
             threads: of the processor; as many as it has cores if 0.
-
-        Raises:
-            FaceDiffError: naming the file and what is wrong in it.
         """
         content = read_audio2face(Path(folder))
         largest = check_graph(content.network)
@@ -108,9 +105,6 @@ class Audio2Face:
 
         Args:
             strengths: of explicit emotions by name; of all others the model's usual ones.
-
-        Raises:
-            FaceDiffError: if there is no such emotion, or a strength is no number.
         """
         names = self.folder.facts.emotions
         explicit = np.array(self.folder.facts.default_emotion, np.float32)

@@ -194,11 +194,7 @@ class Audio2FaceFolder:
 
 
 def read_audio2face(folder: Path) -> Audio2FaceFolder:
-    """Read a folder.
-
-    Raises:
-        FaceDiffError: naming the file and what is wrong in it.
-    """
+    """Read a folder."""
     about = folder / "model.json"
     content = load_json(about, remedy=REMEDY)
     with damaged(about, REMEDY):

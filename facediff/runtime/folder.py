@@ -205,11 +205,7 @@ def check_graphs(folder: Path, description: Description, names: Iterable[str]) -
 
 
 def _check(description: Description) -> None:
-    """Refuse what would be taken for something else, or would leave the folder.
-
-    Raises:
-        ValueError: if anything is.
-    """
+    """Refuse what would be taken for something else, or would leave the folder."""
     allowed: dict[str, tuple[object, ...]] = {
         "sample_rate": (16_000,),
         "generation": tuple(NEEDED),
@@ -243,12 +239,7 @@ def _check(description: Description) -> None:
 
 
 def _check_arrays(description: Description, arrays: Arrays) -> None:
-    """Refuse arrays of other shapes, numbers that are not finite, and indices of vertices that do not exist.
-
-    Raises:
-        ValueError: if there is any.
-        KeyError: if an array is missing.
-    """
+    """Refuse arrays of other shapes, numbers that are not finite, and indices of vertices that do not exist."""
     space, faces, vertices = description.motion_space, len(description.faces), arrays["templates"].shape[1]
     shapes: dict[str, tuple[int | None, ...]] = {
         "templates": (faces, vertices, 3),
@@ -312,9 +303,6 @@ def copy_exported(source: Path, folder: Path) -> int:
 
     Returns:
         the bytes of its files.
-
-    Raises:
-        FaceDiffError: if the source is damaged or the folder cannot be written.
     """
     description, _ = read_folder(source)
     with atomic_folder(folder) as staged:

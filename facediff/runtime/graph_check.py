@@ -96,9 +96,6 @@ def check_graph(path: Path, opset: int | None = None, ends: dict[str, list[dict[
 
     Returns:
         how many bytes a node may have that is computed while the graph is opened.
-
-    Raises:
-        FaceDiffError: naming the file, what is wrong, what was expected, and what to do.
     """
     try:
         with path.open("rb") as stream:

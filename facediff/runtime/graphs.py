@@ -79,11 +79,7 @@ class ExportedGraphs:
         return graph in self.description.graphs
 
     def run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
-        """Results of a graph, which ignores the inputs that it does not declare.
-
-        Raises:
-            FaceDiffError: if it fails, takes more memory or time than the budget, or gives other shapes than declared.
-        """
+        """Results of a graph, which ignores the inputs that it does not declare."""
         if graph not in self._sessions:
             self._sessions[graph] = self._load(graph)
         session = self._sessions[graph]
@@ -151,9 +147,6 @@ def run_session(
         inputs: those that it declares.
         what: what messages call it.
         seconds: of motion that it computes, which bound how long it may take.
-
-    Raises:
-        FaceDiffError: if it fails, or takes more memory or time than the budget.
     """
     allowed = LIMITS.computing * max(1, seconds)
     try:

@@ -197,9 +197,6 @@ class RuntimeModel(ExportedGraphs):
                 model of channels, (T, C, 1) from their values at rest.
             name: of the style.
 
-        Raises:
-            FaceDiffError: if the model takes no styles from motion, or the motion is of another topology.
-
         Example:
             >>> style = model.encode_style(animation.vertices - animation.template)  # doctest: +SKIP
             >>> model.animate(samples, identity="F1", style=style)  # doctest: +SKIP
@@ -218,9 +215,6 @@ class RuntimeStream(SpeechWindows[Array]):
         face: place of the face among the templates.
         conditions: what motion is conditioned on.
         plan: the windows.
-
-    Raises:
-        FaceDiffError: if the plan does not fit the frame rate.
     """
 
     def __init__(self, model: RuntimeModel, face: int, conditions: RuntimeConditions, plan: WindowPlan) -> None:

@@ -35,11 +35,7 @@ class NormalStream:
         self._bits._legacy_seeding(seed & 0xFFFFFFFF)
 
     def draw(self, shape: tuple[int, ...]) -> Noise:
-        """The next numbers, 16 at least.
-
-        Raises:
-            ValueError: if there are fewer, which PyTorch draws by another rule.
-        """
+        """The next numbers, 16 at least."""
         count = int(np.prod(shape))
         if count < BLOCK:
             raise ValueError(f"{count} numbers: PyTorch draws fewer than {BLOCK} by another rule")

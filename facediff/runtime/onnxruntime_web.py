@@ -96,9 +96,6 @@ def web_runtime(source: Path | None = None, *, say: Callable[[str], object] = la
         source: a folder that holds them, or npm's package of this version; if None they are taken from facediff's
             cache, and fetched from the npm registry the first time.
         say: called with a sentence before anything is fetched.
-
-    Raises:
-        FaceDiffError: if they are missing, of another version, or cannot be fetched.
     """
     if source is not None and not source.exists():
         raise FaceDiffError(f"--runtime {source}: no such file or folder; {REMEDY}")

@@ -84,10 +84,6 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
         folder: of ``facediff export-model``.
         runtime: ONNX Runtime's files, as :func:`facediff.runtime.onnxruntime_web.web_runtime` gives them.
         recordings: that a visitor can try the model with, listed by their names.
-
-    Raises:
-        FaceDiffError: if the folder holds no model, or one without triangles; if a recording cannot be read, or two
-            have one name.
     """
     description, arrays = read_folder(folder)
     # A page takes styles by their names: what encodes them from motion is left out.
@@ -113,11 +109,7 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
 
 
 def page(title: str, description: Description, arrays: Arrays, recordings: Sequence[str] = ()) -> str:
-    """The page of a model, with the names of recordings to try.
-
-    Raises:
-        FaceDiffError: if the model has no triangles, or its motion is channels.
-    """
+    """The page of a model, with the names of recordings to try."""
     if not description.motion_space.is_vertices:
         raise FaceDiffError(
             f"{title}: moves channels ({description.motion_space.kind}), and the page plays models of vertices only; "
@@ -215,10 +207,6 @@ def serve_site(
         host: address to listen at; by default only this machine reaches it.
         port: to listen at; 0 for any free one.
         ready: called with the page's address as soon as it can be opened.
-
-    Raises:
-        FaceDiffError: if the address cannot be used.
-        MissingExtraError: if the server's packages are not installed.
     """
     require_server("serving a page", extra="serve")
     run_server(lambda _: make_app(site, names_of(host)), host=host, port=port, ready=ready)

@@ -50,9 +50,6 @@ def style_from(style: object, model: ExportedGraphs, identity: str) -> RuntimeSt
             array (T, V, 3) of absolute vertices; a style vector (S,); or what this function has returned.
         model: the model.
         identity: whose motion an array holds, where a file's name does not say it.
-
-    Raises:
-        FaceDiffError: if there is no such style, or the motion is of another topology.
     """
     if isinstance(style, RuntimeStyle):
         return style
@@ -135,11 +132,7 @@ def _of_vertices(opened: StyleFile, model: ExportedGraphs, identity: str) -> Run
 
 
 def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyle:
-    """The style of reference motion: offsets (T, points, dims) from rest, at the model's unit and frame rate.
-
-    Raises:
-        FaceDiffError: if the model takes no styles from motion, or the motion is of another topology.
-    """
+    """The style of reference motion: offsets (T, points, dims) from rest, at the model's unit and frame rate."""
     if not model.has("style"):
         raise FaceDiffError(
             f"style: the folder has no style encoder, so {model.description.model} takes styles by name alone; "

@@ -93,12 +93,7 @@ class Browser(Receiver):
         return f"http://{host}:{self.port}/"
 
     def open(self, performance: Performance) -> None:
-        """Serve the page.
-
-        Raises:
-            FaceDiffError: if the port is taken or the model has no triangles.
-            MissingExtraError: if the server's package is not installed.
-        """
+        """Serve the page."""
         require_server("the live page", ("websockets",), "live")
         from websockets.sync.server import serve
 

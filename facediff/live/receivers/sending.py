@@ -51,9 +51,6 @@ def endpoint(address: Address, default_port: int, *, listens: bool = False) -> t
         address: of the receiver.
         default_port: where none is given.
         listens: whether others connect to it.
-
-    Raises:
-        FaceDiffError: if the address has a path.
     """
     if address.path:
         raise FaceDiffError(
@@ -269,9 +266,6 @@ class ArkitWeights:
         performance: whose shapes they are.
         address: of the receiver, for errors.
         order: the names as the protocol has them.
-
-    Raises:
-        FaceDiffError: if the face has none of the shapes.
     """
 
     def __init__(self, performance: Performance, address: Address, order: Sequence[str] = ARKIT) -> None:
