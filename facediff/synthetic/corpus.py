@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -33,11 +32,11 @@ from facediff.synthetic.recordings import ALIGNED, recordings_of
 from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.batch import do_all
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder
-from facediff.utils.jobs import is_cluster, run_tasks
+from facediff.utils.jobs import is_cluster
 from facediff.utils.plain_files import read_json, write_json, write_table
-from facediff.utils.workers import WorkerDied
 
 CORPUS = "facediff-puppet"
 MANIFEST = "manifest.json"
@@ -233,20 +232,13 @@ def generate(
         raise FaceDiffError(f"the built-in corpus has no clip {min(unknown)!r}; clips are named like {every[0].name!r}")
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, clips, people, production)
-        tasks = run_tasks(
-            partial(_write_clip, folder, seed=seed, people=tuple(people), production=production),
-            clips,
-            workers=workers or (None if is_cluster(scheduler) else 1),
-            scheduler=scheduler,
-            writes=folder,
-            progress="Puppet corpus" if progress else "",
-        )
-        frames = 0
-        with closing(tasks):
-            for clip, count in tasks:
-                if isinstance(count, WorkerDied):
-                    raise FaceDiffError(f"{clip.name}: killed the process that wrote it, perhaps for lack of memory")
-                frames += count
+        work = partial(_write_clip, folder, seed=seed, people=tuple(people), production=production)
+        places = {
+            "workers": workers or (None if is_cluster(scheduler) else 1),
+            "scheduler": scheduler,
+            "writes": folder,
+        }
+        frames = sum(do_all(work, clips, **places, progress="Puppet corpus" if progress else ""))
         counts = {"subjects": len(production.speakers) + drawn, "vertices": vertex_count(production), "frames": frames}
         more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": production.frame_rate}
         write_json(folder / MANIFEST, {**facts, **more, "files": describe_files(folder)})

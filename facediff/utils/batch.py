@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.checksums import sha256
@@ -88,17 +88,21 @@ def run_batch(
             yield task, outcome
 
 
-def do_all(work: Callable[[Task], object], tasks: Sequence[Task], **options: Any) -> None:  # noqa: ANN401
+def do_all(work: Callable[[Task], Result], tasks: Sequence[Task], **options: Any) -> list[Result]:  # noqa: ANN401
     """Do tasks that must all succeed: of those that fail, the first in their order is reported at the end.
 
     Args:
         work: does a task.
-        tasks: hashable.
+        tasks: hashable and different.
         options: as :func:`run_batch` takes them.
+
+    Returns:
+        results in the order of the tasks.
     """
-    outcomes = {task: outcome.problem for task, outcome in run_batch(work, tasks, **options)}
-    if problem := next(filter(None, map(outcomes.__getitem__, tasks)), ""):
+    outcomes = dict(run_batch(work, tasks, **options))
+    if problem := next(filter(None, (outcomes[task].problem for task in tasks)), ""):
         raise FaceDiffError(problem)
+    return [cast(Result, outcomes[task].result) for task in tasks]
 
 
 def begin_folder(

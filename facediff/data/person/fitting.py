@@ -55,8 +55,6 @@ class TargetCorpus:
 
 def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> TargetCorpus:
     """Read the corpus that a speaker joins; ``frame_rate`` is needed where ``manifest.json`` does not record it."""
-    if not root.is_dir():
-        raise FaceDiffError(f"--corpus {root}: no such folder; expected one with wav/, vertices_npy/ and templates.pkl")
     templates = read_templates(root / "templates.pkl")
     stems = {path.stem for folder in MOTION_FOLDERS for path in (root / folder).glob("*.npy")}
     subjects = {*templates, *(stem.rpartition("_")[0] for stem in stems)}
@@ -74,15 +72,12 @@ def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> Ta
     )
 
 
-def _frame_rate(root: Path, stored: object, option: float | None) -> float:
-    recorded = float(stored) if isinstance(stored, int | float) and math.isfinite(stored) and stored > 0 else None
+def _frame_rate(root: Path, recorded: float | None, option: float | None) -> float:
     if recorded is None and option is None:
         raise FaceDiffError(f"{root}: has no manifest.json with its frame rate; add --corpus-frame-rate")
     if recorded is not None and option is not None and abs(recorded - option) > 1e-6:
-        raise FaceDiffError(
-            f"--corpus-frame-rate {option:g}: {root / 'manifest.json'} has {recorded:g}; omit the option"
-        )
-    return recorded if recorded is not None else float(option or 0)
+        raise FaceDiffError(f"--corpus-frame-rate {option:g}: {root / 'manifest.json'} has {recorded:g}; omit it")
+    return float(recorded or option or 0)
 
 
 def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
@@ -167,8 +162,6 @@ class StabilisedMotion:
 def read_stable(source: str, n_vertices: int) -> Indices:
     """Stable vertices from a text file of indices, or from ``FLAME_masks.pkl:scalp+forehead``."""
     file = Path(source.partition(".pkl:")[0] + ".pkl" if ".pkl:" in source else source)
-    if not file.is_file():
-        raise FaceDiffError(f"--stable {file}: no such file; expected vertex indices separated by commas")
     region = find_region(file.parent, [Path(source).name], "stable vertices", n_vertices)
     if region.count < MIN_STABLE:
         raise FaceDiffError(
@@ -278,39 +271,28 @@ def _onto_template(stabilised: StabilisedMotion, template: TemplateFile) -> Simi
     ratio = robust_align(face, target, scale=True).scale
     rigid = robust_align(face, target)
     residual = relative_residual(rigid.apply(stabilised.face), template.vertices)
-    if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE):
+    if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE) or not residual < RESIDUAL_LIMIT:
         raise FaceDiffError(
-            f"{template.path}: is {ratio:.4g} times as large as the faces of the motion; expected the speaker's "
+            f"{template.path}: is {ratio:.4g} times as large as the faces of the motion, and does not lie on them "
+            f"(residual {residual:.2f} of its size, expected less than {RESIDUAL_LIMIT}); expected the speaker's "
             f"neutral face in the motion's own unit and vertex order"
-        )
-    if not residual < RESIDUAL_LIMIT:
-        raise FaceDiffError(
-            f"{template.path}: does not lie on the faces of the motion (residual {residual:.2f} of its size, expected "
-            f"less than {RESIDUAL_LIMIT}); expected the speaker's neutral face in the motion's own vertex order"
         )
     return rigid
 
 
 def read_template(path: Path, target: TargetCorpus) -> TemplateFile:
     """A neutral face from .obj, .ply or .npy."""
-    suffix, faces, count = path.suffix.lower(), None, target.n_vertices
-    vertices: Array
-    if suffix == ".npy":
-        array = open_array(path, kinds="f")
-        if array.size != 3 * count:
-            raise FaceDiffError(f"{path}: has shape {array.shape}; expected ({count}, 3) like the corpus")
-        vertices = np.array(array, np.float64).reshape(count, 3)
-    elif suffix in MESHES:
+    faces: Faces | None = None
+    if path.suffix.lower() in MESHES:
         mesh = read_mesh(path, points_allowed=True)
         vertices, faces = mesh.vertices, mesh.faces if len(mesh.faces) else None
-        if len(vertices) != count:
-            raise FaceDiffError(
-                f"{path}: has {len(vertices)} vertices, but the corpus has {count}; so its topology differs"
-            )
     else:
-        raise FaceDiffError(f"{path}: unknown form of template; expected .obj, .ply or .npy")
-    if not np.isfinite(vertices).all():
-        raise FaceDiffError(f"{path}: holds NaN or infinity; expected a neutral face")
+        vertices = np.array(open_array(path, kinds="f"), np.float64).reshape(-1, 3)
+    if len(vertices) != target.n_vertices or not np.isfinite(vertices).all():
+        raise FaceDiffError(
+            f"{path}: has {len(vertices)} vertices, or NaN among them; expected {target.n_vertices} finite ones like "
+            f"the corpus, from .obj, .ply or .npy"
+        )
     check_faces(path, faces, target)
     return TemplateFile(path, vertices)
 

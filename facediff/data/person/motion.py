@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import FLAME_WIDTH, read_parameters
+from facediff.data.prepare.motion import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.flame import Flame
@@ -45,34 +45,22 @@ def read_motion(
     ``flame`` is the FLAME model file, needed for parameters and only for them; ``scratch`` is a temporary file for
     frames that must be put together.
     """
-    parameters = path.suffix.lower() in HDF5_SUFFIXES
-    if path.suffix.lower() == ".npy" and path.is_file():
-        array = open_array(path, kinds="f")
-        fits = vertices_of(array.shape) == n_vertices
-        if fits and flame is None:
-            return FaceSequence(array.reshape(len(array), n_vertices, 3))
-        parameters = array.shape[-1:] == (FLAME_WIDTH,)
-        if not parameters and not fits:
-            raise FaceDiffError(
-                f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) "
-                f"like the corpus, or FLAME parameters (1, frames, {FLAME_WIDTH})"
-            )
-    elif path.is_dir():
-        if flame is None:
-            frames, faces, notes = read_frames(
-                path, n_vertices=n_vertices, frame_rate=frame_rate, scratch=scratch, progress=progress
-            )
-            return FaceSequence(frames, faces, notes=notes)
-    elif not path.is_file():
-        raise FaceDiffError(f"{path}: no such file or folder; expected the reconstructed motion")
-    if not parameters:
-        kinds = "a folder of .obj or .ply files, a .npy array, or FLAME parameters (.hdf5 or .npy)"
-        if flame is not None:
-            raise FaceDiffError(f"{path}: holds no FLAME parameters; omit --flame, or give .hdf5 or .npy")
-        raise FaceDiffError(f"{path}: unknown form of motion; expected {kinds}")
-    if flame is None:
+    if flame is not None:
+        return _read_flame(path, flame, n_vertices, scratch)
+    if path.is_dir():
+        frames, faces, notes = read_frames(
+            path, n_vertices=n_vertices, frame_rate=frame_rate, scratch=scratch, progress=progress
+        )
+        return FaceSequence(frames, faces, notes=notes)
+    if path.suffix.lower() in HDF5_SUFFIXES:
         raise FaceDiffError(f"{path}: holds FLAME parameters; add --flame MODEL, your own FLAME model file")
-    return _read_flame(path, flame, n_vertices, scratch)
+    array = open_array(path, kinds="f")
+    if vertices_of(array.shape) != n_vertices:
+        raise FaceDiffError(
+            f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) like "
+            f"the corpus, a folder of .obj or .ply files, or FLAME parameters with --flame MODEL"
+        )
+    return FaceSequence(array.reshape(len(array), n_vertices, 3))
 
 
 def _read_flame(path: Path, model: Path, n_vertices: int, scratch: Path) -> FaceSequence:
@@ -133,15 +121,11 @@ def read_frames(
 
 
 def _check(path: Path, mesh: Mesh, first_path: Path, first: Mesh, n_vertices: int) -> None:
-    count = len(mesh.vertices)
-    if count != len(first.vertices):
+    if len(mesh.vertices) != n_vertices or not np.isfinite(mesh.vertices).all():
         raise FaceDiffError(
-            f"{path}: has {count} vertices, but {first_path.name} has {len(first.vertices)}; expected one topology"
+            f"{path}: has {len(mesh.vertices)} vertices, or NaN among them; expected {n_vertices} finite ones like the "
+            f"corpus"
         )
-    if count != n_vertices:
-        raise FaceDiffError(f"{path}: has {count} vertices, but the corpus has {n_vertices}; so its topology differs")
-    if not np.isfinite(mesh.vertices).all():
-        raise FaceDiffError(f"{path}: holds NaN or infinity; repair the frame, or remove the file")
     if not np.array_equal(mesh.faces, first.faces) and differing_faces(mesh.faces, first.faces):
         raise FaceDiffError(f"{path}: its faces differ from those of {first_path.name}; expected one topology")
 
@@ -166,34 +150,19 @@ class FrameFiles:
 
 def find_frames(folder: Path) -> FrameFiles:
     """The mesh files of a folder, in the natural order of the one number in which their names differ."""
-    try:
-        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES and not p.name.startswith("."))
-    except OSError as error:
-        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
-    if not paths:
-        raise FaceDiffError(f"{folder}: holds no mesh files; expected one for each frame, {' or '.join(MESHES)}")
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES and not p.name.startswith("."))
     pieces = [re.split(r"(\d+)", path.stem) for path in paths]
-    for path, piece in zip(paths, pieces, strict=True):
-        if piece[::2] != pieces[0][::2] or len(piece) == 1:
-            raise FaceDiffError(
-                f"{folder}: {paths[0].name} and {path.name} are named in different ways; "
-                f"leave only one file for each frame in the folder, named like frame_0001.obj"
-            )
-    figures = np.array([[int(word) for word in piece[1::2]] for piece in pieces], dtype=object)
-    varying = [column for column in range(figures.shape[1]) if len(set(figures[:, column])) > 1]
-    if len(varying) > 1:
+    texts = {tuple(piece[::2]) for piece in pieces}
+    figures = np.array([[int(word) for word in piece[1::2]] for piece in pieces if len(texts) == 1], dtype=object)
+    varying = [column for column in range(figures.shape[-1]) if len(set(figures[:, column])) > 1] if paths else []
+    if len(texts) != 1 or not figures.size or len(varying) > 1 or len(set(map(tuple, figures.tolist()))) < len(paths):
         raise FaceDiffError(
-            f"{folder}: the names differ in more than one number ({paths[0].name}, {paths[-1].name}); expected the "
-            f"frames of one video, numbered in their names"
+            f"{folder}: expected one {' or '.join(MESHES)} file for each frame, with names that differ in one number, "
+            f"such as frame_0001.obj"
         )
     column = varying[0] if varying else figures.shape[1] - 1
     order = sorted(range(len(paths)), key=lambda i: figures[i, column])
     paths, numbers = [paths[i] for i in order], [int(figures[i, column]) for i in order]
-    for i in range(1, len(paths)):
-        if numbers[i] == numbers[i - 1]:
-            raise FaceDiffError(
-                f"{folder}: {paths[i - 1].name} and {paths[i].name} are both frame {numbers[i]}; remove one of them"
-            )
     return FrameFiles(paths, _places(numbers), numbers)
 
 

@@ -48,18 +48,12 @@ def resample_frames(
         rate_out: frames a second of the result.
         out: where to write, shape (round(T · rate_out / rate_in), C); a new array of ``motion``'s type if None.
     """
-    if not (rate_in > 0 and rate_out > 0 and math.isfinite(rate_in) and math.isfinite(rate_out)):
-        raise FaceDiffError(f"frame rates {rate_in:g} and {rate_out:g}: expected positive numbers of frames a second")
     length = resampled_length(len(motion), rate_in, rate_out)
     if length < 1:
         raise FaceDiffError(
             f"motion of {len(motion)} frames at {rate_in:g} frames a second: too short for {rate_out:g} frames a second"
         )
-    shape = (length, *motion.shape[1:])
-    if out is None:
-        out = np.empty(shape, motion.dtype)
-    if out.shape != shape:
-        raise FaceDiffError(f"resampling: out has shape {out.shape}, expected {shape}")
+    out = np.empty((length, *motion.shape[1:]), motion.dtype) if out is None else out
     if rate_in == rate_out:
         for first in range(0, length, BLOCK):
             out[first : first + BLOCK] = motion[first : first + BLOCK]
@@ -139,20 +133,12 @@ def read_parameters(path: Path) -> FlameParameters:
     The shape is the mean over all frames with equal weights, since these files do not say how well the face was seen
     in each. Rotation of the head and the camera are left out.
     """
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected FLAME parameters, .hdf5 or .npy")
     parts = read_frames(path, WIDTHS) if path.suffix.lower() in HDF5_SUFFIXES else _read_array(path)
-    for name, values in parts.items():
-        bad = ~np.isfinite(values).all(axis=1)
-        if bad.any():
-            raise FaceDiffError(
-                f"{path}: frame {int(np.argmax(bad))} (counted from 0) of {name} holds NaN or infinity; leave the clip "
-                f"out or get it again"
-            )
     frames = len(parts["exp"])
-    if len(parts["jaw"]) != frames or len(parts["shape"]) not in (1, frames):
+    finite = all(np.isfinite(values).all() for values in parts.values())
+    if not finite or len(parts["jaw"]) != frames or len(parts["shape"]) not in (1, frames):
         counts = ", ".join(f"{len(values)} of {name}" for name, values in parts.items())
-        raise FaceDiffError(f"{path}: its frames do not agree ({counts}); get it again")
+        raise FaceDiffError(f"{path}: holds NaN or infinity, or its frames do not agree ({counts}); get it again")
     return FlameParameters(parts["shape"].mean(axis=0), parts["exp"], parts["jaw"])
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from facediff.data.prepare.motion import resample_frames, resampled_length
-from facediff.errors import FaceDiffError
 
 RATES = [(60, 30), (30, 25), (25, 30), (29.97, 25), (23.976, 30), (30, 60), (100, 25)]
 
@@ -71,16 +70,3 @@ def test_resampling_from_disk_to_disk_needs_little_memory(tmp_path: Path) -> Non
     tracemalloc.stop()
     np.testing.assert_array_equal(out, resample_frames(motion, 30, 25))
     assert peak < motion.nbytes / 2
-
-
-@pytest.mark.parametrize("rates", [(0, 25), (25, -1), (25, float("nan")), (float("inf"), 25)])
-def test_impossible_rates_are_refused(rates: tuple[float, float]) -> None:
-    with pytest.raises(FaceDiffError, match="positive numbers of frames a second"):
-        resample_frames(np.zeros((9, 3)), *rates)
-
-
-def test_too_short_motion_and_a_wrong_output_are_refused() -> None:
-    with pytest.raises(FaceDiffError, match="too short"):
-        resample_frames(np.zeros((0, 3)), 30, 25)
-    with pytest.raises(FaceDiffError, match="out has shape"):
-        resample_frames(np.zeros((30, 3)), 30, 25, out=np.zeros((30, 3)))
