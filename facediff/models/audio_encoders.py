@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, 
 from facediff.registry import audio_encoder
 from facediff.speech.cepstra import mel_filters
 from facediff.speech.windows import CONVOLUTIONS, convolved
-from facediff.utils.limits import quoted
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
@@ -579,11 +578,7 @@ class CtcEncoder(FrozenEncoder):
 
 def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
     """A HuBERT from a directory, from the hub, or from a plain configuration without weights."""
-    with needs_extra("transformers", "train", "the hubert audio encoder"):
-        from transformers import HubertConfig, HubertModel
-    if config is not None:
-        return HubertModel(known_options(HubertConfig, config))
-    return load_pretrained(HubertModel, source, "HuBERT")
+    return cast("HubertModel", load_typed(source, config, {"hubert": "Hubert"}, "Model", "HuBERT", encoder="hubert"))
 
 
 SOURCE = "audio_encoder.source"
@@ -619,12 +614,13 @@ def load_typed(
     """
     with needs_extra("transformers", "train", f"the {encoder} audio encoder"):
         import transformers
+    path = os.path.expanduser(source)
     if config is None:
-        check_source(source, option)
-        try:
-            kind = transformers.PretrainedConfig.get_config_dict(os.path.expanduser(source))[0].get("model_type")
-        except Exception as error:  # the hub's errors are of many classes
-            raise unreadable(source, f"a {what}", error, option) from error
+        # A directory that does not exist would be taken for a name on the hub, with a puzzling message.
+        if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(path).is_dir():
+            raise FaceDiffError(f"{option}: no directory {source}; {SOURCE_EXPECTED}")
+        with unreadable(source, what, option):
+            kind = transformers.PretrainedConfig.get_config_dict(path)[0].get("model_type")
     else:
         kind = config.get("model_type")
     if kind not in kinds:
@@ -634,15 +630,25 @@ def load_typed(
         )
     network: type[PreTrainedModel] = getattr(transformers, f"{kinds[kind]}{head}")
     if config is not None:
-        try:
+        with unreadable("config.json", what, "audio_encoder.config"):
             return network(known_options(getattr(transformers, f"{kinds[kind]}Config"), config))
-        except Exception as error:  # transformers' own of a value that it cannot use, and whatever its layers raise
-            reason = quoted(" ".join(str(error).split())) if str(error) else type(error).__name__
-            raise FaceDiffError(
-                f"audio_encoder.config: makes no {what} ({reason}); expected the content of the network's config.json "
-                f"(--audio-config)"
-            ) from error
-    return load_pretrained(network, source, what, option)
+    bar = transformers.utils.logging.is_progress_bar_enabled()
+    transformers.utils.logging.disable_progress_bar()
+    try:
+        with unreadable(source, what, option):
+            model, info = network.from_pretrained(path, output_loading_info=True, dtype=torch.float32)
+    finally:
+        if bar:
+            transformers.utils.logging.enable_progress_bar()
+    # The mask embedding is absent from checkpoints that were fine-tuned without SpecAugment; it has no other use.
+    missing = sorted(key for key in info["missing_keys"] if not key.endswith("masked_spec_embed"))
+    if missing:  # they would be random numbers without a word
+        raise FaceDiffError(
+            f'{option}: "{source}" holds no complete {what} ({len(missing)} weights are missing, '
+            f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
+        )
+    # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
+    return model.train()
 
 
 RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
@@ -656,46 +662,20 @@ def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - o
     return kind.from_dict({key: value for key, value in config.items() if key in options})
 
 
-def check_source(source: str, option: str = SOURCE) -> None:
-    """Refuse a directory that does not exist: it would be taken for a name on the hub, with a puzzling message."""
-    if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(source).expanduser().is_dir():
-        raise FaceDiffError(
-            f"{option}: no directory {source}; expected one with config.json and model.safetensors, "
-            f"or a name on the Hugging Face hub such as facebook/hubert-base-ls960"
-        )
+SOURCE_EXPECTED = (
+    "expected one with config.json and model.safetensors, or a name on the Hugging Face hub such as "
+    "facebook/hubert-base-ls960"
+)
 
 
-def unreadable(source: str, what: str, error: Exception, option: str = SOURCE) -> FaceDiffError:
-    """What is reported where a source cannot be loaded."""
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return FaceDiffError(
-        f'{option}: cannot load {what} from "{source}" ({reason}); give a directory '
-        f"that holds config.json and model.safetensors, or go online once to fetch it"
-    )
-
-
-def load_pretrained(network: Any, source: str, what: str, option: str = SOURCE) -> Any:  # noqa: ANN401 - one of transformers' models
-    """A complete network from a directory or from the hub."""
-    from transformers.utils import logging
-
-    check_source(source, option)
-    bar = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()
+@contextmanager
+def unreadable(source: str, what: str, option: str) -> Iterator[None]:
+    """Say in a sentence of what a source is, and where it was named, that it cannot be loaded."""
     try:
-        model, info = network.from_pretrained(
-            os.path.expanduser(source), use_safetensors=None, output_loading_info=True, dtype=torch.float32
-        )
-    except Exception as error:  # a broken file makes safetensors, pickle and transformers raise anything
-        raise unreadable(source, what, error, option) from error
-    finally:
-        if bar:
-            logging.enable_progress_bar()
-    # The mask embedding is absent from checkpoints that were fine-tuned without SpecAugment; it has no other use.
-    missing = sorted(key for key in info["missing_keys"] if not key.endswith("masked_spec_embed"))
-    if missing:
+        yield
+    except Exception as error:  # the hub, safetensors, pickle and transformers raise anything
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FaceDiffError(
-            f'{option}: "{source}" holds no complete {what} ({len(missing)} weights are missing, '
-            f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
-        )
-    # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
-    return model.train()
+            f'{option}: cannot load {what} from "{source}" ({reason}); give a directory that holds config.json and '
+            f"model.safetensors, or go online once to fetch it"
+        ) from error
