@@ -18,7 +18,10 @@ REMOVED: dict[str, dict[str, Any]] = {
         "face_weight_unit": "scaled",
         "style_contrast_weight": 0.0,
     },
-    "facediff.models.style_content.model.StyleContentDisentanglement": {"basis_start": "pca"},
+    "facediff.models.style_content.model.StyleContentDisentanglement": {
+        "basis_start": "pca",
+        "upper_face_weight": 0.0,
+    },
     "facediff.models.audio_encoders.MelEncoder": {"n_mels": 64},
     "facediff.models.mesh_encoders.SpiralMeshEncoder": {"negative_slope": 0.2, "max_frames": None},
     "facediff.models.speaker_encoders.HierarchicalIdentity": {"unseen": "mean"},

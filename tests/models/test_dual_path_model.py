@@ -108,30 +108,6 @@ def test_the_neutral_face_is_a_token_of_what_it_has_of_its_own(make_model: Make,
         model.graphs()
 
 
-def test_a_tiny_model_overfits_one_clip(make_model: Make, tiny: Tiny) -> None:
-    model = make_model(
-        dim=32,
-        identity_dropout=0.0,
-        audio_encoder=partial(registry.audio_encoder.mel, hidden_dim=32, num_layers=1, dropout=0.0),
-        decoder=partial(registry.decoder.style_transformer, num_layers=1, dropout=0.0),
-        fusion=partial(registry.fusion.cross_attention, dropout=0.0),
-        style_encoder=partial(registry.style_encoder.tcn_gru_transformer, num_layers=1, dropout=0.0),
-        sampler=partial(registry.sampler.ddim, steps=10),
-    )
-    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    batch = collate([tiny.dataset("val")[0]] * 2)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
-    torch.manual_seed(0)
-    for _ in range(140):
-        optimizer.zero_grad()
-        model.losses(batch)["loss"].backward()
-        optimizer.step()
-    with torch.inference_mode():
-        motion = model.eval().generate(batch, seed=0)
-    error = (motion - batch.motion).square().mean() / batch.motion.square().mean()
-    assert error < 0.05
-
-
 def test_animate_is_seeded_and_knows_unseen_people(model: DualPathDiffusion) -> None:
     speech = torch.randn(16_000)
     first = model.animate(speech, identity="A", seed=1)
@@ -175,7 +151,7 @@ def test_fewer_steps_end_at_more_noise(make_model: Make, name: str | None) -> No
     assert model.sampler.timesteps == own
     model.choose_sampler("ddim", 4)
     model.choose_sampler(steps=2)  # of the sampler that was chosen
-    assert (type(model.sampler).__name__, model.sampler.steps) == ("ddim", 2)
+    assert (type(model.sampler).__name__, model.sampler.steps) == ("DdimSampler", 2)
     with pytest.raises(FaceDiffError, match="steps"):
         model.choose_sampler(steps=-1)
 

@@ -216,7 +216,7 @@ def test_where_no_style_is_given_motion_is_that_of_a_hidden_style(ready: Ready, 
 
 
 def test_guidance_of_the_constructor_needs_the_dropout(make_model: Callable[..., DualPathDiffusion]) -> None:
-    with pytest.raises(FaceDiffError, match="style_guidance"):
+    with pytest.raises(FaceDiffError, match=r"style=1\.5 needs a model that knows motion without it"):
         make_model(style_guidance=1.5)
     assert make_model(identity_guidance=1.5).guidance["identity"] == 1.5
     assert not make_model(identity_guidance=1.5, identity_dropout=0.2).network.no_style

@@ -66,7 +66,6 @@ CONFIG: dict[str, Any] = {
     f"{MODEL}.swap_region": "lower_face",
     # What is not published, so that there is none of it.
     f"{MODEL}.swap_dynamics_weight": 0.0,
-    f"{MODEL}.upper_face_weight": 0.0,
     f"{MODEL}.content_pull": "squared",
     f"{MODEL}.style_pull": "squared",
     f"{MODEL}.speech_style": "own",

@@ -139,6 +139,10 @@ class DualPathDiffusion(AnimationModel):
     samples: ClassVar[bool] = True
     low_latency_steps = LOW_LATENCY_STEPS
     chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
+    # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which weight
+    # averaging would copy together with the model.
+    _sampler_options: dict[str, Any] | None = None
+    _step_weights: Tensor | None = None  # follow from the motion space, known when training begins
 
     def __init__(
         self,
@@ -177,9 +181,8 @@ class DualPathDiffusion(AnimationModel):
     ) -> None:
         super().__init__(**options)
         self.identity_dropout = identity_dropout
-        self.invented_speakers = (
-            InventedSpeakers(self.n_vertices, self.dims, invented_speakers) if invented_speakers else None
-        )
+        invented = InventedSpeakers(self.n_vertices, self.dims, invented_speakers) if invented_speakers else None
+        self.invented_speakers = invented
         self.style_dropout = style_dropout
         self.speech_dropout = speech_dropout
         self.expressivity: Expressivity = expressivity
@@ -191,32 +194,27 @@ class DualPathDiffusion(AnimationModel):
         }
         self.noise_draws = noise_draws
         self.timestep_sampling = timestep_sampling
-        self._step_weights: Tensor | None = None  # follow from the motion space, known when training begins
         self.style_identity_weight = style_identity_weight
         self.noise_scale: NoiseScale = noise_scale
         self.process = NoiseProcess(diffusion_steps, noise_schedule, 1.0 if noise_scale == "auto" else noise_scale)
-        # Not the factory itself: jsonargparse's holds the parser, and with it the trainer and its processes, which
-        # weight averaging would copy together with the model.
-        self._sampler_options: dict[str, Any] | None = None
         self.sampler = sampler(process=self.process)
         self._usual_steps = self.sampler.steps
         self.sampling_space: SamplingSpace = sampling_space
-        self.motion_space = motion_space(n_vertices=self.n_vertices, dims=self.dims, steps=diffusion_steps)
+        points = {"n_vertices": self.n_vertices, "dims": self.dims}
+        self.motion_space = motion_space(**points, steps=diffusion_steps)
         if timestep_sampling == "log_snr" and self.motion_space.preconditioning is None:
             raise ArgumentError(
                 {"timestep_sampling": timestep_sampling}, "needs motion_space=components, which knows what noise hides"
             )
-        style = style_encoder(dim=dim)
+        style, speakers = style_encoder(dim=dim), len(self.identities)
         self.network = DualPathNetwork(
             coordinates=self.motion_space.coordinates,
             inputs=self.motion_space.inputs,
             dim=dim,
             audio_encoder=audio_encoder(dim=dim),
-            identity_encoder=identity_encoder(dim=dim, n_identities=len(self.identities)),
+            identity_encoder=identity_encoder(dim=dim, n_identities=speakers),
             # Without a dynamic style there is nothing to embed, and no idle weights.
-            mesh_encoder=mesh_encoder(dim=dim, n_vertices=self.n_vertices, dims=self.dims)
-            if style.token_dims
-            else None,
+            mesh_encoder=mesh_encoder(dim=dim, **points) if style.token_dims else None,
             style_encoder=style,
             fusion=fusion(dim=dim),
             decoder=decoder(dim=dim, style_dim=dim),
@@ -224,25 +222,17 @@ class DualPathDiffusion(AnimationModel):
             template_token=TemplateToken(self.n_vertices, self.dims, dim) if template_token else None,
             speech_may_hide=speech_dropout > 0,
             style_may_hide=style_dropout > 0,
-            speech_style=SpeechStyle(dim, sum(style.token_dims), len(self.identities)) if style_from_speech else None,
+            starts_at_zero=self.motion_space.preconditioning is not None,
+            speech_style=SpeechStyle(dim, sum(style.token_dims), speakers) if style_from_speech else None,
         )
         if (style_from_speech or style_identity_weight) and not style.token_dims:
+            needing = {"style_from_speech": style_from_speech, "style_identity_weight": style_identity_weight}
             raise ArgumentError(
-                {"style_from_speech": style_from_speech, "style_identity_weight": style_identity_weight},
-                "there is no dynamic style; choose a style_encoder, or leave out what needs one (false, 0)",
+                needing, "there is no dynamic style; choose a style_encoder, or leave out what needs it"
             )
-        self.style_identity = nn.Linear(sum(style.token_dims), len(self.identities)) if style_identity_weight else None
+        self.style_identity = nn.Linear(sum(style.token_dims), speakers) if style_identity_weight else None
         self.guidance = dict.fromkeys(CONDITIONS, 1.0)
-        scales = {"speech": speech_guidance, "identity": identity_guidance, "style": style_guidance}
-        for name, scale in scales.items():
-            try:
-                self.choose_guidance({name: scale})
-            except FaceDiffError as error:
-                raise ArgumentError({f"{name}_guidance": scale}, str(error)) from error
-        if self.motion_space.preconditioning is not None:
-            # Training starts from the posterior mean without speech, and not from random motion added to it.
-            nn.init.zeros_(self.network.unembed.weight)
-            nn.init.zeros_(self.network.unembed.bias)
+        self.choose_guidance({"speech": speech_guidance, "identity": identity_guidance, "style": style_guidance})
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Besides principal components, how much noise hides of the training motion."""

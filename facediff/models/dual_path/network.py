@@ -125,6 +125,8 @@ class DualPathNetwork(nn.Module):
         style_may_hide: the same for the dynamic style.
         speech_style: what speech says of the style; None if that is not asked.
         template_token: the neutral face to a further token; None if the network does not see it.
+        starts_at_zero: let training start from the posterior mean without speech, and not from random motion added to
+            it.
     """
 
     def __init__(
@@ -144,6 +146,7 @@ class DualPathNetwork(nn.Module):
         style_may_hide: bool = False,
         speech_style: SpeechStyle | None = None,
         template_token: TemplateToken | None = None,
+        starts_at_zero: bool = False,
     ) -> None:
         super().__init__()
         self.coordinates = coordinates
@@ -160,6 +163,9 @@ class DualPathNetwork(nn.Module):
         self.fused_norm = nn.LayerNorm(dim)
         self.decoder = decoder
         self.unembed = nn.Linear(dim, coordinates)
+        if starts_at_zero:
+            nn.init.zeros_(self.unembed.weight)
+            nn.init.zeros_(self.unembed.bias)
         # Only where they are trained, so that other checkpoints have no weights for them.
         self.no_speech = nn.Parameter(torch.zeros(dim)) if speech_may_hide else None
         self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None

@@ -25,23 +25,20 @@ EPSILON = 1e-6
 
 
 class MotionDistance:
-    """How far two motions are apart: positions, velocities, the upper face, the gap between the inner lips.
+    """How far two motions are apart: positions, velocities, the gap between the inner lips.
 
-    Mean squared differences; 0 for equal motions. Brows and lids move so much less than lips that they hardly count
-    among all vertices, so the upper face may be given a weight of its own.
+    Mean squared differences; 0 for equal motions.
 
     Args:
         position: weight of the positions.
         velocity: weight of the differences from frame to frame.
         lip_gap: weight of the distance between the inner lips; looked at where the corpus says which vertices they are.
-        upper_face: weight of the upper face's positions, as a share of how much they vary.
     """
 
-    def __init__(self, position: float, velocity: float, lip_gap: float, upper_face: float = 0.0) -> None:
+    def __init__(self, position: float, velocity: float, lip_gap: float) -> None:
         self.position = position
         self.velocity = velocity
         self.lip_gap = lip_gap
-        self.upper_face = upper_face
 
     def __call__(
         self,
@@ -52,7 +49,6 @@ class MotionDistance:
         vertices: Int[Tensor, " region"] | None = None,
         rest: Float[Tensor, "batch points dims"] | None = None,
         pairs: Int[Tensor, "pairs 2"] | None = None,
-        upper: Int[Tensor, " upper_face"] | None = None,
     ) -> Float[Tensor, ""]:
         """The weighted sum.
 
@@ -63,12 +59,7 @@ class MotionDistance:
             vertices: vertices that count; all if None.
             rest: the templates in the motion's unit, for the gap.
             pairs: upper and lower vertices of the inner lips.
-            upper: vertices of the upper face; not looked at if None.
         """
-        face = motion.new_zeros(())
-        # As a share of the truth's own size, since squared errors of small movements vanish next to those of the lips.
-        if self.upper_face and upper is not None:
-            face = relative_error(motion[:, :, upper], truth[:, :, upper], mask)
         gap = motion.new_zeros(())
         if self.lip_gap and pairs is not None and rest is not None:
             gap = frame_mean((_gaps(motion, rest, pairs) - _gaps(truth, rest, pairs)).square().mean(-1), mask)
@@ -83,7 +74,7 @@ class MotionDistance:
             for total, valid in zip(squares, (mask, neighbours(mask)), strict=True)
         )
         total = self.position * moved + self.velocity * changed
-        return total + self.lip_gap * gap + self.upper_face * face
+        return total + self.lip_gap * gap
 
 
 def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch frames pairs"]:
@@ -96,12 +87,6 @@ def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch f
 def frame_mean(values: Float[Tensor, "batch frames"], mask: Mask) -> Float[Tensor, ""]:
     """Mean over valid frames; 0 if there is none."""
     return (values * mask).sum() / mask.sum().clamp_min(1)
-
-
-def relative_error(motion: Motion, truth: Motion, mask: Mask) -> Float[Tensor, ""]:
-    """Mean squared difference as a share of the truth's mean square."""
-    size = frame_mean(truth.square().mean((2, 3)), mask)
-    return frame_mean((motion - truth).square().mean((2, 3)), mask) / (size + EPSILON)
 
 
 def squared_distance(

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Assets, Batch, SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, results_of, speech_graph, style_graphs
@@ -96,7 +96,6 @@ class StyleContentDisentanglement(AnimationModel):
         position_weight: of positions within each comparison of motions.
         velocity_weight: of velocities within it.
         lip_gap_weight: of the gap between the inner lips within it.
-        upper_face_weight: of the upper face's positions within it, as a share of how much they vary.
         weight_decay: decoupled weight decay.
         options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
@@ -137,19 +136,10 @@ class StyleContentDisentanglement(AnimationModel):
         position_weight: Weight = 1.0,
         velocity_weight: Weight = 5.0,
         lip_gap_weight: Weight = 1.0,
-        upper_face_weight: Weight = 0.0,
         weight_decay: Decay = 0.0,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(weight_decay=weight_decay, **options)
-        if dim % speech_heads:
-            raise ArgumentError({"dim": dim, "speech_heads": speech_heads}, "dim must be a multiple of the heads")
-        if len(decoder_channels) != len(decoder_kernels):
-            raise ArgumentError(
-                {"decoder_channels": list(decoder_channels), "decoder_kernels": list(decoder_kernels)},
-                "expected one number of channels and one of taps for each convolution",
-            )
-        self.vertices = vertices
         self.aligned_pairs = aligned_pairs
         self.aligned_windows = aligned_windows
         self.window_context = window_context
@@ -167,7 +157,7 @@ class StyleContentDisentanglement(AnimationModel):
             "speech_content": speech_content_weight,
         }
         self.weights |= {f"speech_{term}": speech_weight * self.weights[term] for term in SPOKEN}
-        self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight, upper_face_weight)
+        self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight)
         self.alignments = Alignments(self.frame_rate)
         style = style_encoder(dim=dim)
         if not style.token_dims:
@@ -341,17 +331,16 @@ class StyleContentDisentanglement(AnimationModel):
             vertices=self.face() if vertices is None else vertices,
             rest=batch.template * self.scale,
             pairs=None if pairs is None else pairs.to(motion.device),
-            upper=self.assets.regions["upper_face"].to(motion.device) if vertices is None else None,
         )
 
     def face(self) -> Tensor | None:
         """Indices of the vertices that the losses compare; None for all."""
-        return self.assets.regions["face"].to(self.device) if self.vertices == "face" else None
+        return self.assets.regions["face"].to(self.device) if self.network.visible is not None else None
 
     def lower_face(self) -> Tensor:
         """Indices of the vertices that the losses compare, outside the upper face."""
         lower = torch.ones(self.n_vertices, dtype=torch.bool)
-        if self.vertices == "face":
+        if self.network.visible is not None:
             lower[:] = False
             lower[self.assets.regions["face"]] = True
         lower[self.assets.regions["upper_face"]] = False
