@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from facediff.benchmark.referee import FAULTS, SCORES, Judgement, RefereeScore, Tally, judge
+from facediff.benchmark.referee import FAULTS, Judgement, Tally, judge
 from facediff.pipelines.candidates import Candidate, CandidateMotion, perform
 from facediff.synthetic.spoken_set import SpokenClip, SpokenMotion, open_face, reference, spoken_set
 from facediff.utils.hub import BUNDLED
@@ -87,11 +87,3 @@ def test_a_model_that_has_a_fault_already_is_not_asked_for_it() -> None:
     assert not Judgement("good", {"closures": 0.9, "correlation": 0.9}).lacks("gap")
     # Of a jaw alone closures are not read, which says nothing of how it closes its lips.
     assert not Judgement("jaw", {"correlation": 0.9}).lacks("closures")
-
-
-def test_scores_know_which_way_is_better() -> None:
-    lag, lips = SCORES["lag"], SCORES["lips"]
-    assert lag.badness(-80) > lag.badness(20)
-    assert lips.badness(0.5) == pytest.approx(lips.badness(2.0))
-    assert SCORES["closures"].badness(0.9) < SCORES["closures"].badness(0.5)
-    assert RefereeScore("x", "one", 1, "").badness(0.0) == float("inf")

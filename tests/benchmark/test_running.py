@@ -23,38 +23,17 @@ from facediff.benchmark.running import (
     Runner,
     Setting,
     estimate,
-    fit_options,
     pending,
     run_cells,
 )
 from facediff.benchmark.writing import document
 from facediff.errors import FaceDiffError
 from facediff.reporting.documents import markdown
+from tests.benchmark.conftest import PLAN
 from tests.fakes.waiting import wait_until
 
 LAUNCHER = (sys.executable, "-m", "facediff.utils.tethered", "tests.fakes.stand_in")
-PLAN = """\
-seeds: [0, 1]
-baseline: one
-corpora: {tiny: {}}
-methods:
-  one: {config: one.yaml}
-  two: {config: two.yaml, before: {prior: {config: one.yaml}}, options: {model.prior: "{prior}"}}
-"""
 ONE_SEED = PLAN.replace("[0, 1]", "[0]")
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a plan and two configs."""
-    monkeypatch.setenv("STAND_IN_CALLS", str(tmp_path / "calls"))
-    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-    (tmp_path / "part.yaml").write_text("dim: 3\n")
-    (tmp_path / "one.yaml").write_text("model: part.yaml\n")
-    (tmp_path / "two.yaml").write_text("model: {dim: 4}\n")
-    (tmp_path / "plan.yaml").write_text(PLAN)
-    return tmp_path
 
 
 def setting(folder: Path, **options: Any) -> Setting:  # noqa: ANN401
@@ -97,13 +76,6 @@ def test_every_cell_is_trained_and_tested_once_with_its_seed(folder: Path) -> No
     assert result is not None
     assert list(result.curve["val/lve"]) == [2.0, 1.0]
     assert result.measured["fit"]["memory"]
-
-
-def test_a_model_of_ones_own_is_named_to_the_test(folder: Path) -> None:
-    (folder / "plan.yaml").write_text(ONE_SEED)
-    left = pending(cells_of(read_plan(folder / "plan.yaml")), folder / "out", retry_failed=False)
-    list(run_cells(left, setting(folder, models={"one": "mine.Net"}), workers=1))
-    assert [call.get("model") for call in calls(folder) if call["command"] == "test"] == ["mine.Net", None]
 
 
 def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path) -> None:
@@ -237,13 +209,6 @@ def test_the_estimate_is_the_time_of_the_last_run(folder: Path) -> None:
     assert outcome.result is not None
     seconds = outcome.result.total_seconds
     assert estimate(cells, folder / "out") == {cell: seconds if cell.row == cells[0].row else None for cell in cells}
-
-
-def test_options_take_the_place_of_the_checkpoints_before_them(folder: Path) -> None:
-    cell = next(cell for cell in cells_of(read_plan(folder / "plan.yaml")) if cell.row == "two")
-    options = fit_options(cell.trainings[-1], {"prior": Path("p.ckpt")}, cell)
-    assert options["model.prior"] == "p.ckpt"
-    assert options["seed_everything"] == cell.seed
 
 
 def test_the_best_weights_are_not_replaced_by_the_last(folder: Path) -> None:

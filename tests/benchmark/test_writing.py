@@ -21,7 +21,6 @@ from facediff.benchmark.writing import (
     Scale,
     document,
     latex_tables,
-    main_table,
     plots,
     replace_block,
     text,
@@ -137,14 +136,6 @@ def test_decimals_end_where_intervals_and_deviations_do(
     intervals = [Interval(3.417e-6 - half, 3.417e-6 + half) for half in halves]
     scale = Scale.of([3.417e-6, 8e-6], [None, *intervals], deviations)
     assert " ".join([scale.number(3.417e-6), *map(scale.interval, intervals[:1])]) == shown
-
-
-def test_costs_are_columns_too() -> None:
-    found = dataclasses.replace(outline(), columns=("lve", "weights"))
-    (table,) = report_of(found, results(), resamples=20).tables
-    shown = main_table(table)
-    assert list(shown.head) == ["", "LVE ↓", "runs", "weights"]
-    assert {len(row) for row in shown.rows} == {4}
 
 
 def test_the_page_needs_no_network_and_shows_hostile_names_as_they_are() -> None:

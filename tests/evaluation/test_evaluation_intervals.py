@@ -7,18 +7,6 @@ from facediff.reporting.statistics import BLOCK, Bootstrap, draws, pooled
 from tests.evaluation.conftest import LENGTHS, OF_VERTICES, Files, scores_of
 
 
-def test_equal_sequences_leave_no_doubt() -> None:
-    values, weights = np.full((7, 2), 0.3), np.arange(1.0, 15).reshape(7, 2)
-    for interval in Bootstrap(200).intervals(Bootstrap(200).scores(values, weights), 2):
-        assert interval is not None
-        assert (interval.low, interval.high) == pytest.approx((0.3, 0.3), rel=1e-12)
-
-
-def test_one_sequence_and_no_resamples_give_no_interval() -> None:
-    assert Bootstrap().intervals(Bootstrap().scores(np.ones((1, 2)), np.ones((1, 2))), 2) == [None, None]
-    assert Bootstrap(0).scores(np.ones((4, 2)), np.ones((4, 2))) is None
-
-
 def test_resamples_are_drawn_with_replacement_by_the_seed() -> None:
     counts = np.concatenate(list(draws(6, 500, 3)))
     assert counts.shape == (500, 6)
@@ -50,17 +38,6 @@ def test_intervals_cover_about_as_often_as_they_say() -> None:
         assert found is not None
         hits += found.low <= 1.0 <= found.high
     assert 0.8 <= hits / 200 <= 0.97  # percentile intervals of a skew distribution are a little narrow
-
-
-def test_intervals_are_reproducible_and_hold_the_score(shared_files: Files) -> None:
-    one = shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=1)
-    assert one.methods == shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=1, workers=1).methods
-    assert one.methods != shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=2).methods
-    wide, narrow = one, shared_files.evaluate(protocols=OF_VERTICES, bootstrap=300, seed=1, level=0.5)
-    for outer, inner in zip(wide.methods[0].scores, narrow.methods[0].scores, strict=True):
-        assert outer.interval is not None
-        assert inner.interval is not None
-        assert outer.interval.low <= inner.interval.low <= outer.value <= inner.interval.high <= outer.interval.high
 
 
 def test_a_method_differs_from_itself_by_exactly_nothing(shared_files: Files) -> None:

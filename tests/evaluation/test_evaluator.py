@@ -139,13 +139,6 @@ def test_scores_are_those_of_the_classes(corpus: Files) -> None:
         assert found[name] == pytest.approx(metric.compute().item(), rel=1e-12), name
 
 
-def test_workers_order_and_other_metrics_change_no_digit(corpus: Files) -> None:
-    texts = ["frame_speech_lip_correlation", "clip_speech_lip_correlation", "temporal_misalignment:at=path"]
-    one = values(scored(corpus, *texts, workers=1))
-    assert values(scored(corpus, *texts[::-1], workers=3)) == one
-    assert values(scored(corpus, texts[1])) == {texts[1]: one[texts[1]]}
-
-
 def test_clips_without_a_value_are_left_out(corpus: Files) -> None:
     (corpus.root / "phonemes" / "A_e01.csv").unlink()
     report = scored(corpus, "bilabial_closure_rate", bootstrap=30)
@@ -154,18 +147,6 @@ def test_clips_without_a_value_are_left_out(corpus: Files) -> None:
     rows = {row["clip"]: row["metrics/bilabial_closure_rate"] for row in report.rows()}
     assert rows["A_e01"] is None
     assert all(value is not None for clip, value in rows.items() if clip != "A_e01")
-
-
-def test_methods_are_compared_by_them(corpus: Files) -> None:
-    report = scored(corpus, "lip_speed_correlation", "clip_speech_lip_correlation", bootstrap=30)
-    two = corpus.evaluate(
-        "ours", "theirs", metrics=["lip_speed_correlation"], corpus=corpus.root, protocols=["meshtalk"], bootstrap=30
-    )
-    assert values(report)["lip_speed_correlation"] == values(two)["lip_speed_correlation"]
-    (difference,) = [each for each in two.comparisons if each.metric == "lip_speed_correlation"]
-    theirs = [score.value for score in two.methods[1].scores if score.protocol == "metrics"]
-    assert difference.difference == pytest.approx(theirs[0] - values(two)["lip_speed_correlation"], abs=1e-12)
-    assert "theirs − ours: lip_speed_correlation" in text(two)
 
 
 def test_a_clip_of_which_one_method_has_no_value_is_not_compared(corpus: Files) -> None:
@@ -188,11 +169,8 @@ def test_a_clip_of_which_one_method_has_no_value_is_not_compared(corpus: Files) 
     ("metric", "missing", "names"),
     [
         ("mouth_opening_difference", "regions/inner_lip_pairs.txt", ["--lip-pairs"]),
-        ("bilabial_closure_rate", "phonemes", ["phonemes"]),
-        ("frame_speech_lip_correlation", "wav", ["wav"]),
         ("frame_speech_lip_correlation", "manifest.json", ["--frame-rate"]),
         ("identity_diversity", "", ["--identity all"]),
-        ("upper_face_vertex_error", "regions/fdd.txt", ["--upper-face"]),
         ("face_dynamics_deviation", "", ["--templates"]),
     ],
 )
@@ -200,21 +178,10 @@ def test_what_is_missing_is_asked_for_by_name(corpus: Files, metric: str, missin
     path = corpus.root / missing
     if missing:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    options = {"upper_face": None} if metric == "upper_face_vertex_error" else {}
-    options |= {"templates": None} if metric == "face_dynamics_deviation" else {}
+    options = {"templates": None} if metric == "face_dynamics_deviation" else {}
     with pytest.raises(FaceDiffError) as error:
         scored(corpus, metric, **options)
     assert all(name in str(error.value) for name in [metric, *names])
-
-
-def test_options_have_the_kind_of_their_defaults() -> None:
-    request = parse("sample_diversity: n_samples=4, pairing=all, region=lips")
-    assert (request.name, dict(request.options)) == (
-        "sample_diversity",
-        {"n_samples": 4, "pairing": "all", "region": "lips"},
-    )
-    assert parse("temporal_misalignment:frames_per_second=25").options == {"frames_per_second": 25.0}
-    assert parse("temporal_misalignment:frames_per_second=none").options == {"frames_per_second": None}
 
 
 class PlainError(Metric):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.evaluation import text
 from facediff.evaluation.groups import attributes_of
@@ -57,25 +55,3 @@ def test_names_of_3dmead_and_biwi_say_emotions() -> None:
     assert mead == {"M003_001_4_1": {"emotion": "fear", "intensity": "2"}}
     found = attributes_of(None, ["F2_e37", "F2_37"], ["emotion"])
     assert [each["emotion"] for each in found.values()] == ["emotional", "neutral"]
-
-
-def test_the_command_groups_and_its_rows_have_the_attributes(
-    moody: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["evaluate", str(moody.method()), str(moody.root), "--bootstrap", "0", "--by", "mood,loud"]
-    assert main([*words, "--csv", str(tmp_path / "rows.csv")]) == 0
-    assert "by mood, loud" in capsys.readouterr().out
-    with (tmp_path / "rows.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert {row["clip"]: row["mood"] for row in rows} == MOODS
-    assert [row["loud"] for row in rows] == [str(len(MOODS[row["clip"]])) for row in rows]
-
-
-def test_blinks_are_counted_in_files(moody: Files) -> None:
-    (moody.root / "regions" / "eyelid_pairs.txt").write_text("0, 5\n13, 18\n")
-    metrics = ["blink_rate:closed=0.02,reopened=0.01", "blink_rate_ratio:closed=0.02,reopened=0.01"]
-    report = moody.evaluate(corpus=moody.root, metrics=metrics, frame_rate=25.0)
-    scores = {score.metric: score.value for score in report.methods[0].scores}
-    assert all(scores[name] > 0 for name in metrics)
-    with pytest.raises(FaceDiffError, match="--eyelid-pairs"):
-        moody.evaluate(metrics=metrics)

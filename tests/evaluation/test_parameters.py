@@ -87,18 +87,6 @@ def test_predictions_may_lie_in_the_folder_of_the_truth(
     assert found["mve"] == pytest.approx(np.abs(gaps).mean(), rel=1e-5)
 
 
-def test_a_partner_who_is_missing_is_named(dialogue: tuple[Path, Path, dict[str, list[Array]]]) -> None:
-    ours, truth, _ = dialogue
-    for file in (truth / "partner").iterdir():
-        file.unlink()
-    (truth / "partner").rmdir()
-    layouts = ("--layout", "flame_dualtalk", "--truth-layout", "flame_dualtalk_truth")
-    assert "partner/" in refused(ours, truth, *layouts, "--protocol", "dualtalk")
-    message = refused(ours, truth, *layouts, "--protocol", "artalk")
-    assert "--rig" in message
-    assert "dualtalk, facediffuser_beat" in message
-
-
 def test_artalk_and_unils_on_a_head_that_does_not_turn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = write_flame(tmp_path / "model.pkl")
     flame = Flame.read(model)
@@ -184,11 +172,3 @@ def test_mask_and_partner_have_the_stride_of_the_truth(tmp_path: Path, capsys: p
     assert found["s_channel_variance"] == pytest.approx(prediction[speaking[::2]].var(0).mean(), rel=1e-4)
     both = [np.corrcoef(side.ravel(), partner[::2].ravel())[0, 1] for side in (prediction, truth[::2])]
     assert found["residual_partner_correlation"] == pytest.approx(abs(both[1] - both[0]), rel=1e-4)
-
-
-def test_suffixes_in_capitals_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    values = np.random.default_rng(5).uniform(0, 1, (9, 51))
-    for folder in ("truth", "ours"):
-        write(tmp_path / folder, "ann_a", values, "arkit_51", ".json")
-        (tmp_path / folder / "ann_a.json").rename(tmp_path / folder / "ann_a.JSON")
-    assert scores(capsys, tmp_path / "ours", tmp_path / "truth", "--protocol", "facediffuser_beat")["mve"] == 0

@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import gc
 import shutil
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +19,6 @@ from tests.evaluation.conftest import (
     Files,
     expected,
     scores_of,
-    write_corpus,
 )
 
 
@@ -165,40 +161,6 @@ def test_truth_at_a_higher_frame_rate_is_thinned(files: Files) -> None:
     assert scores_of(files.evaluate(protocols=OF_VERTICES, truth_stride=2)) == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.fixture
-def restless_threads() -> Iterator[None]:
-    """Threads take turns at every collection of garbage, and garbage is collected all the time."""
-
-    def let_others_run(phase: str, info: dict[str, int]) -> None:
-        time.sleep(0)
-
-    before = gc.get_threshold()
-    gc.callbacks.append(let_others_run)
-    gc.set_threshold(10)
-    yield
-    gc.set_threshold(*before)
-    gc.callbacks.remove(let_others_run)
-
-
-@pytest.mark.usefixtures("restless_threads")
-def test_many_small_files_are_opened_by_many_workers(tmp_path: Path) -> None:
-    """Headers are read with ast, which is not safe in threads under Python 3.11."""
-    for place in range(30):
-        for side in ("truth", "ours"):
-            (tmp_path / side).mkdir(exist_ok=True)
-            np.save(tmp_path / side / f"A_e{place:02d}.npy", np.full((2, 6), float(side == "ours")))
-    report = evaluate(
-        {"ours": tmp_path / "ours"},
-        tmp_path / "truth",
-        lips=Region.from_indices("lips", [1]),
-        n_vertices=2,
-        protocols=["meshtalk"],
-        workers=8,
-    )
-    (score,) = report.methods[0].scores
-    assert (score.value, score.sequences, score.frames) == (pytest.approx(3**0.5), 30, 60)
-
-
 @pytest.mark.parametrize("side", ["truth", "prediction"])
 def test_nan_names_its_clip(files: Files, side: str) -> None:
     path = files.truth / "A_e03.npy" if side == "truth" else files.method() / "A_e03_condition_A.npy"
@@ -261,8 +223,3 @@ def test_everything_that_is_not_scored_is_told(files: Files) -> None:
 def test_mistakes_are_told_in_one_sentence(shared_files: Files, options: dict[str, object], message: str) -> None:
     with pytest.raises(FaceDiffError, match=message):
         shared_files.evaluate(**options)
-
-
-def test_another_corpus_gives_other_numbers(shared_files: Files, tmp_path: Path) -> None:
-    other = write_corpus(tmp_path / "other", seed=5)
-    assert scores_of(other.evaluate()) != scores_of(shared_files.evaluate())

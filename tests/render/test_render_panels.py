@@ -42,17 +42,6 @@ def test_side_by_side_shows_the_renderers_pictures_under_their_labels(renderer: 
     np.testing.assert_allclose(strip.astype(int), frames[2][:top].astype(int), atol=1)
 
 
-def test_side_by_side_strips_continue_the_background(renderer: Renderer) -> None:
-    (frame,) = side_by_side(renderer, [MOTION[:1] - [0, 0.5, 0]], [""], footer="x")
-    assert (frame[95] != renderer.backdrop[-1]).any()
-    np.testing.assert_array_equal(frame[96], renderer.backdrop[-1])
-
-
-def test_side_by_side_without_labels_has_no_strips(renderer: Renderer) -> None:
-    (frame,) = side_by_side(renderer, [MOTION[:1]], [""])
-    np.testing.assert_array_equal(frame, renderer.render(MOTION[0]))
-
-
 def test_side_by_side_mixes_topologies_and_colours(renderer: Renderer, sphere: MakeSphere) -> None:
     vertices, faces = sphere(8, 12)
     other = Renderer(faces, template=vertices, size=(96, 64))
@@ -61,11 +50,6 @@ def test_side_by_side_mixes_topologies_and_colours(renderer: Renderer, sphere: M
     frames = list(side_by_side([renderer, other], [MOTION, still], ["a", "b"], colours=[heat, None]))
     assert frames[0].shape[1] == 80 + 64
     np.testing.assert_array_equal(frames[1][-96:, :80], renderer.render(MOTION[1], colours=heat[1]))
-
-
-def test_side_by_side_fits_a_very_long_label(renderer: Renderer) -> None:
-    (frame,) = side_by_side(renderer, [MOTION[:1]], ["a label that is much too long for such a small picture " * 2])
-    assert frame.shape[1] == 80
 
 
 def test_side_by_side_refuses_motions_of_different_lengths(renderer: Renderer) -> None:

@@ -12,7 +12,7 @@ import pytest
 from facediff.errors import FaceDiffError
 from facediff.render import EVEN, VIEWS, Camera, Light, Look, Renderer, portrait
 from facediff.render.rasteriser import TABLE_SIZE, light_table
-from facediff.utils.colours import to_linear, to_srgb
+from facediff.utils.colours import to_linear
 
 MakeSphere = Callable[..., tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]]
 
@@ -127,12 +127,6 @@ def test_the_light_table_against_lambert() -> None:
     np.testing.assert_allclose(table[inside][:, 0], 0.5 * np.sqrt(depth[inside]), atol=1e-6)
 
 
-def test_gamma_round_trip_and_known_value() -> None:
-    values = np.linspace(0, 1, 50)
-    np.testing.assert_allclose(to_srgb(to_linear(values)), values, atol=1e-6)
-    assert to_linear(0.5) == pytest.approx(0.2140, abs=1e-4)
-
-
 def test_vertices_outside_or_behind_the_camera_give_background(sphere: MakeSphere) -> None:
     vertices, faces = sphere()
     renderer = Renderer(faces, template=vertices, size=48)
@@ -186,14 +180,6 @@ def test_importing_the_package_is_cheap() -> None:
         "sys.exit(str(heavy) if heavy else 0)"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)  # noqa: S603
-
-
-def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, sphere: MakeSphere) -> None:
-    vertices, faces = sphere()
-    renderer = Renderer(faces, template=vertices, size=32)
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(FaceDiffError, match=r"facediff\[render\]"):
-        renderer.render(vertices)
 
 
 def test_a_portrait_leaves_out_shoulders_but_no_chin() -> None:

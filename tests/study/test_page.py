@@ -206,26 +206,6 @@ def test_answers_wait_while_the_server_is_away(made: Path, serve: Serve, browser
     page.close()
 
 
-@pytest.mark.slow
-def test_two_raters_at_once_have_numbers_and_answers_of_their_own(made: Path, serve: Serve, program: Path) -> None:
-    address, study = serve(made), read_study(made)
-    with Chromium(program) as one, Chromium(program) as other:  # two profiles: two people
-        pages = [opened(each, f"{address}/") for each in (one, other)]
-        for page in pages:
-            begin(page)
-        for page in pages:
-            answer(page, key="ArrowLeft" if page is pages[0] else "ArrowRight")
-        for page in pages:
-            page.wait_for("facediffStudy.state.sent === 1")
-            stays_clean(page)
-    raters = AnswerStore(made / DATABASE, study).raters()
-    assert [rater.number for rater in raters] == [0, 1]
-    assert [[list(a.answers.values()) for a in r.answers.values()] for r in raters] == [
-        [["left", "left"]],
-        [["right", "right"]],
-    ]
-
-
 CONTRAST = """(() => {
   const light = (colour) => {
     const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map((v) => v / 255)

@@ -112,14 +112,6 @@ def test_the_rule_decides_who_is_counted() -> None:
     assert check_rater(early, replace(study, rule=replace(study.rule, finished=False))).reasons == ()
 
 
-def test_careless_raters_are_mostly_left_out() -> None:
-    study = small_study(clips=8, still=4, rule=Rule(least_right=0.8))
-    report = analyse(study, simulate(study, SCORES, 200, careless=0.3, seed=2))
-    assert 200 * 0.65 < len(report.counted) < 200 * 0.8
-    clean = analyse(study, simulate(study, SCORES, 100, seed=5))
-    assert len(clean.counted) > 95
-
-
 def test_answers_without_difference_are_half_for_each() -> None:
     study = small_study(clips=6, no_difference=True)
     report = analyse(study, simulate(study, SCORES, 40, no_difference=0.4, seed=1))

@@ -35,33 +35,6 @@ def test_what_is_stored_comes_back(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"answers.sqlite"}  # nothing is open
 
 
-def test_a_second_submission_changes_nothing(tmp_path: Path) -> None:
-    study = small_study()
-    store = AnswerStore(tmp_path / "a.sqlite", study)
-    assert [store.register(TOKEN, "en", ""), store.register(TOKEN, "de", "x")] == [0, 0]
-    trial = study.trials_of(0)[0].id
-    first = Answer(trial, {"realism": "left", "style": "right"}, 3.0, 1, "2026-01-01T00:00:00Z")
-    second = Answer(trial, {"realism": "right", "style": "right"}, 9.0, 2, "2026-01-01T00:00:09Z")
-    assert [store.save(TOKEN, first), store.save(TOKEN, first), store.save(TOKEN, second)] == [True, False, False]
-    assert not store.finish(TOKEN, {"comments": "early"})
-    (rater,) = store.raters()
-    assert rater.answers == {trial: first}
-    assert (rater.language, rater.finished, rater.comments) == ("en", None, {})
-
-
-def test_hostile_text_is_text(tmp_path: Path) -> None:
-    study = small_study()
-    store = AnswerStore(tmp_path / "a.sqlite", study)
-    store.register(TOKEN, "en", HOSTILE)
-    for trial in study.trials_of(0):
-        store.save(TOKEN, Answer(trial.id, {"realism": "left", "style": "left"}, 1.0, 1, "2026-01-01T00:00:00Z"))
-    assert store.finish(TOKEN, {"comments": HOSTILE})
-    assert store.finish(TOKEN, {"comments": "another"})  # sent again: what was first stays
-    (rater,) = store.raters()
-    assert (rater.code, rater.comments) == (HOSTILE, {"comments": HOSTILE})
-    assert len(rater.answers) == len(study.trials_of(0))
-
-
 def test_raters_at_the_same_time_get_numbers_of_their_own_and_lose_nothing(tmp_path: Path) -> None:
     study = small_study()
     store = AnswerStore(tmp_path / "a.sqlite", study)

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import (
     Curve,
     Curves,
@@ -30,12 +30,10 @@ from facediff.evaluation.figures import (
     draw_training,
 )
 from facediff.evaluation.figures import lips as lips_module
-from facediff.evaluation.figures.heatmaps import scale_end
 from facediff.evaluation.figures.material import FLAT, Painter
-from facediff.evaluation.figures.page import Grid, Heading, check_output, text_width, wrapped
+from facediff.evaluation.figures.page import Grid, Heading
 from facediff.render.panels import heat_ramp
-from facediff.reporting import drawing
-from facediff.reporting.drawing import LINES, SMALLEST_TEXT
+from facediff.reporting.drawing import SMALLEST_TEXT
 
 SMALL = Paper(width=85, dpi=100)
 TIMES = (np.arange(50) + 0.5) / 25
@@ -175,16 +173,6 @@ def test_a_known_motion_has_the_colours_of_its_numbers(
     assert top < bottom
 
 
-def test_the_end_of_a_scale(own_material: FigureData, tmp_path: Path) -> None:
-    values = {"a": np.array([0.001, 0.002]), "b": np.array([0.004, 0.0])}
-    assert scale_end(values, 1000, None) == pytest.approx(4)
-    assert scale_end(values, 1000, 2.5) == 2.5
-    assert scale_end({"a": np.zeros(3)}, 1000, None) == 1
-    for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(FaceDiffError, match="highest"):
-            draw_error(own_material, ["A_e06"], tmp_path / "error.png", highest=(wrong, None))
-
-
 def test_pictures_are_white_around_and_as_large_as_asked(own_material: FigureData) -> None:
     faces, shape = own_material.mesh(["A_e06"])
     for region in (None, range(6)):
@@ -208,31 +196,6 @@ def test_the_grid_leaves_room_for_its_labels() -> None:
     wide = Grid(Paper(175, 100), ["truth"], [Heading("one")], aspect=0.7, highest=50)
     assert wide.height == 50
     assert wide.left - (175 - wide.end) == pytest.approx(4.5, abs=0.1)  # in the middle, but for the name
-
-
-def test_text_is_broken_where_it_may_be() -> None:
-    assert wrapped("DPM-Solver", 100, 8) == ["DPM-Solver"]
-    assert wrapped("DPM-Solver", text_width("DPM-Solve", 8), 8) == ["DPM-", "Solver"]
-    lines = wrapped("x" * 40, 10, 8)
-    assert "".join(lines) == "x" * 40
-    assert all(text_width(line, 8) <= 10 for line in lines)
-
-
-def test_lines_differ_in_more_than_colour() -> None:
-    assert len({str(dashes) for _, dashes in LINES}) == len(LINES)
-    assert len({colour for colour, _ in LINES}) == len(LINES)
-
-
-@pytest.mark.parametrize("suffix", [".jpg", "", ".txt"])
-def test_unknown_suffixes(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"unknown suffix.*\.png, \.pdf, \.svg"):
-        check_output(tmp_path / f"figure{suffix}")
-
-
-@pytest.mark.parametrize(("options", "match"), [({"width": 3}, "Paper.width"), ({"dpi": 5000}, "Paper.dpi")])
-def test_paper_of_no_size(options: dict[str, int], match: str) -> None:
-    with pytest.raises(FaceDiffError, match=match):
-        Paper(**options)
 
 
 def test_fonts(tmp_path: Path) -> None:
@@ -266,28 +229,3 @@ def test_lips_are_drawn_at_their_times_and_in_their_unit(monkeypatch: pytest.Mon
     assert (grey.get_x(), grey.get_x() + grey.get_width()) == pytest.approx((0.2, 0.5))
     outline = wave.collections[0].get_paths()[0].vertices
     assert outline[outline[:, 1].argmax(), 0] == pytest.approx(1.0, abs=0.01)
-
-
-def test_without_sound_or_phonemes_there_is_the_curve_alone(tmp_path: Path) -> None:
-    draw_lips(LIPS, SpeechTrack(), tmp_path / "alone.svg", paper=SMALL, span=(0.5, 1.5))
-    text = (tmp_path / "alone.svg").read_text(encoding="utf-8")
-    assert "lip opening" in text
-    assert "sound" not in text
-
-
-def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtraError, match=r'pip install "facediff\[figures\]"'):
-        drawing.matplotlib()
-
-
-def test_nothing_is_left_of_a_figure_that_failed(
-    own_material: FigureData, tmp_path: Path, damaged: Callable[..., FigureData]
-) -> None:
-    with pytest.raises(FaceDiffError):
-        draw_frames(own_material, "A_e06", [Moment(0.1), Moment(77)], tmp_path / "a.png")
-    with pytest.raises(FaceDiffError, match="NaN"):
-        draw_heatmap(damaged(np.full((9, 24, 3), np.nan)), ["A_e06"], tmp_path / "a.pdf")
-    assert not list(tmp_path.glob("*a.p*"))

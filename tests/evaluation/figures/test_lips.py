@@ -10,7 +10,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import (
     FigureData,
     opening_curves,
@@ -42,14 +41,6 @@ def test_opening_curves_are_those_of_the_metrics(own_material: FigureData, read:
     np.testing.assert_allclose(curves.times, (np.arange(len(curves.times)) + 0.5) / RATE)
     apart = mouth_opening_difference(torch.tensor(read("ours", "A_e06")), torch.tensor(read("truth", "A_e06")), pairs)
     assert np.abs(curves.openings["ours"] - curves.openings["truth"]).mean() == pytest.approx(apart.item())
-
-
-@pytest.mark.parametrize("source", ["0-0", "0-99", "0-1-2", "gone.txt", "-"])
-def test_lip_pairs_are_refused(source: str, tiny_root: Path) -> None:
-    with pytest.raises(FaceDiffError, match="--lip-pairs"):
-        read_pairs(source, tiny_root, VERTICES)
-    with pytest.raises(FaceDiffError, match="--lip-pairs"):
-        read_pairs(None, tiny_root / "wav", VERTICES)
 
 
 def test_the_envelope_holds_every_sample() -> None:
