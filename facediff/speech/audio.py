@@ -26,7 +26,7 @@ from facediff.errors import FaceDiffError, OptionError, needs_extra
 from facediff.speech.pcm import samples_of
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
-from facediff.utils.limits import SAMPLE_RATES, brief, check_number
+from facediff.utils.limits import brief
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,9 +42,6 @@ CONTAINERS = (".flv", ".m4a", ".mp4", ".mov", ".mkv", ".webm", ".avi", ".aac")
 
 DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,aac,mpegts,mpeg,mp3,ogg,wav,flac,aiff,w64,caf"
 """What FFmpeg may take such a file for: not a playlist, which names other files and addresses to be opened."""
-
-CHANNELS = 64
-"""Most channels of a recording; microphone arrays and Ambisonics have fewer."""
 
 LOUDEST = 2.0**31
 """Largest sample; even whole numbers of 32 bits that were not scaled to 1 stay below."""
@@ -86,26 +83,15 @@ def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
 
 
 def _read(path: Path, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such sound file; expected {', '.join(SUFFIXES + CONTAINERS)}")
-    if path.stat().st_size == 0:
-        raise FaceDiffError(f"{path}: the file is empty; expected a recording of speech")
+    if not path.is_file() or path.stat().st_size == 0:
+        raise FaceDiffError(
+            f"{path}: is no sound file, or an empty one; expected speech as {', '.join(SUFFIXES + CONTAINERS)}"
+        )
     refuse_cut_short(path)
-    decode = _decode_container if path.suffix.lower() in CONTAINERS else _decode
-    samples, rate = decode(path, _Length(path, max_seconds))
-    if not len(samples):
-        raise FaceDiffError(f"{path}: holds no samples; expected a recording of speech")
-    return samples, rate
-
-
-def _read_open(file: IO[bytes], name: str, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
-    """The same of an open sound file, such as ``io.BytesIO`` of a .wav."""
-    length = _Length(Path(name), max_seconds)
-    with open_sound(file, name) as sound:
-        samples, rate = _decoded(sound, length)
-    if not len(samples):
-        raise FaceDiffError(f"{name}: holds no samples; expected a recording of speech")
-    return samples, rate
+    if path.suffix.lower() in CONTAINERS:
+        return _decode_container(path, max_seconds)
+    with open_sound(path) as sound:
+        return _decoded(sound, path, max_seconds)
 
 
 def write_wav(path: Path, samples: npt.NDArray[Any], rate: int, bits: int = 16) -> None:
@@ -129,11 +115,11 @@ def _rate_to_play(rate: float) -> int:
 
 def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
     """Mono, where all samples are in range."""
-    if not np.isfinite(samples).all():
-        raise FaceDiffError(f"{name}: holds samples that are not finite numbers; convert it again")
-    peak = max(float(samples.max(initial=0)), -float(samples.min(initial=0)))
-    if peak > LOUDEST:
-        raise FaceDiffError(f"{name}: holds a sample of {peak:g}; expected a full scale of 1, convert it again")
+    peak = float(np.abs(samples).max(initial=0.0))
+    if not len(samples) or not peak <= LOUDEST:
+        raise FaceDiffError(
+            f"{name}: holds no samples, or up to {peak:g}; expected speech of finite numbers with a full scale of 1"
+        )
     return samples if samples.ndim == 1 else samples.mean(axis=1)
 
 
@@ -153,34 +139,15 @@ def resampler(rate: int) -> Callable[[npt.NDArray[np.float32], bool], npt.NDArra
     return lambda piece, last: stream.resample_chunk(piece, last=last)
 
 
-class _Length:
-    """Refuses speech that is too long, by what the file declares and by what has been decoded of it.
-
-    Args:
-        path: the file.
-        most: longest speech allowed in seconds, of an option; None for any.
-    """
-
-    def __init__(self, path: Path, most: float | None) -> None:
-        self.path, self.most = path, most
-
-    def check(self, samples: float, rate: float) -> None:
-        """Check a number of samples."""
-        seconds = samples / rate
-        if self.most is not None and seconds > self.most:
-            raise OptionError(
-                "max_seconds", f"{self.path} lasts {seconds:.0f} s; cut it or raise the limit", f"{self.most:g}"
-            )
-
-
-def _check_rate(path: Path, rate: object, channels: object) -> None:
-    check_number(path, "its sample rate", rate, *SAMPLE_RATES, remedy="convert it with ffmpeg")
-    check_number(path, "its number of channels", channels, 1, CHANNELS, remedy="convert it with ffmpeg")
+def _check_length(path: object, seconds: float, most: float | None) -> None:
+    """Refuse speech that is longer than an option allows, by what a file declares and by what is decoded of it."""
+    if most is not None and seconds > most:
+        raise OptionError("max_seconds", f"{path} lasts {seconds:.0f} s; cut it or raise the limit", f"{most:g}")
 
 
 @contextmanager
 def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
-    """A ``soundfile.SoundFile`` whose rate and number of channels are in range.
+    """A ``soundfile.SoundFile``.
 
     Args:
         source: the file, or its content.
@@ -192,7 +159,6 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
     try:
         # As bytes, since a name need not be UTF-8.
         with soundfile.SoundFile(os.fsencode(source) if isinstance(source, Path) else source) as file:
-            _check_rate(path, file.samplerate, file.channels)
             yield file
     except (soundfile.LibsndfileError, RuntimeError, TypeError, ValueError, OSError) as error:
         raise FaceDiffError(
@@ -206,31 +172,25 @@ def _reason(path: Path, error: Exception) -> str:
     return brief(str(error).replace(f"Error opening {os.fsencode(path)!r}: ", "").replace(str(path), path.name))
 
 
-def _decode(path: Path, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
-    """All samples (S,) of a recording, its channels averaged."""
-    with open_sound(path) as file:
-        return _decoded(file, length)
-
-
-def _decoded(file: Any, length: _Length) -> tuple[npt.NDArray[np.float32], int]:  # noqa: ANN401 - a SoundFile
+def _decoded(file: Any, path: object, most: float | None) -> tuple[npt.NDArray[np.float32], int]:  # noqa: ANN401
+    """All samples (S,) of a ``soundfile.SoundFile``, its channels averaged."""
     declared, rate = int(file.frames), int(file.samplerate)
     known = 0 <= declared < UNKNOWN
-    if known:
-        length.check(declared, rate)
+    _check_length(path, declared / rate if known else 0, most)
     parts, decoded = [], 0
     while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
         decoded += len(block)
-        length.check(decoded, rate)
+        _check_length(path, decoded / rate, most)
         parts.append(block[:, 0].copy() if file.channels == 1 else block.mean(axis=1))
     # Without a frame that tells the number of frames, the length of an mp3 is an estimate.
     if known and decoded < declared and file.format != "MP3":
         raise FaceDiffError(
-            f"{length.path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
+            f"{path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
         )
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
 
 
-def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float32], int]:
+def _decode_container(path: Path, most: float | None) -> tuple[npt.NDArray[np.float32], int]:
     """The first sound track of a video, (S,) mono, from the time of its first picture on."""
     with needs_extra("av", "prepare", f"extracting the sound of {path.suffix} files"):
         import av
@@ -242,9 +202,8 @@ def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float
                 raise FaceDiffError(f"{path}: has no sound track; expected a video with speech")
             track = container.streams.audio[0]
             rate = int(track.rate)
-            _check_rate(path, rate, track.channels)
             if track.duration and track.time_base:
-                length.check(float(track.duration * track.time_base) * rate, rate)
+                _check_length(path, float(track.duration * track.time_base), most)
             plain = AudioResampler(format="fltp", layout="mono", rate=rate)
             decoded, late = 0, None
             for frame in chain(container.decode(audio=0), [None]):  # at None, what the resampler still holds comes out
@@ -254,7 +213,7 @@ def _decode_container(path: Path, length: _Length) -> tuple[npt.NDArray[np.float
                 for part in plain.resample(frame):
                     parts.append(part.to_ndarray()[0])
                     decoded += len(parts[-1])
-                length.check(decoded, rate)
+                _check_length(path, decoded / rate, most)
     except (av.FFmpegError, AttributeError, ValueError, TypeError, OSError) as error:  # a track may lack its rate
         raise FaceDiffError(f"{path}: its sound cannot be read ({_reason(path, error)}); convert it to .wav") from error
     if not parts or not late:
@@ -286,9 +245,7 @@ def read_stretch(
         if file.samplerate == SAMPLE_RATE and file.channels == 1 and file.seekable():
             file.seek(min(first, file.frames))
             samples = file.read(length, dtype="float32")
-            if not np.isfinite(samples).all():
-                raise FaceDiffError(f"{path}: holds samples that are not finite numbers; convert it again")
-            return fit_length(samples, length)
+            return fit_length(_checked(samples, str(path)) if len(samples) else samples, length)
     if store is None:
         return fit_length(read_speech(path)[first:], length)
     facts = path.stat()
@@ -355,50 +312,33 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         rate: sample rate of an array; that of a tensor is 16 kHz if None.
         max_seconds: refuse speech that lasts longer.
     """
-    if isinstance(speech, Mapping):
-        return _of_data_set(speech, rate, max_seconds)
-    if isinstance(speech, str | Path) or hasattr(speech, "read"):
-        if rate is not None:
-            raise FaceDiffError(f"rate {rate:g}: belongs to an array, and {speech} says its own; omit it")
-        if isinstance(speech, str | Path):
-            return read_recording(Path(speech), max_seconds)
+    if isinstance(speech, Mapping):  # audio of a data set of the Hugging Face hub, decoded or a file
+        name = Path(speech["path"]).stem if speech.get("path") else "speech"
+        if "array" in speech:
+            # Channels come first there; lists come of data sets without a format.
+            found = speech_of(np.asarray(speech["array"]), speech["sampling_rate"], max_seconds)
+        elif speech.get("bytes") is not None:
+            found = speech_of(io.BytesIO(speech["bytes"]), None, max_seconds)
+        else:
+            found = speech_of(speech["path"], None, max_seconds)
+        return replace(found, name=name)
+    if isinstance(speech, str | Path):
+        return read_recording(Path(speech), max_seconds)
+    if hasattr(speech, "read"):
         file = cast("IO[bytes]", speech)
         path = file.name if isinstance(getattr(file, "name", None), str) else "speech"
-        return SpeechRecording.of(*_read_open(file, path, max_seconds), Path(path).stem, path)
+        with open_sound(file, path) as sound:
+            return SpeechRecording.of(*_decoded(sound, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
-        if rate is not None or len(speech) != 2:
-            raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
         first, second = cast("tuple[Any, Any]", speech)
-        rate_first = isinstance(first, numbers.Real)  # NumPy's as well
-        speech, rate = (second, first) if rate_first else (first, second)
+        speech, rate = (second, first) if isinstance(first, numbers.Real) else (first, second)
     if rate is None:
         if not hasattr(speech, "detach"):  # a tensor has the models' rate, an array may have any
             raise FaceDiffError("rate: is missing; give the array's sample rate, as in animate(samples, rate=48000)")
         rate = SAMPLE_RATE
-    rate = check_number("speech", "rate", rate, *SAMPLE_RATES, remedy="give the rate in Hz")
     waveform = mono_waveform(cast("Waveform", speech), "speech")
-    seconds = len(waveform) / rate
-    if max_seconds is not None and seconds > max_seconds:
-        raise OptionError("max_seconds", f"speech lasts {seconds:.0f} s; cut it or raise the limit", f"{max_seconds:g}")
+    _check_length("speech", len(waveform) / rate, max_seconds)
     return SpeechRecording.of(waveform, rate, "speech", "speech")
-
-
-def _of_data_set(audio: Mapping[str, Any], rate: float | None, max_seconds: float | None) -> SpeechRecording:
-    """Speech as data sets of the Hugging Face hub hold it: decoded, or a file's content and name."""
-    name = Path(audio["path"]).stem if audio.get("path") else "speech"
-    if rate is not None:
-        raise FaceDiffError(f"rate {rate:g}: belongs to an array, and the data set's audio says its own; omit it")
-    if "array" in audio and "sampling_rate" in audio:
-        # Channels come first there; lists come of data sets without a format.
-        return replace(speech_of(np.asarray(audio["array"]), audio["sampling_rate"], max_seconds), name=name)
-    if audio.get("bytes") is not None:
-        return replace(speech_of(io.BytesIO(audio["bytes"]), None, max_seconds), name=name)
-    if audio.get("path"):
-        return speech_of(audio["path"], None, max_seconds)
-    raise FaceDiffError(
-        f"speech: is a mapping with {', '.join(map(str, audio)) or 'nothing'}; expected array and sampling_rate, or "
-        f"bytes or path"
-    )
 
 
 def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
@@ -427,18 +367,10 @@ def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
 
 def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     """A piece (n,) of a stream, which may be empty."""
-    if isinstance(chunk, bytes):
-        if len(chunk) % 2:
-            raise FaceDiffError(f"chunks: one has {len(chunk)} bytes, half a sample too much; give 16-bit samples")
-        return samples_of(chunk)
-    if np.ndim(chunk) != 1:
+    samples = samples_of(chunk) if isinstance(chunk, bytes) else np.asarray(chunk)
+    if samples.ndim != 1:
         raise FaceDiffError(f"chunks: one has the shape {np.shape(chunk)}; expected mono samples (n,)")
-    if not len(chunk):
-        return np.zeros(0, np.float32)
-    samples = mono_waveform(chunk, "chunks")
-    if not np.isfinite(samples).all():
-        raise FaceDiffError("chunks: one holds samples that are not finite numbers; give a full scale of 1")
-    return samples
+    return _checked(mono_waveform(samples, "chunks"), "chunks") if len(samples) else np.zeros(0, np.float32)
 
 
 # Decoders return the samples that they find, and only some of them say that there should be more. A recording that was
@@ -463,7 +395,8 @@ def refuse_cut_short(path: Path) -> None:
 def cut_short(path: Path) -> str | None:
     """What a recording lacks at its end; None if it is whole, or of a format whose decoder reports it.
 
-    Wav, AIFF, MP4, Ogg and mp3 are checked, by their headers only; others, such as flac, are left to the decoder.
+    Wav, AIFF, MP4 and Ogg are checked, by their headers only; others, such as flac, are left to the decoder. Of an mp3
+    nothing tells how long it should be.
 
     Args:
         path: the file, which must not be empty.
@@ -478,7 +411,7 @@ def cut_short(path: Path) -> str | None:
             return _ogg(data)
         if head[4:8] in (b"ftyp", b"wide", b"mdat", b"moov"):
             return _boxes(data)
-        return None if head[:4] == b"fLaC" else _mpeg(data)
+        return None
 
 
 def _bytes(count: int) -> str | None:
@@ -529,73 +462,3 @@ def _boxes(data: mmap.mmap) -> str | None:
             return None
         at += size
     return _bytes(at - len(data))
-
-
-# MPEG audio (mp3): frames without a container. Only a first frame that encoders add says how many there are.
-
-BITRATES = {  # kbit/s by layer and whether the sample rate is one of MPEG 1, by index from 1 on
-    (1, True): (32, 64, 96, 128, 160, 192, 224, 256, 288, 320, 352, 384, 416, 448),
-    (2, True): (32, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320, 384),
-    (3, True): (32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320),
-    (1, False): (32, 48, 56, 64, 80, 96, 112, 128, 144, 160, 176, 192, 224, 256),
-    (2, False): (8, 16, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128, 144, 160),
-    (3, False): (8, 16, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128, 144, 160),
-}
-RATES = {3: (44_100, 48_000, 32_000), 2: (22_050, 24_000, 16_000), 0: (11_025, 12_000, 8_000)}
-GARBAGE = 100_000
-"""Places without a frame after which the search for the next one is given up; no recording has so many."""
-TAGS = (b"TAG", b"APETAGEX", b"LYRICSBEGIN", b"ID3", b"3DI")
-"""How the tags begin that may follow the last frame."""
-
-
-def _frame_bytes(header: bytes) -> int | None:
-    """mmap.mmap of the frame of MPEG audio that begins with these 4; None if none does."""
-    if len(header) < 4 or header[0] != 0xFF or header[1] & 0xE0 != 0xE0:
-        return None
-    version, layer = header[1] >> 3 & 3, 4 - (header[1] >> 1 & 3)
-    index, rate_index, padding = header[2] >> 4, header[2] >> 2 & 3, header[2] >> 1 & 1
-    if version == 1 or layer == 4 or rate_index == 3 or index in (0, 15):
-        return None
-    bitrate, rate = BITRATES[layer, version == 3][index - 1] * 1000, RATES[version][rate_index]
-    if layer == 1:
-        return (12 * bitrate // rate + padding) * 4
-    return (72 if layer == 3 and version != 3 else 144) * bitrate // rate + padding
-
-
-def _mpeg(data: mmap.mmap) -> str | None:
-    at = 0
-    while data[at : at + 3] == b"ID3" and at + 10 <= len(data):
-        sevens = data[at + 6 : at + 10]
-        at += 10 + (sevens[0] << 21 | sevens[1] << 14 | sevens[2] << 7 | sevens[3])
-    first = _frame_bytes(data[at : at + 4])
-    if first is None or (at + first < len(data) and _frame_bytes(data[at + first : at + first + 4]) is None):
-        return None
-    declared = _declared_frames(data[at : at + first])
-    walked, skipped = 0, 0
-    while at < len(data) and skipped < GARBAGE:
-        size = _frame_bytes(data[at : at + 4])
-        if size is not None and at + size <= len(data):
-            at, walked = at + size, walked + 1
-        elif size is not None:
-            return "its last frame is incomplete"
-        elif data[at : at + 16].startswith(TAGS) or len(data) - at < 4:
-            break
-        else:  # garbage or padding: go on with the next frame
-            at, skipped = data.find(b"\xff", at + 1), skipped + 1
-            if at < 0:
-                break
-    # The frame that declares does not count itself; some encoders count it nevertheless.
-    if declared is not None and skipped < GARBAGE and walked - 1 < declared - 1:
-        return f"{walked - 1} of {declared} frames are there"
-    return None
-
-
-def _declared_frames(frame: bytes) -> int | None:
-    """Frames of the file, as its first frame may declare them."""
-    for mark, flags, count in ((b"Xing", 4, 8), (b"Info", 4, 8), (b"VBRI", None, 14)):
-        at = frame.find(mark, 4, 80)
-        if at >= 0 and at + count + 4 <= len(frame):
-            if flags is not None and not frame[at + flags + 3] & 1:
-                return None
-            return int.from_bytes(frame[at + count : at + count + 4], "big") or None
-    return None

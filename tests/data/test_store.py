@@ -145,7 +145,7 @@ def test_sound_keeps_its_time_beside_the_picture(tmp_path: Path, suffix: str, so
     assert heard == pytest.approx(0.5 + sound - picture, abs=0.07)  # AAC spreads an onset over its frame of 0.064 s
 
 
-@pytest.mark.parametrize(("content", "sentence"), [(b"text" * 99, "cannot be read"), (b"", "is empty")])
+@pytest.mark.parametrize(("content", "sentence"), [(b"text" * 99, "cannot be read"), (b"", "an empty one")])
 def test_a_broken_video_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
     (tmp_path / "v.flv").write_bytes(content)
     with pytest.raises(FaceDiffError, match=rf"v\.flv: .*{sentence}"):
