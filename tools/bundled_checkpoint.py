@@ -32,8 +32,9 @@ from facediff.cli.adapt import OF_TRAINING
 from facediff.cli.generation_metrics import corpus_of_checkpoint
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
-from facediff.models.checkpoint import build_model, read_checkpoint
+from facediff.models.checkpoint import read_checkpoint
 from facediff.models.dual_path.network import StepEmbedding
+from facediff.models.loading import build_model
 from facediff.pipelines.export_model import compare, record, trial_speech
 from facediff.utils.hub import BUNDLED
 

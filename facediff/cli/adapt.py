@@ -141,8 +141,9 @@ def adapt(
     from facediff.cli.lightning import exit_statuses
     from facediff.cli.trainer_options import IDLE_WARNINGS, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
-    from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import IMPORTED
+    from facediff.models.loading import build_model
     from facediff.utils.licences import require_cleared
     from facediff.utils.progress import on_terminal
 
@@ -212,8 +213,9 @@ def adapt_audio_encoder(
     quiet: bool,
 ) -> None:
     """Write a checkpoint with a distilled audio encoder; see :func:`adapt`."""
-    from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import PROVENANCE_KEY
+    from facediff.models.loading import build_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.licences import require_cleared
 
@@ -261,7 +263,7 @@ def write_distilled(
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.models.adaptation import with_audio_encoder
     from facediff.models.audio_distillation import distil_audio_encoder, encoder_weights
-    from facediff.models.checkpoint import build_model
+    from facediff.models.loading import build_model
     from facediff.utils.progress import progress_bar
 
     model, teacher = build_model(checkpoint, content).to(device), None

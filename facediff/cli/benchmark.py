@@ -296,7 +296,8 @@ def check_checkpoint(
         root: folder of the corpus that the plan's data config names.
     """
     from facediff.cli.lightning import corpus_and_folder
-    from facediff.models.checkpoint import build_model, read_checkpoint
+    from facediff.models.checkpoint import read_checkpoint
+    from facediff.models.loading import build_model
 
     path = Path(str(cell.source))
     content = read_checkpoint(path)

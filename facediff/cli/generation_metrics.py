@@ -92,8 +92,8 @@ def generation_metrics(
         stored = load_json(against, name=f"--against {against}")
     from dataclasses import replace
 
-    from facediff.models.checkpoint import load_model
     from facediff.models.generation_metrics import SamplingOptions, means_of, measure
+    from facediff.models.loading import load_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar

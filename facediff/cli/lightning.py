@@ -383,7 +383,8 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     from facediff.cli.lightning_cli import LINKS
     from facediff.data import SpeechMotionDataModule
     from facediff.data.batch import DATA_SOURCE_KEY
-    from facediff.models.checkpoint import build_model, corpus_of, read_checkpoint
+    from facediff.models.checkpoint import corpus_of, read_checkpoint
+    from facediff.models.loading import build_model
 
     own = import_model(arguments)
     checkpoint = read_checkpoint(path)

@@ -21,12 +21,11 @@ from __future__ import annotations
 
 import io
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, cast
+from typing import IO, Any
 
 import torch
 
@@ -41,36 +40,11 @@ from facediff.registry import COMPONENTS, corpus, find_class, model
 from facediff.spaces import Space
 from facediff.utils.hints import is_name
 from facediff.utils.hub import model_path, split_face
-from facediff.utils.licences import require_cleared
 from facediff.utils.limits import brief, quoted
 from facediff.utils.torch_files import EXPECTED, load_tensors
 
-if TYPE_CHECKING:
-    from facediff.models.base import AnimationModel
-
-
 FACES_PREFIX = "further_faces."
 """Beginning of the names of these faces' weights, in front of the face's name."""
-
-
-def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool = False) -> AnimationModel:
-    """A trained model, ready for inference.
-
-    Args:
-        path: a checkpoint of any model, also of an installed package's; a model folder; or ``user/name[@revision]`` of
-            the Hugging Face hub, where no such path exists.
-        device: where it computes.
-        commercial_only: refuse a model whose licence labels do not allow commercial use.
-
-    Example:
-        >>> model = load_model("demo/puppet.ckpt")  # doctest: +SKIP
-        >>> model.animate(speech, identity="F1").vertices.shape  # doctest: +SKIP
-        torch.Size([75, 1008, 3])
-    """
-    model = build_model(path, read_checkpoint(path))
-    if commercial_only:
-        require_cleared(path, model.licences)
-    return model.to(device)
 
 
 @contextmanager
@@ -99,27 +73,6 @@ def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:
     if checkpoint["hyper_parameters"].get("identities") != assets.identities:
         raise FaceDiffError(f"{name}: its model and its assets do not have the same identities; {EXPECTED}")
     return checkpoint
-
-
-def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
-    """The model of a checkpoint that :func:`read_checkpoint` has read, ready for inference on the CPU.
-
-    Args:
-        path: the file, for messages.
-        checkpoint: its content.
-    """
-    weights = checkpoint["state_dict"]
-    # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
-    # before the weights, since tables of mesh encoders are among these.
-    implementation, arguments = model_of(path, checkpoint["hyper_parameters"])
-    with naming(path), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of sizes that are 0, for example
-        built = implementation(**arguments)
-        built.on_load_checkpoint(checkpoint)
-        if difference := misfit(weights, built.state_dict()):
-            raise FaceDiffError(difference)
-        built.load_state_dict(weights)
-    return built.eval()
 
 
 def read_assets(path: Path | str) -> Assets:
@@ -229,11 +182,10 @@ def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
         return Assets.from_state(checkpoint[ASSETS_KEY])
 
 
-def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[AnimationModel], dict[str, Any]]:
+def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[CheckpointContent], dict[str, Any]]:
     """The model's class and its constructor's arguments: components and plain values."""
     named = hparams.get("_class_path")
-    # Every model is an AnimationModel, whose file imports this one; of what it extends, nothing else has its arguments.
-    implementation = cast("type[AnimationModel] | None", find_class(model, named, CheckpointContent))
+    implementation: type[CheckpointContent] | None = find_class(model, named, CheckpointContent)
     if implementation is None:
         raise unknown_class(path, "model", named)
     extra = ("_class_path", "_instantiator", "identities", "space", "faces")

@@ -233,7 +233,7 @@ class CodeTalker(AutoregressiveModel):
         Raises:
             FaceDiffError: if it cannot be read, or its prior has other sizes or options.
         """
-        from facediff.models.checkpoint import load_model
+        from facediff.models.loading import load_model
         from facediff.utils.licences import merged
 
         try:
