@@ -112,6 +112,8 @@ def printed(site: Path, tiny_root: Path, place: Path) -> dict[str, str]:
         # Twelve seconds: longer than what is animated in one pass.
         "animate": ["animate", speech[12], "--checkpoint", checkpoint, "--identity", "C", "--quiet"]
         + ["-o", str(place / "speech.npz")],
+        "help": ["--help"],
+        "command": ["liveliest", str(place / "speech.npz"), "--count", "2"],
         "export": ["export", str(place / "speech.npz"), "-o", str(place / "speech.bounds")],
         "predict": ["predict", "--ckpt_path", checkpoint, *trainer, *own],
         "evaluate": ["evaluate", predictions, str(tiny_root), "--metric", "lip_range", "--quiet"]
@@ -148,6 +150,13 @@ def test_components_lists_the_extensions_of_an_installed_package(printed: dict[s
     [row] = [row for row in rows if row["name"] == "moving_average"]
     assert row["class"] == "facediff_example.decoder.MovingAverageDecoder"
     assert row["summary"] == "Averages each frame with its neighbours and adds the mean style token."
+
+
+def test_a_command_of_an_installed_package_runs_and_is_listed(printed: dict[str, str]) -> None:
+    assert "liveliest           of the package facediff-example" in printed["help"]
+    moments = [float(line.removesuffix(" s")) for line in printed["command"].splitlines()]
+    assert len(moments) == 2
+    assert 0 < moments[0] < moments[1] < 12
 
 
 def test_an_installed_decoder_is_chosen_by_name(printed: dict[str, str]) -> None:

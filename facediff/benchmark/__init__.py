@@ -4,9 +4,6 @@ from facediff.benchmark.cells import Cell, cells_of, rows_of
 from facediff.benchmark.plan import BenchmarkPlan, find_plan, read_plan
 from facediff.benchmark.results import Result, read_result
 from facediff.benchmark.tables import BenchmarkReport, ReportOutline, report_of
-from facediff.utils.renamed import old_names
-
-__getattr__ = old_names(__name__)
 
 __all__ = [
     "BenchmarkReport",

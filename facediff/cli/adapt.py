@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import shlex
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff import registry
 from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder, prepared
-from facediff.cli.options import Checkpoint, Corpus, Folder, Output, Seed
+from facediff.cli.options import Checkpoint, CheckpointFile, Corpus, Folder, Seed
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -32,28 +32,66 @@ OF_TRAINING = (
 Mode = Literal["finetune", "joint"]
 
 
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Training on a person or a face.
+
+    Attributes:
+        mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
+        train: train all weights, those of identity and style only (person), or those of the face only (head); by
+            default all with --person, and head with --face
+        epochs: epochs over the training clips
+        learning_rate: falls to 0 as a cosine
+        yes: start without a question, however long it takes
+    """
+
+    mode: Annotated[Mode, Option(needs="person")] = "finetune"
+    train: Annotated[Literal["all", "person", "head"] | None, Option(needs="person face")] = None
+    epochs: Annotated[ranges.Epochs, Option(metavar="N", needs="person face")] = 60
+    learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE", needs="person face")] = 5e-4
+    yes: bool = False
+
+
+@dataclass(frozen=True)
+class EncoderOptions:
+    """Distillation of the audio encoder.
+
+    Attributes:
+        audio_encoder: with --low-latency: an encoder that replaces the checkpoint's and learns to reproduce its
+            features, such as mel or mel:num_layers=6
+        augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
+            docs/voices.md); --low-latency does not unless it is given
+        transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
+            of up to 15 s, each with its words in NAME.txt, or in NAME.de.txt if they are German
+        interpolation: how far the audio encoder's weights go from what they were to what was distilled (0.85 with
+            --voices, 1 with --low-latency): less changes clean speech less
+    """
+
+    audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="low_latency")] = None
+    augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="voices low_latency")] = (
+        None
+    )
+    transcribed: Annotated[Path | None, Option(metavar="DIR", reads=True, needs="voices")] = None
+    interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE", needs="voices low_latency")] = None
+
+
 def adapt(
     *,
     checkpoint: Checkpoint,
-    person: Annotated[str | None, Option(metavar="DIR", reads=True)] = None,
-    face: Annotated[str | None, Option(metavar="CORPUS")] = None,
-    voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
+    person: Annotated[str | None, Option(metavar="DIR", reads=True, without="face voices low_latency")] = None,
+    face: Annotated[str | None, Option(metavar="CORPUS", without="voices low_latency corpus")] = None,
+    voices: Annotated[
+        ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS, without="low_latency")
+    ] = None,
     low_latency: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_LOW_LATENCY_STEPS)] = None,
-    audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
-    augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]")] = None,
-    transcribed: Annotated[Path | None, Option(metavar="DIR", reads=True)] = None,
-    interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE")] = None,
-    output: Output,
-    mode: Mode = "finetune",
-    train: Literal["all", "person", "head"] | None = None,
-    epochs: Annotated[ranges.Epochs, Option(metavar="N")] = 60,
-    learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE")] = 5e-4,
+    output: CheckpointFile,
     data_root: Folder = None,
     corpus: Corpus = None,
     seed: Seed = 0,
     accelerator: str = "auto",
     quiet: bool = False,
-    yes: bool = False,
+    training: TrainingOptions,
+    encoder: EncoderOptions,
     licence: LicenceOptions,
 ) -> None:
     """Fine-tune a checkpoint on a new speaker or a new face, or adapt its audio encoder to voices or to low latency.
@@ -70,71 +108,82 @@ def adapt(
             trained on and has clips that belong to no split
         face: corpus of another face, by its registered name or as package.module.Class; --data-root is its folder
         voices: distil the audio encoder to be robust to other voices, rooms and noise, in so many steps (600 if no
-            number); --mode, --epochs and --learning-rate are for --person
+            number)
         low_latency: distil the audio encoder for low latency, in so many steps (1500 if no number)
-        audio_encoder: with --low-latency: an encoder that replaces the checkpoint's and learns to reproduce its
-            features, such as mel or mel:num_layers=6
-        augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
-            docs/voices.md); --low-latency does not unless it is given
-        transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
-            of up to 15 s, each with its words in NAME.txt, or in NAME.de.txt if they are German
-        interpolation: how far the audio encoder's weights go from what they were to what was distilled (0.85 with
-            --voices, 1 with --low-latency): less changes clean speech less
         output: checkpoint to write (.ckpt)
-        mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
-        train: train all weights, those of identity and style only (person), or those of the face only (head); by
-            default all with --person, and head with --face
-        epochs: epochs over the training clips
-        learning_rate: falls to 0 as a cosine
         data_root: where the corpus is, if not where it was in training
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class; it
             may be a file of the working folder
         seed: seed of all random numbers
         accelerator: Lightning's: auto, cpu, gpu …
         quiet: no progress bar
-        yes: start without a question, however long it takes
+        training: how the model learns a person or a face.
+        encoder: how the audio encoder is distilled.
         licence: which models are refused.
     """
-    if output.suffix != ".ckpt":
-        raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
-    if sum(choice is not None for choice in (person, face, voices, low_latency)) != 1:
+    check_model_source(checkpoint, "--checkpoint")
+    where = (data_root, corpus)
+    started = time.monotonic()
+    if voices is not None or low_latency is not None:
+        from facediff.models.audio_distillation import LOW_LATENCY_DISTILLATION, DistillationOptions
+
+        if low_latency is not None:
+            options = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
+        else:
+            options = DistillationOptions(steps=voices, seed=seed, transcribed=encoder.transcribed)
+        options = replace(
+            options,
+            augmentations=encoder.augmentation or options.augmentations,
+            interpolation=encoder.interpolation or options.interpolation,
+        )
+        device = {"gpu": "cuda"}.get(accelerator, accelerator)
+        report = adapt_audio_encoder(
+            checkpoint, output, where, device, licence, options, encoder.audio_encoder, quiet=quiet
+        )
+    elif person is None and face is None:
         raise FaceDiffError(
             "--person, --face, --voices, --low-latency: expected one of them: a new speaker, another face, robustness "
             "to other voices, or an audio encoder of low latency"
         )
-    if face is not None and (corpus is not None or mode != "finetune"):
-        raise FaceDiffError("--face: names the corpus, on which alone the head is trained; omit --corpus and --mode")
-    if person is None and face is None and (train is not None or mode != "finetune"):
-        raise FaceDiffError("--mode, --train: are options of --person and --face; omit them, as all of the model stays")
-    train = train or ("all" if face is None else "head")
-    if train == "head" and face is None:
-        raise FaceDiffError("--train head: is for --face; give all or person")
-    for name, value in (("augmentation", augmentation), ("interpolation", interpolation)):
-        if value and voices is None and low_latency is None:
-            raise FaceDiffError(f"--{name}: is an option of --voices and --low-latency; give one of them as well")
-    if transcribed is not None and voices is None:
-        raise FaceDiffError("--transcribed: is an option of --voices; give it as well")
-    if audio_encoder is not None and low_latency is None:
-        raise FaceDiffError("--audio-encoder: is an option of --low-latency; give --low-latency as well")
-    check_model_source(checkpoint, "--checkpoint")
-    if person is None and face is None:
-        from facediff.models.audio_distillation import LOW_LATENCY_DISTILLATION, DistillationOptions
+    else:
+        train = training.train or ("all" if face is None else "head")
+        if train == "head" and face is None:
+            raise FaceDiffError("--train head: is for --face; give all or person")
+        training = replace(training, train=train)
+        report = train_on(checkpoint, output, person, face, where, training, licence, accelerator, seed, quiet=quiet)
+    tell(f"{output}: {report.format(seconds=time.monotonic() - started)}")
 
-        if low_latency is not None:
-            chosen = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
-        else:
-            chosen = DistillationOptions(steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed, transcribed=transcribed)
-        chosen = replace(
-            chosen,
-            augmentations=augmentation or chosen.augmentations,
-            interpolation=interpolation or chosen.interpolation,
-        )
-        device = {"gpu": "cuda"}.get(accelerator, accelerator)
-        adapt_audio_encoder(
-            *(checkpoint, output, data_root, corpus, device, licence.commercial_only, chosen, audio_encoder),
-            quiet=quiet,
-        )
-        return
+
+def train_on(
+    checkpoint: Path,
+    output: Path,
+    person: str | None,
+    face: str | None,
+    where: tuple[Path | None, str | None],
+    options: TrainingOptions,
+    licence: LicenceOptions,
+    accelerator: str,
+    seed: int,
+    *,
+    quiet: bool,
+) -> str:
+    """Write a checkpoint that knows a new person or face; see :func:`adapt`.
+
+    Args:
+        checkpoint: the trained model.
+        output: checkpoint to write.
+        person: folder or name of the speaker; None for a face.
+        face: corpus of the face; None for a person.
+        where: folder and class of the corpus, if they are given.
+        options: how it is trained.
+        licence: which models are refused.
+        accelerator: Lightning's.
+        seed: of all random numbers.
+        quiet: no progress bar.
+
+    Returns:
+        what was done, in which ``{seconds}`` is left to be filled in.
+    """
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
@@ -147,12 +196,11 @@ def adapt(
     from facediff.utils.licences import require_cleared
     from facediff.utils.progress import on_terminal
 
-    started = time.monotonic()
     content = read_checkpoint(checkpoint)
     if person is not None:
-        name, data = adaptation_data(checkpoint, content, person, mode, data_root, corpus)
+        name, data = adaptation_data(checkpoint, content, person, options.mode, *where)
     else:
-        data = corpus_of_face(str(face), data_root)
+        data = corpus_of_face(str(face), where[0])
         name = data.identities[0]
     model = build_model(checkpoint, content)
     if licence.commercial_only:
@@ -164,16 +212,16 @@ def adapt(
     clips = data.clips("train")
     if person is not None and not any(clip.identity == name for clip in clips):
         raise FaceDiffError(f"--person {person}: no clip of {name} lies outside the corpus's test split")
-    confirm_cost(yes, "--epochs", seconds=CLIP_SECONDS * epochs * len(clips))
+    confirm_cost(options.yes, "--epochs", seconds=CLIP_SECONDS * options.epochs * len(clips))
     seed_everything(seed, verbose=False)
     model = with_extra_identities(model, list(data.identities)) if face is None else with_new_face(model, data)
     imported = {key: value for key, value in model.provenance.items() if key == IMPORTED}
     model.provenance = {**imported, "parent": model_name(checkpoint)}
-    model.learning_rate, model.lr_schedule, model.warmup_steps = learning_rate, "cosine", 0
+    model.learning_rate, model.lr_schedule, model.warmup_steps = options.learning_rate, "cosine", 0
     model.parameter_groups = None
-    train_only(model.train(), train)
+    train_only(model.train(), options.train or "all")
     trainer = Trainer(
-        max_epochs=epochs,
+        max_epochs=options.epochs,
         accelerator=accelerator,
         devices=1,
         gradient_clip_val=1.0,
@@ -194,44 +242,37 @@ def adapt(
     # Pictures need a mesh, which a corpus may lack.
     target = "speech.npz" if model.assets.faces is None else "speech.mp4"
     command = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", target]
-    tell(
-        f"{output}: adapted to {face or name} by {seconds:.0f} s of motion, in {time.monotonic() - started:.0f} s; "
-        f"next: {shlex.join(command)}"
-    )
+    return f"adapted to {face or name} by {seconds:.0f} s of motion, in {{seconds:.0f}} s; next: {shlex.join(command)}"
 
 
 def adapt_audio_encoder(
     checkpoint: Path,
     output: Path,
-    data_root: Path | None,
-    corpus: str | None,
+    where: tuple[Path | None, str | None],
     device: str,
-    commercial_only: bool,
-    chosen: DistillationOptions,
+    licence: LicenceOptions,
+    options: DistillationOptions,
     encoder: str | None,
     *,
     quiet: bool,
-) -> None:
-    """Write a checkpoint with a distilled audio encoder; see :func:`adapt`."""
+) -> str:
+    """Write a checkpoint with a distilled audio encoder; see :func:`adapt` and :func:`train_on`."""
     from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import PROVENANCE_KEY
     from facediff.models.loading import build_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.licences import require_cleared
 
-    started = time.monotonic()
     device = usable_device(device, "accelerator")
     content = read_checkpoint(checkpoint)
-    if commercial_only:
+    if licence.commercial_only:
         require_cleared(checkpoint, build_model(checkpoint, content).licences)
-    module, options = corpus_and_folder(checkpoint, content, corpus, data_root)
-    data = prepared(module(**options))
+    module, arguments = corpus_and_folder(checkpoint, content, where[1], where[0])
+    data = prepared(module(**arguments))
     content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
-    error = write_distilled(checkpoint, content, data, output, chosen, encoder, device=device, quiet=quiet)
-    tell(
-        f"{output}: audio encoder adapted to {chosen.goal} in {time.monotonic() - started:.0f} s; its features err by "
-        f"{error:.2f} of their variance"
-    )
+    error = write_distilled(checkpoint, content, data, output, options, encoder, device=device, quiet=quiet)
+    result = f"its features err by {error:.2f} of their variance"
+    return f"audio encoder adapted to {options.goal} in {{seconds:.0f}} s; {result}"
 
 
 def write_distilled(

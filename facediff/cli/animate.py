@@ -50,7 +50,7 @@ def animate(
     checkpoint: Annotated[Path | None, Option(metavar="C", reads=True)] = None,
     output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file or folder", dash=True)],
     stream: bool = False,
-    rate: Annotated[ranges.SampleRate, Option(metavar="HZ")] = 16_000,
+    rate: Annotated[ranges.SampleRate, Option(metavar="HZ", needs="stream")] = 16_000,
     quiet: bool = False,
     yes: bool = False,
     generation: GenerationOptions,
@@ -96,18 +96,16 @@ def animate(
     """
     streamed = [str(path) for path in speech] == ["-"]
     several = len(speech) > 1 or speech[0].is_dir()
-    if stream and not streamed:
+    if streamed != stream:
         raise FaceDiffError(
             f"--stream: reads standard input; give - in place of {speech[0]} (a file needs no --stream)"
+            if stream
+            else "speech: - is standard input; add --stream, and send samples rather than a file"
         )
     if not streamed and not several and not speech[0].exists():
         raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
-    if streamed and not stream:
-        raise FaceDiffError("speech: - is standard input; add --stream, and send samples rather than a file")
     if stream:
         refuse_idle("is for recordings, and a stream ends by itself", max_seconds=recording.max_seconds is not None)
-    else:
-        refuse_idle("is for --stream", rate=rate != 16_000)
     if several:
         one = ("alignment", "transcript")
         refuse_idle("is for one recording", **{name: getattr(recording, name) is not None for name in one})
@@ -115,7 +113,7 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     checkpoint = model_or_bundled(checkpoint)
     check_animating_source(checkpoint)
-    from facediff.export import check_export, check_used
+    from facediff.export import check_used
 
     check_used(batch.suffix if several else ".npy" if stream else output.suffix, files.changed())
     files = replace(files, quiet=quiet)
@@ -129,19 +127,17 @@ def animate(
         return 0
     if several:
         from facediff.pipelines.folder import animate_folder
-        from facediff.utils.jobs import check_scheduler
 
-        check_scheduler(batch.scheduler)
-        return animate_folder(
-            options,
-            speech,
-            output,
-            batch.suffix,
-            export=files,
-            workers=batch.workers,
-            scheduler=batch.scheduler,
-            retry_failed=batch.retry_failed,
-        )
+        return animate_folder(options, speech, output, export=files, **vars(batch))
+    animate_recording(options, speech[0], output, files, yes=yes)
+    return 0
+
+
+def animate_recording(
+    options: AnimationOptions, speech: Path, output: Path, files: ExportOptions, *, yes: bool
+) -> None:
+    """Animate one recording, and say what was written."""
+    from facediff.export import check_export
     from facediff.export.writing import seeks_weights
     from facediff.pipelines.animate import check_options, direction_for
     from facediff.pipelines.trained import open_pipeline
@@ -150,12 +146,12 @@ def animate(
     from facediff.utils.hub import may_have_weights
 
     if options.direction is not None:
-        options = replace(options, direction=direction_for(options.direction, speech[0]))
+        options = replace(options, direction=direction_for(options.direction, speech))
     check_options(options)
     check_export(output, files, options.samples, weights=may_have_weights(options.checkpoint))
-    spoken = read_recording(speech[0], options.max_seconds)  # before the model, which takes longer to load
+    spoken = read_recording(speech, options.max_seconds)  # before the model, which takes longer to load
     for problem in speech_problems(spoken.speech):
-        tell(f"note: {speech[0]}: {problem}")
+        tell(f"note: {speech}: {problem}")
     pipeline = open_pipeline(options)
     weights = seeks_weights(output, files) and pipeline.has_weights
     check_export(output, files, options.samples, weights=weights)
@@ -180,4 +176,3 @@ def animate(
             tell(avatar.summary, *avatar.left_out(animation))
         elif holds_glb(output):
             tell(*unused_shapes(mesh))
-    return 0

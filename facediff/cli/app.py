@@ -1,4 +1,11 @@
-"""The command ``facediff``: finds the subcommand and hands over; imports nothing heavy by itself."""
+"""The command ``facediff``: finds the subcommand and hands over; imports nothing heavy by itself.
+
+Other packages add commands of one word by entry points in the group ``facediff.command``, whose target is a typed
+function, as those of this package are::
+
+    [project.entry-points."facediff.command"]
+    my-command = "my_package.my_module:my_command"
+"""
 
 from __future__ import annotations
 
@@ -7,11 +14,14 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import facediff
 from facediff.cli import process
-from facediff.errors import FaceDiffError, MissingExtraError, choices
-from facediff.utils import renamed
+from facediff.errors import FaceDiffError, MissingExtraError, choices, import_failure
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 @dataclass(frozen=True)
@@ -122,6 +132,14 @@ GROUPS = {
 }
 
 
+def installed_commands() -> dict[str, EntryPoint]:
+    """The commands that installed packages add, by name; those that are facediff's cannot be replaced."""
+    from importlib.metadata import entry_points
+
+    taken = {name.partition(" ")[0] for name in COMMANDS}
+    return {point.name: point for point in entry_points(group="facediff.command") if point.name not in taken}
+
+
 def usage(group: str = "") -> str:
     """The help text of the program or of a group of commands."""
     if group:
@@ -130,6 +148,10 @@ def usage(group: str = "") -> str:
     else:
         rows = {name: command.help for name, command in COMMANDS.items() if name.partition(" ")[0] not in GROUPS}
         rows |= GROUPS
+        rows |= {
+            name: f"of the package {point.dist.name if point.dist else point.value}"
+            for name, point in sorted(installed_commands().items())
+        }
     program = f"facediff {group}".strip()
     width = max(map(len, rows)) + 2
     return "\n".join(
@@ -155,11 +177,11 @@ def find(arguments: Sequence[str]) -> tuple[str, list[str]]:
         return f"{first} {rest[0]}", rest[1:]
     if first in COMMANDS:
         return first, rest
-    if first in renamed.COMMANDS:
-        renamed.tell(renamed.COMMANDS[first].note(first))
-        return renamed.COMMANDS[first].new, rest
     if first not in GROUPS:
-        commands = list(dict.fromkeys(name.partition(" ")[0] for name in COMMANDS))
+        installed = installed_commands()
+        if first in installed:
+            return first, rest
+        commands = [*dict.fromkeys(name.partition(" ")[0] for name in COMMANDS), *installed]
         raise FaceDiffError(f'there is no command "{first}": {choices(first, commands)}')
     # A group with a command of it is found above.
     members = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{first} ")]
@@ -236,7 +258,20 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
 
 def load(name: str) -> Callable[..., int | None]:
-    """Import a command's function."""
+    """Import a command's function.
+
+    Raises:
+        FaceDiffError: if the package that adds it cannot be imported, naming the file and the line.
+    """
+    if name not in COMMANDS:
+        point = installed_commands()[name]
+        try:
+            installed: Callable[..., int | None] = point.load()
+        except Exception as error:  # whatever somebody else's module raises
+            raise FaceDiffError(
+                f"the command {name} ({point.value}) cannot be imported: {import_failure(error)}"
+            ) from error
+        return installed
     module, _, function = COMMANDS[name].target.partition(":")
     command: Callable[..., int | None] = getattr(importlib.import_module(module), function)
     return command

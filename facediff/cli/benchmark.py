@@ -54,10 +54,9 @@ def benchmark(
         dry_run: say what would run, and for how long by the last timings
     """
     from facediff.benchmark.plan import check_scores, find_plan, read_plan
-    from facediff.utils.jobs import check_scheduler, is_cluster
+    from facediff.utils.jobs import is_cluster
     from facediff.utils.workers import processors
 
-    check_scheduler(scheduler)
     definition = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline

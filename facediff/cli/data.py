@@ -10,23 +10,29 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.options import Corpus, File, FileOrList, FrameRate, Output, OutputFolder, Scheduler, Size, Workers
-from facediff.cli.parsing import OptionGroup, Parameter, Parameters, parameters_of, parse
+from facediff.cli.options import Corpus, File, FileOrList, FrameRate, OutputFolder, Scheduler, Size, Workers
+from facediff.cli.parsing import Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, choices, counted, printable
 from facediff.utils import ranges
-from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.data.prepare.runner import PreparationPlan, PreparationReport
 
-Root = Annotated[Path, Option(reads=True)]
-Packed = Annotated[str, Option(reads=True)]
+Root = Annotated[Path, Option(reads=True, exists="folder")]
+
+
+def require_folder(source: str) -> None:
+    """Refuse what is neither a folder nor an address, before anything heavy is imported."""
+    if "://" not in source and not Path(source).is_dir():
+        raise FaceDiffError(f"{source}: no such folder; expected a corpus folder, or the address of a packed corpus")
+
+
+Packed = Annotated[str, Option(reads=True, check=require_folder)]
 """A folder, or the address of a packed corpus, such as ``s3://bucket/corpus.zarr``."""
 NewFolder = Annotated[Path, Option(writes="folder")]
 
@@ -47,15 +53,6 @@ class WorkOptions:
     workers: Workers = None
     scheduler: Scheduler = None
     quiet: bool = False
-
-
-USUAL_WORK = WorkOptions()
-
-
-def require_folder(source: str | Path, expected: str) -> None:
-    """Refuse what is neither a folder nor an address, before anything heavy is imported."""
-    if "://" not in str(source) and not Path(source).expanduser().is_dir():
-        raise FaceDiffError(f"{source}: no such folder; expected {expected}")
 
 
 def find_own_module(corpus: str | None) -> None:
@@ -85,7 +82,7 @@ def check(
     corpus: Corpus = None,
     quick: bool = False,
     json: bool = False,
-    work: WorkOptions = USUAL_WORK,
+    work: WorkOptions,
 ) -> int:
     """Report which corpus a folder holds, what is missing and what is wrong in it.
 
@@ -102,8 +99,6 @@ def check(
     Returns:
         0 if the folder is sound, 1 if not.
     """
-    require_folder(root, "a corpus folder")
-    check_scheduler(work.scheduler)
     from facediff.data.check import check as check_folder
     from facediff.data.check import text
 
@@ -138,33 +133,29 @@ def run(name: str, arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         tell(*PREPARE.format(corpora=", ".join(CORPORA)).split("\n"))
         return 0 if arguments else 2
-    make_plan, values = read_prepare(arguments)
-    return prepare(make_plan, **values)
-
-
-def read_prepare(arguments: Sequence[str]) -> tuple[Callable[[Path], PreparationPlan], dict[str, Any]]:
-    """A function that plans a raw folder, and the arguments of :func:`prepare`, from a command line."""
     corpus, *remaining = arguments
     if corpus not in CORPORA:
         raise FaceDiffError(f'there is no corpus "{corpus}" to prepare: {choices(corpus, CORPORA)}')
     module = importlib.import_module(f"facediff.data.prepare.{corpus}")
     title = (module.__doc__ or "").partition("\n")[0]
     values = parse(options_of(module.plan), remaining, f"facediff data prepare {corpus}", title)
-    own = {name: values.pop(name) for name in plan_options(module.plan)}
+    raw, out, work = values.pop("raw"), values.pop("out"), values.pop("work")
+    if out.resolve().is_relative_to(raw.resolve()):  # the next run would read what is written as raw data
+        raise FaceDiffError(f"{out}: lies in the raw folder {raw}; choose a folder outside it to write to")
     if "quiet" in inspect.signature(module.plan).parameters:  # a long scan has a progress bar
-        own["quiet"] = values["work"].quiet
-    return partial(module.plan, **own), values
+        values["quiet"] = work.quiet
+    from facediff.data.prepare.runner import prepare
 
-
-def plan_options(plan: Callable[..., PreparationPlan]) -> dict[str, Parameter | OptionGroup]:
-    """Keyword parameters of a corpus's plan: each is an option of the command, in addition to the common ones."""
-    return {name: entry for name, entry in parameters_of(plan).items() if name not in ("raw", "quiet")}
+    with resumable(out):
+        report = prepare(module.plan(raw, **values), out, reads=[raw], **vars(work))
+    tell(*describe(report))
+    return 0 if report.sound else 1
 
 
 def options_of(plan: Callable[..., PreparationPlan]) -> Parameters:
-    """The options of ``facediff data prepare`` for a corpus."""
+    """The options of ``facediff data prepare`` for a corpus: the common ones, and the parameters of its plan."""
 
-    def common(raw: Root, out: NewFolder, *, work: WorkOptions = USUAL_WORK) -> None:
+    def common(raw: Root, out: NewFolder, *, work: WorkOptions) -> None:
         """Prepare.
 
         Args:
@@ -173,23 +164,8 @@ def options_of(plan: Callable[..., PreparationPlan]) -> Parameters:
             work: where the work is done
         """
 
-    return {**parameters_of(common), **plan_options(plan)}
-
-
-def prepare(
-    make_plan: Callable[[Path], PreparationPlan], *, raw: Path, out: Path, work: WorkOptions = USUAL_WORK
-) -> int:
-    """Prepare a data set and print a report."""
-    from facediff.data.prepare.runner import prepare as carry_out
-
-    check_scheduler(work.scheduler)
-    if out.resolve().is_relative_to(raw.resolve()):  # the next run would read what is written as raw data
-        raise FaceDiffError(f"{out}: lies in the raw folder {raw}; choose a folder outside it to write to")
-    require_folder(raw, "the raw data set, unpacked")
-    with resumable(out):
-        report = carry_out(make_plan(raw), out, reads=[raw], **vars(work))
-    tell(*describe(report))
-    return 0 if report.sound else 1
+    own = {name: entry for name, entry in parameters_of(plan).items() if name not in ("raw", "quiet")}
+    return {**parameters_of(common), **own}
 
 
 def describe(report: PreparationReport) -> list[str]:
@@ -238,7 +214,7 @@ def pack(
     unit: Annotated[str | None, Option(metavar="U")] = None,
     chunk_seconds: Annotated[ranges.ChunkLength, Option(metavar="S")] = 0.5,
     codec: Literal["zstd", "lz4"] = "zstd",
-    work: WorkOptions = USUAL_WORK,
+    work: WorkOptions,
 ) -> None:
     """Pack a corpus into one Zarr store, at most a fifth of its size, that can also be read from an address.
 
@@ -258,14 +234,12 @@ def pack(
         codec: how motion is compressed; lz4 is read faster and takes an eighth more room
         work: where the work is done
     """
-    require_folder(root, "a corpus folder")
-    check_scheduler(work.scheduler)
     from facediff.data.packed.packing import pack as pack_folder
 
     find_own_module(corpus)
     with resumable(out):
         report = pack_folder(
-            root.expanduser(),
+            root,
             out,
             corpus=corpus,
             tolerance=tolerance,
@@ -286,7 +260,7 @@ def pack(
     )
 
 
-def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions = USUAL_WORK) -> None:
+def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions) -> None:
     """Write a packed corpus back as a corpus folder.
 
     Args:
@@ -294,8 +268,6 @@ def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions = USUAL_WORK) ->
         out: folder to make
         work: where the work is done
     """
-    require_folder(packed, "a packed corpus, as `facediff data pack` writes it, or its address")
-    check_scheduler(work.scheduler)
     from facediff.data.packed.unpacking import unpack as unpack_folder
 
     clips = unpack_folder(packed, out, **vars(work))
@@ -306,11 +278,11 @@ def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions = USUAL_WORK) ->
 
 
 def import_person(
-    motion: Annotated[Path, Option(metavar="MOTION", reads=True)],
+    motion: Annotated[Path, Option(metavar="MOTION", reads=True, exists="file or folder")],
     *,
-    audio: Annotated[Path, Option(metavar="FILE", reads=True)],
+    audio: Annotated[Path, Option(metavar="FILE", reads=True, exists="file")],
     name: str,
-    corpus: Annotated[Path, Option(metavar="ROOT", reads=True)],
+    corpus: Annotated[Path, Option(metavar="ROOT", reads=True, exists="folder")],
     output: OutputFolder,
     frame_rate: Annotated[ranges.FrameRate, Option(metavar="F")],
     corpus_frame_rate: FrameRate = None,
@@ -344,10 +316,6 @@ def import_person(
         clip_seconds: approximate length of a clip
         quiet: no progress bar
     """
-    required = (("MOTION", motion, "file or folder"), ("--audio", audio, "sound file"), ("--corpus", corpus, "folder"))
-    for option, path, kind in required:
-        if not path.exists():
-            raise FaceDiffError(f"{option} {path}: no such {kind}")
     from facediff.data.corpus import read_manifest
     from facediff.data.person import import_person as import_motion
 
@@ -373,8 +341,8 @@ def import_person(
 
 
 def import_take(
-    take: Annotated[Path, Option(metavar="TAKE", reads=True)],
-    sound: Annotated[Path, Option(metavar="SOUND", reads=True)],
+    take: Annotated[Path, Option(metavar="TAKE", reads=True, exists="file")],
+    sound: Annotated[Path, Option(metavar="SOUND", reads=True, exists="file")],
     *,
     name: str,
     output: OutputFolder,
@@ -396,9 +364,6 @@ def import_take(
         most_offset: largest offset to look for, either way
         clip_seconds: approximate length of a clip
     """
-    for argument, path in (("TAKE", take), ("SOUND", sound)):
-        if not path.is_file():
-            raise FaceDiffError(f"{argument} {path}: no such file")
     from facediff.data.person import import_take as import_recording
 
     report = import_recording(
@@ -413,7 +378,7 @@ def import_take(
 def regions(
     root: Root,
     *,
-    output: Output = Path("regions.png"),
+    output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".png",))] = Path("regions.png"),
     corpus: Corpus = None,
     lips: FileOrList = None,
     upper_face: FileOrList = None,
@@ -432,10 +397,6 @@ def regions(
             corpus's own)
         size: height of each view in pixels
     """
-    if output.suffix.lower() != ".png":
-        raise FaceDiffError(f'--output {output}: unknown suffix "{output.suffix}"; expected a picture .png')
-    root = root.expanduser()
-    require_folder(root, "a corpus folder with a mesh and regions/")
     from facediff.data.packed.stores import is_packed
     from facediff.evaluation.figures.regions import draw_regions
 

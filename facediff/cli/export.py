@@ -40,7 +40,7 @@ def export(
         source: what completes a bare .npy.
         controls: what is changed in the animations.
     """
-    check_source(source, animations)
+    check_source(source)
 
     from facediff.animation import Animation
     from facediff.editing.controls import check_controls

@@ -10,20 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from facediff.cli.options import (
     File,
     FileOrList,
-    Folder,
     FrameRate,
     Output,
     Scheduler,
     View,
     Workers,
-    check_folders,
     named_folders,
 )
 from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -75,7 +72,6 @@ class FileOptions:
     def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, FigureData]:
         """The page and what is drawn on it."""
         methods = named_folders([predictions, *(self.method or [])])
-        check_folders(methods)
         if not truth.is_dir() and str(truth) != "puppet":
             raise FaceDiffError(f"{truth}: no such folder; expected a corpus, a folder of truths, or puppet")
         paper = page.paper()
@@ -134,8 +130,8 @@ def frames(
     phonemes: Annotated[list[str] | None, Option(metavar="IPA", many=True)] = None,
     phoneme_file: Annotated[Path | None, Option(metavar="CSV", reads=True)] = None,
     close_up: bool = False,
-    regions: Folder = None,
-    lips: FileOrList = None,
+    regions: Annotated[Path | None, Option(metavar="FOLDER", reads=True, needs="close_up")] = None,
+    lips: Annotated[str | None, Option(metavar="FILE", reads=True, needs="close_up")] = None,
     view: View = "front",
     files: FileOptions,
     page: PageOptions,
@@ -158,8 +154,6 @@ def frames(
     """
     if bool(times) == bool(phonemes):
         raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
-    if not close_up:
-        refuse_idle("is for --close-up", regions=regions is not None, lips=lips is not None)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
     from facediff.evaluation.figures.gather import phonemes_of
@@ -224,7 +218,6 @@ def heatmap(
         files: what is drawn.
         page: how it is printed.
     """
-    check_scheduler(maps.scheduler)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_heatmap
 
@@ -257,7 +250,6 @@ def error(
         highest_mean=statistic == "max" and maps.highest_mean is not None,
         highest_max=statistic == "mean" and highest_max is not None,
     )
-    check_scheduler(maps.scheduler)
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_error
 
@@ -347,9 +339,6 @@ def training(
         page: how it is printed.
     """
     folders = named_folders(runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
-    for folder in folders.values():
-        if not folder.exists():
-            raise FaceDiffError(f"{folder / 'metrics.csv'}: no such file; expected the folder of a run")
     paper = page.paper()
     from facediff.evaluation.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +13,7 @@ from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
-from facediff.utils import ranges
+from facediff.utils import hints, ranges
 from facediff.utils.hub import check_model_source
 from facediff.utils.option import Option
 
@@ -23,15 +24,32 @@ if TYPE_CHECKING:
 SPLITS = ("val", "test_a", "test_b", "test_c")
 
 
+@dataclass(frozen=True)
+class SampleOptions:
+    """Samples.
+
+    Attributes:
+        samples: samples of each clip, two at least
+        references: samples of each clip with each of up to eight references and labels
+        sampler: sampler by name; see `facediff components sampler`
+        steps: denoising steps of the sampler
+        expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
+        low_latency: frame by frame, as `facediff live` does
+        seed: of the first sample; the others follow
+    """
+
+    samples: Annotated[ranges.Samples, Option(metavar="N")] = 10
+    references: Annotated[ranges.Samples, Option(metavar="N")] = 2
+    sampler: Annotated[str | None, Option(metavar="NAME")] = None
+    steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None
+    expressivity: Annotated[str | None, Option(metavar="E")] = None
+    low_latency: bool = False
+    seed: Seed = 0
+
+
 def generation_metrics(
     checkpoints: Annotated[list[Path], Option(metavar="CHECKPOINT", reads=True)],
     *,
-    samples: Annotated[ranges.Samples, Option(metavar="N")] = 10,
-    references: Annotated[ranges.Samples, Option(metavar="N")] = 2,
-    sampler: Annotated[str | None, Option(metavar="NAME")] = None,
-    steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
-    expressivity: Annotated[ranges.Expressivity | None, Option(metavar="E")] = None,
-    low_latency: bool = False,
     splits: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None,
     max_clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
     against: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
@@ -39,10 +57,10 @@ def generation_metrics(
     corpus: Corpus = None,
     eyelid_pairs: FileOrList = None,
     device: str = "cpu",
-    seed: Seed = 0,
     json: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
     quiet: bool = False,
+    samples: SampleOptions,
     licence: LicenceOptions,
 ) -> None:
     """Measure diversity, liveliness, calibration and errors of models' samples, on their corpus's test splits.
@@ -59,12 +77,6 @@ def generation_metrics(
 
     Args:
         checkpoints: trained models (.ckpt) of one corpus
-        samples: samples of each clip, two at least
-        references: samples of each clip with each of up to eight references and labels
-        sampler: sampler by name; see `facediff components sampler`
-        steps: denoising steps of the sampler
-        expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
-        low_latency: frame by frame, as `facediff live` does
         splits: val, test_a, test_b, test_c (default: all test splits)
         max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
         against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
@@ -72,10 +84,10 @@ def generation_metrics(
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
         eyelid_pairs: file with pairs of eyelid vertices (default: regions/eyelid_pairs.txt in the corpus's folder)
         device: cpu, cuda …
-        seed: of the first sample; the others follow
         json: write everything as JSON
         csv: write one row for each split and metric
         quiet: no progress bar
+        samples: what is asked of the models.
         licence: which models are refused.
     """
     for path in [*checkpoints, *([] if against is None else [against])]:
@@ -90,16 +102,14 @@ def generation_metrics(
         from facediff.utils.plain_files import load_json
 
         stored = load_json(against, name=f"--against {against}")
-    from dataclasses import replace
-
     from facediff.models.generation_metrics import SamplingOptions, means_of, measure
     from facediff.models.loading import load_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
-    factor = None if expressivity is None else expressivity
-    sampling = SamplingOptions(samples, references, sampler, steps, seed, factor, low_latency)
+    expressivity = None if samples.expressivity is None else read_expressivity(samples.expressivity)
+    sampling = SamplingOptions(**{**vars(samples), "expressivity": expressivity})
     device = usable_device(device)
     reference = {} if stored is None else means_of(stored, f"--against {against}")
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
@@ -126,6 +136,14 @@ def generation_metrics(
     if csv is not None:
         write_rows(csv, scores.rows())
     tell(*text(scores).split("\n"))
+
+
+def read_expressivity(word: str) -> float:
+    """The number of ``--expressivity``; regions, as `facediff animate` takes them, have no scores of their own."""
+    try:
+        return float(hints.read(ranges.Expressivity, word))
+    except ValueError as error:
+        raise FaceDiffError(f"--expressivity {word}: expected {error}") from error
 
 
 def corpus_of_checkpoint(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from facediff.animation.options import LicenceOptions
-from facediff.cli.options import Output
+from facediff.cli.options import CheckpointFile
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.models.published.import_options import ImportOptions
@@ -23,7 +23,7 @@ MOST_NAMED = 4
 def import_checkpoint(
     files: Annotated[list[Path], Option(metavar="FILE", reads=True)],
     *,
-    output: Output = Path("model.ckpt"),
+    output: CheckpointFile = Path("model.ckpt"),
     doctor: bool = False,
     facts: ImportOptions,
     licence: LicenceOptions,
@@ -44,8 +44,6 @@ def import_checkpoint(
         facts: what the checkpoint does not hold
         licence: which licences are accepted
     """
-    if output.suffix != ".ckpt":
-        raise FaceDiffError(f"--output {output}: expected a name that ends in .ckpt")
     for path in files:
         if not path.is_file():
             raise FaceDiffError(f"{path}: no such file; expected the checkpoint of a published method")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import View as View
+from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils import ranges
 from facediff.utils.files import valid_text
 from facediff.utils.hub import bundled_by_name, check_model_source, is_graphs
+from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
+from facediff.utils.server import LOOPBACK
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -20,9 +23,10 @@ if TYPE_CHECKING:
 
 Output = Annotated[Path, Option(also="-o", metavar="OUT", writes="file")]
 OutputFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder")]
-Picture = Annotated[Path | None, Option(metavar="PNG", writes="file")]
+CheckpointFile = Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".ckpt",))]
+Picture = Annotated[Path | None, Option(metavar="PNG", writes="file", suffixes=(".png",))]
 Checkpoint = Annotated[Path, Option(metavar="C", reads=True)]
-Animations = Annotated[list[Path], Option(metavar="ANIMATION", reads=True)]
+Animations = Annotated[list[Path], Option(metavar="ANIMATION", reads=True, exists="file")]
 Corpus = Annotated[str | None, Option(metavar="NAME")]
 File = Annotated[Path | None, Option(metavar="FILE", reads=True)]
 FileOrList = Annotated[str | None, Option(metavar="FILE", reads=True)]
@@ -33,14 +37,46 @@ FrameRate = Annotated[ranges.FrameRate | None, Option(metavar="F")]
 Seed = Annotated[ranges.Seed, Option(metavar="N")]
 Size = Annotated[ranges.Pixels, Option(metavar="PIXELS")]
 Workers = Annotated[ranges.Workers | None, Option(metavar="N")]
-Scheduler = Annotated[str | None, Option(metavar="WHERE")]
+Scheduler = Annotated[str | None, Option(metavar="WHERE", check=check_scheduler)]
+Text = Annotated[str | None, Option(metavar="NAME")]
 
 
-def check_source(source: SourceOptions, animations: Sequence[Path]) -> None:
+@dataclass(frozen=True)
+class PageServer:
+    """Page (of a command that serves one).
+
+    Attributes:
+        host: address to listen at; by default nobody but this machine reaches it
+        port: to listen at; 0 for any free one (default: 8000 for a study, 8010 for a model)
+        open: open the page in the browser
+    """
+
+    host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1"
+    port: Annotated[ranges.Port | None, Option(metavar="N")] = None
+    open: bool = False
+
+    def announce(self, text: str, action: str) -> Callable[[str], None]:
+        """What is called with the page's address once it is served: it prints the text, and opens the page.
+
+        Args:
+            text: after the address.
+            action: what others may do who reach the page.
+        """
+
+        def ready(address: str) -> None:
+            tell(f"{address} {text}")
+            if self.host not in LOOPBACK:
+                tell(f"note: everybody who reaches {self.host} may {action}, without encryption")
+            if self.open:
+                import webbrowser
+
+                webbrowser.open(address)
+
+        return ready
+
+
+def check_source(source: SourceOptions) -> None:
     """Refuse, before anything is imported, files that do not exist."""
-    for path in animations:
-        if not path.is_file():
-            raise FaceDiffError(f"{path}: no such file; expected an animation, .npz or .npy")
     if source.checkpoint is not None and not is_graphs(bundled_by_name(source.checkpoint)):
         check_model_source(source.checkpoint, "--checkpoint")
     for option, file in (("mesh", source.mesh), ("speech", source.speech)):
@@ -57,31 +93,20 @@ def with_different_names(animations: Sequence[Animation], paths: Sequence[Path])
     ]
 
 
-def check_picture_path(path: Path | None) -> None:
-    """Refuse, before any work is done, a picture of another format."""
-    if path is not None and path.suffix != ".png":
-        raise FaceDiffError(f'--show {path}: unknown suffix "{path.suffix}"; expected a picture .png')
-
-
-def check_folders(methods: Mapping[str, Path]) -> None:
-    """Refuse, before anything is imported, folders of predictions that do not exist."""
-    for folder in methods.values():
-        if not folder.is_dir():
-            raise FaceDiffError(f"{folder}: no such folder; expected the predictions of a method")
-
-
 def named_folders(
     words: Sequence[str], name_of: Callable[[Path], str] = lambda path: path.resolve().name
 ) -> dict[str, Path]:
-    """Folders by name, from words NAME=FOLDER, or FOLDER, which ``name_of`` names."""
-    found: dict[str, Path] = {}
+    """Folders by name, from words NAME=FOLDER, or FOLDER, which ``name_of`` names; all of them exist."""
+    folders: dict[str, Path] = {}
     for word in words:
         name, equals, folder = word.partition("=")
         if not equals or Path(word).exists():
             name, folder = name_of(Path(word)), word
         if not name or not folder:
             raise FaceDiffError(f"{word}: expected NAME=FOLDER")
-        if name in found:
+        if name in folders:
             raise FaceDiffError(f'{word}: there is already one called "{name}"; name it with NAME=FOLDER')
-        found[name] = Path(folder)
-    return found
+        if not Path(folder).exists():
+            raise FaceDiffError(f"{folder}: no such folder")
+        folders[name] = Path(folder)
+    return folders

@@ -2,11 +2,11 @@
 
 A command is a typed function. Its parameters are its options: the name, the type hint, the default and the docstring's
 ``Args:`` entry become flag, type, default and help text. A parameter that may be given by position in Python is a
-positional argument of the command, too. A parameter whose type is a dataclass is a group of options that several
-commands share: the dataclass's fields are the options, and the function receives an instance.
+positional argument of the command, too. A parameter whose type is a dataclass is a group of options, which several
+commands may share: the dataclass's fields are the options, and the function receives an instance.
 
-It is the standard library's argparse that splits the words; this module adds the conversion to the declared types,
-ranges of numbers, groups, checks of paths, and errors of one or two sentences.
+It is the standard library's argparse that splits the words; this module adds the conversion to the declared types
+(:mod:`facediff.utils.hints`), groups, checks of paths (:mod:`facediff.cli.paths`), and errors of one or two sentences.
 """
 
 from __future__ import annotations
@@ -15,25 +15,20 @@ import argparse
 import collections.abc
 import dataclasses
 import inspect
-import os
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
-from facediff.utils import hints
-from facediff.utils.hints import extras_of, range_of, shown
+from facediff.utils.hints import Range, extras_of, range_of, read, shown
 from facediff.utils.option import Option
-from facediff.utils.ranges import Range
-from facediff.utils.renamed import current_option
 
 MISSING = inspect.Parameter.empty
-LONGEST_NAME = 255  # Bytes of the name of a file on usual disks; a path may be longer
 
 
 @dataclass(frozen=True)
@@ -56,22 +51,9 @@ class Parameter:
         return f"--{'no-' if self.is_switch and self.default is True else ''}{self.name.replace('_', '-')}"
 
     @property
-    def shown(self) -> str:
-        """The name as errors show it."""
-        return f"{self.name}:" if self.positional else self.flag
-
-    @property
     def is_path(self) -> bool:
         """Whether a value is a path; texts may hold one as well."""
         return self.value_type is Path
-
-    @property
-    def flags(self) -> list[str]:
-        """All spellings of an option."""
-        if self.positional:
-            return []
-        also = [self.option.also] if self.option.also else []
-        return list(dict.fromkeys([*also, self.flag, f"--{self.flag[2:].replace('-', '_')}"]))
 
     @property
     def is_switch(self) -> bool:
@@ -115,41 +97,21 @@ class Parameter:
 
     def read(self, word: str) -> Any:  # noqa: ANN401 - the type of the hint
         """One word of the command line as a value."""
-        if self.is_number:
-            try:
-                return hints.read(Annotated[self.value_type, self.range or Range()], word)
-            except ValueError as error:
-                bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
-                raise FaceDiffError(f"{self.flag} {shown(word)}: expected {error}{bare}") from error
-        if not word.strip():
-            raise FaceDiffError(f"{self.flag} {shown(word)}: is empty; expected {self.expected()}")
-        if get_origin(self.value_type) is Literal:
-            values = {str(value): value for value in get_args(self.value_type)}
-            if word not in values:
-                raise FaceDiffError(f"{self.shown} {shown(word)}: not valid; expected {self.expected()}")
-            return values[word]
-        if self.has_commas:
-            words = word.split(",")
-            names = [name.strip() for name in words]
-            if "" in names or len({*names}) < len(names):
-                raise FaceDiffError(
-                    f"{self.flag} {shown(word)}: has an empty or a repeated entry; expected names with commas between"
-                )
-            return names
-        path = self.is_path or self.option.reads or self.option.writes
-        if path and any(len(os.fsencode(part)) > LONGEST_NAME for part in re.split(r"[/,]", word)):
-            raise FaceDiffError(f"{self.shown} {shown(word)}: too long for the name of a file; choose a shorter one")
+        hint = Annotated[self.value_type, self.range or Range()]
+        try:
+            if self.is_number or get_origin(self.value_type) is Literal:
+                return read(hint, word)
+            if not word.strip():
+                raise ValueError("a path" if self.is_path else "text")
+            if self.has_commas:
+                names = [name.strip() for name in word.split(",")]
+                if "" in names or len({*names}) < len(names):
+                    raise ValueError("different names with commas between")
+                return names
+        except ValueError as error:
+            bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
+            raise FaceDiffError(f"{self.flag} {shown(word)}: expected {error}{bare}") from error
         return Path(word) if self.is_path else word
-
-    def expected(self) -> str:
-        """What values the parameter takes, in words."""
-        if get_origin(self.value_type) is Literal:
-            return f"one of {', '.join(str(value) for value in get_args(self.value_type))}"
-        if self.is_number:
-            one = (self.range or Range()).numbers(whole=self.value_type is int)
-        else:
-            one = "text" if self.value_type is str else "a path"
-        return f"{self.length} times {one}" if self.length else one
 
 
 Parameters = Mapping[str, "Parameter | OptionGroup"]
@@ -169,8 +131,8 @@ class OptionGroup:
 def without_none(hint: Any) -> Any:  # noqa: ANN401
     """``X`` for ``X | None``; any other hint as it is."""
     if get_origin(hint) in (Union, types.UnionType):
-        kept = [part for part in get_args(hint) if part is not type(None)]
-        return kept[0] if len(kept) == 1 else hint
+        parts = [part for part in get_args(hint) if part is not type(None)]
+        return parts[0] if len(parts) == 1 else hint
     return hint
 
 
@@ -181,24 +143,24 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | OptionG
     parsed = docstring_parser.parse(inspect.getdoc(function) or "", docstring_parser.DocstringStyle.GOOGLE)
     helps = {entry.arg_name: plain_text(entry.description or "") for entry in parsed.params}
     hints, annotations = typing.get_type_hints(function), typing.get_type_hints(function, include_extras=True)
-    found: dict[str, Parameter | OptionGroup] = {}
+    parameters: dict[str, Parameter | OptionGroup] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             continue
         hint, annotated = hints[name], annotations[name]
         if dataclasses.is_dataclass(hint):
-            made = typing.cast(type, hint)
-            fields = [field for field in parameters_of(made).values() if isinstance(field, Parameter)]
+            group = typing.cast(type, hint)
+            fields = [field for field in parameters_of(group).values() if isinstance(field, Parameter)]
             fields = [field for field in fields if not field.option.hidden]
-            found[name] = OptionGroup(made, *summary_of(made), fields)
+            parameters[name] = OptionGroup(group, *summary_of(group), fields)
             continue
         option = next((extra for extra in extras_of(annotated) if isinstance(extra, Option)), Option())
         # The fields of a dataclass may be given by position in Python, but are options of the command line.
         positional = parameter.kind is not parameter.KEYWORD_ONLY and not inspect.isclass(function)
-        found[name] = Parameter(
+        parameters[name] = Parameter(
             name, hint, parameter.default, helps.get(name, ""), option, positional, range_of(annotated)
         )
-    return found
+    return parameters
 
 
 def flat(parameters: Parameters) -> list[Parameter]:
@@ -223,7 +185,7 @@ def summary_of(documented: object) -> tuple[str, str]:
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Help without type names: metavars and texts say what a value is; defaults are added where they say something."""
+    """Help whose defaults are added where they say something."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text = action.help or ""
@@ -231,13 +193,6 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         says_nothing = action.default is None or isinstance(action.default, bool)
         quiet = says_nothing or action.default in ([], argparse.SUPPRESS) or not action.option_strings
         return text if quiet or "(default" in text else f"{text} (default: %(default)s)"
-
-    def _format_action_invocation(self, action: argparse.Action) -> str:
-        # The spelling with underscores is accepted, but not advertised twice.
-        strings = [flag for flag in action.option_strings if not flag.startswith("--") or "_" not in flag]
-        shown = argparse.Action(strings or action.option_strings, action.dest, action.nargs, metavar=action.metavar)
-        shown.choices = action.choices
-        return super()._format_action_invocation(shown if action.option_strings else action)
 
 
 def make_parser(
@@ -250,7 +205,7 @@ def make_parser(
 
     class CommandParser(argparse.ArgumentParser):
         def error(self, message: str) -> NoReturn:
-            raise FaceDiffError(readable(message, flat(parameters), program))
+            raise FaceDiffError(f"{message}; see `{program} --help`")
 
         def format_help(self) -> str:
             self.epilog = details() if callable(details) else details
@@ -269,13 +224,13 @@ def make_parser(
 
 def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's groups have no public type
     """Add one parameter to a parser or to a group of it."""
-    option, flags = parameter.option, parameter.flags
+    option = parameter.option
+    flags = [*([option.also] if option.also else []), parameter.flag]
     text = parameter.help if parameter.range is None else f"{parameter.help}; {parameter.range}"
     keywords: dict[str, Any] = {"help": text.replace("%", "%%")}
     if parameter.is_switch:
-        parser.add_argument(
-            *flags, dest=parameter.name, action="store_false" if parameter.default else "store_true", **keywords
-        )
+        action = "store_false" if parameter.default else "store_true"
+        parser.add_argument(*flags, dest=parameter.name, action=action, **keywords)
         return
     # argparse calls the function with defaults that are texts, too; those of type hints are values already.
     keywords["type"] = lambda word: word if word == parameter.default else parameter.read(word)
@@ -309,16 +264,25 @@ def parse(
     details: str | Callable[[], str] = "",
 ) -> dict[str, Any]:
     """The values of a command's parameters; those of a group as an instance of its dataclass."""
-    flags = {flag for parameter in flat(parameters) for flag in parameter.flags}
+    options = flat(parameters)
     end = arguments.index("--") if "--" in arguments else len(arguments)
-    arguments = [*(current_option(word, flags) for word in arguments[:end]), *arguments[end:]]
-    refuse_repeated(flat(parameters), arguments)
-    values = vars(make_parser(parameters, program, summary, details).parse_args(arguments))
-    for parameter in flat(parameters):
+    arguments = [*map(with_dashes, arguments[:end]), *arguments[end:]]
+    refuse_repeated(options, arguments)
+    namespace, rest = make_parser(parameters, program, summary, details).parse_known_args(arguments)
+    if rest:
+        word = rest[0].partition("=")[0]
+        near = choices(word, [p.flag for p in options if not p.positional]).partition("known are")[0].strip()
+        hint = f"there is no such option; {near}" if word.startswith("-") else "one argument too many;"
+        raise FaceDiffError(f"{word}: {hint} see `{program} --help`")
+    values = vars(namespace)
+    for parameter in options:
         value = values[parameter.name]
         if parameter.length and value is not None:
             values[parameter.name] = tuple(value)
-    check_paths(flat(parameters), values)
+        if parameter.option.check is not None:
+            parameter.option.check(value)
+    refuse_ineffective(options, values)
+    check_paths(options, values)
     return {
         name: values[name]
         if isinstance(entry, Parameter)
@@ -327,27 +291,41 @@ def parse(
     }
 
 
-def refuse_repeated(parameters: Collection[Parameter], arguments: Sequence[str]) -> None:
+def with_dashes(word: str) -> str:
+    """An option as the command spells it: ``--frame_rate`` is ``--frame-rate``."""
+    flag, equals, value = word.partition("=")
+    return f"{flag.replace('_', '-')}{equals}{value}" if word.startswith("--") else word
+
+
+def refuse_repeated(parameters: Sequence[Parameter], arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice: argparse would drop the first value without a word."""
-    once = {flag: parameter for parameter in parameters if parameter.given_once for flag in parameter.flags}
+    once = {flag: p for p in parameters if p.given_once for flag in (p.flag, p.option.also)}
     seen: set[str] = set()
-    for word in arguments:
-        if word == "--":
-            return
-        flag = word.partition("=")[0] if word.startswith("--") else word[:2]
-        if (parameter := once.get(flag)) is None:
-            continue
-        if parameter.name in seen:
+    for word in arguments[: arguments.index("--") if "--" in arguments else None]:
+        parameter = once.get(word.partition("=")[0] if word.startswith("--") else word[:2])
+        if parameter is not None and parameter.name in seen:
             fix = "give all its values after one" if parameter.is_list else "give it once"
             raise FaceDiffError(f"{parameter.flag}: is given twice; {fix}")
-        seen.add(parameter.name)
+        seen |= {parameter.name} if parameter is not None else set()
+
+
+def refuse_ineffective(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
+    """Refuse options that are given, but would change nothing beside the others, or for want of another one."""
+    given = {p.name: p for p in parameters if values[p.name] not in (p.default, None, [])}
+    for parameter in given.values():
+        needed, excluding = parameter.option.needs.split(), parameter.option.without.split()
+        if needed and not given.keys() & needed:
+            flags = " or ".join(p.flag for p in parameters if p.name in needed)
+            raise FaceDiffError(f"{parameter.flag}: has no effect without {flags}; omit it")
+        for name in given.keys() & excluding:
+            raise FaceDiffError(f"{parameter.flag}: has no effect with {given[name].flag}; omit it")
 
 
 def refuse_idle(reason: str, **given: bool) -> None:
-    """Refuse options that were given, but change nothing.
+    """Refuse options that were given, but change nothing because of what no declaration says.
 
     Args:
-        reason: where the options have an effect, as in "is for --stream".
+        reason: where the options have an effect, as in "is for one recording".
         given: whether an option was given, by its name.
     """
     for name, is_given in given.items():
@@ -364,8 +342,8 @@ def arguments_of(function: Callable[..., Any], program: str, words: Sequence[str
     """The arguments of a command function, read from a command line."""
     summary, details = summary_of(function)
     late: Callable[[], str] | None = getattr(function, "more_help", None)
-    whole = details if late is None else lambda: f"{details}\n\n{late()}".strip()
-    return parse(parameters_of(function), words, program, summary, whole)
+    text = details if late is None else lambda: f"{details}\n\n{late()}".strip()
+    return parse(parameters_of(function), words, program, summary, text)
 
 
 Function = typing.TypeVar("Function", bound=Callable[..., Any])
@@ -379,24 +357,3 @@ def with_more_help(text: Callable[[], str]) -> Callable[[Function], Function]:
         return function
 
     return decorate
-
-
-def readable(message: str, parameters: Collection[Parameter], program: str) -> str:
-    """One sentence for what argparse reports, naming the option and what to do."""
-    see = f"see `{program} --help`"
-    flags = {parameter.name: parameter.flag for parameter in parameters}
-    unknown = re.search(r"[Uu]nrecognized arguments?: (\S+)", message)
-    if unknown is not None:
-        word = unknown.group(1).partition("=")[0]
-        if not word.startswith("-"):
-            return f"{word}: one argument too many; {see}"
-        known = [parameter.flag for parameter in parameters if not parameter.positional]
-        hint = choices(word, known).partition("known are")[0].strip()
-        return f"{word}: there is no such option; {hint}. S{see[1:]}" if hint else f"{word}: no such option; {see}"
-    needed = re.search(r"arguments are required: (.*)", message)
-    if needed is not None:
-        names = [name.split("/")[-1].strip() for name in needed.group(1).split(",")]
-        shown = ", ".join(flags.get(name.lstrip("-").replace("-", "_"), name) for name in names)
-        return f"{shown}: missing; {see}"
-    first = " ".join(message.split())
-    return f"{first[:1].lower()}{first[1:]}; {see}"

@@ -1,16 +1,14 @@
 """Files and folders of a command line: which are read, which are written, and what is refused before any work.
 
-Every option and argument that is a path says so (:class:`facediff.cli.parsing.Option`); the checks here are the same
+Every option and argument that is a path says so (:class:`facediff.utils.option.Option`); the checks here are the same
 for all commands. What a command finds out later, such as the names of further files, is checked by the same rules where
 it is written (:mod:`facediff.utils.files`).
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import re
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,8 +35,8 @@ class PathParameter(Protocol):
         """Whether a value is a path; texts may hold one as well."""
 
     @property
-    def shown(self) -> str:
-        """The name as errors show it."""
+    def flag(self) -> str:
+        """The name as it is typed."""
 
 
 def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) -> None:
@@ -53,16 +51,24 @@ def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) 
     inputs: list[Path] = []
     outputs: list[Path] = []
     for parameter in parameters:
+        option = parameter.option
         for path in given_paths(parameter, values.get(parameter.name)):
-            written = parameter.option.writes and not (parameter.option.reads and path.exists())
-            if str(path) == "-" and (written or parameter.option.dash):
-                check_dash(parameter)
-            elif written:
-                check_output(parameter, path)
-                outputs.append(path)
-            elif parameter.is_path or path.exists():  # a text may be a name, or a path
-                check_input(parameter, path)
-                inputs.append(path)
+            try:
+                written = option.writes and not (option.reads and path.exists())
+                if str(path) == "-" and (written or option.dash):
+                    if not option.dash:
+                        raise FaceDiffError("-: is not standard output here; expected the name of a file")
+                elif option.suffixes and path.suffix.lower() not in option.suffixes:
+                    raise FaceDiffError(f"{path}: expected a name that ends in {' or '.join(option.suffixes)}")
+                elif written:
+                    check_output(option, path)
+                    outputs.append(path)
+                elif parameter.is_path or path.exists():  # a text may be a name, or a path
+                    check_input(option, path)
+                    inputs.append(path)
+            except (FaceDiffError, OSError) as error:
+                reason = f"{path}: {error.strerror}" if isinstance(error, OSError) else error
+                raise FaceDiffError(f"{parameter.flag} {reason}") from error
     refuse_equal(outputs)
     refuse_overwriting(inputs, outputs)
     protect(inputs)
@@ -93,37 +99,20 @@ def exists(text: str) -> bool:
         return False
 
 
-def check_dash(parameter: PathParameter) -> None:
-    """Refuse ``-`` for standard output where a command does not write to it."""
-    if not parameter.option.dash:
-        raise FaceDiffError(
-            f"{parameter.shown} -: is standard output elsewhere, but not here; expected the name of a file"
-        )
-
-
-def check_output(parameter: PathParameter, path: Path) -> None:
+def check_output(option: Option, path: Path) -> None:
     """Refuse a file or a folder that cannot be written."""
-    kind = parameter.option.writes
-    try:
-        if kind == "folder" or (kind == "file or folder" and path.is_dir()):
-            check_folder_writable(path)
-        else:
-            check_writable(path)
-    except (FaceDiffError, OSError) as error:
-        reason = f"{path}: {error.strerror}" if isinstance(error, OSError) else error
-        raise FaceDiffError(f"{parameter.shown} {reason}") from error
+    if option.writes == "folder" or (option.writes == "file or folder" and path.is_dir()):
+        check_folder_writable(path)
+    else:
+        check_writable(path)
 
 
-def check_input(parameter: PathParameter, path: Path) -> None:
-    """Refuse a name that no file can have, and what is neither file nor folder; missing files are reported later."""
-    try:
-        mode = path.stat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    except OSError as error:
-        what = "links lead to each other" if error.errno == errno.ELOOP else error.strerror
-        raise FaceDiffError(f"{parameter.shown} {path}: cannot be read ({what})") from error
-    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise FaceDiffError(f"{parameter.shown} {path}: is a device or a pipe; expected a file, or a folder of files")
-    if not os.access(path, os.R_OK):
-        raise FaceDiffError(f"{parameter.shown} {path}: cannot be read (permission denied)")
+def check_input(option: Option, path: Path) -> None:
+    """Refuse what is neither a file nor a folder, or not there although it must be."""
+    present = {"file": path.is_file, "folder": path.is_dir}.get(option.exists, path.exists)()
+    if option.exists and not present:
+        raise FaceDiffError(f"{path}: no such {option.exists}")
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise FaceDiffError(f"{path}: is a device or a pipe; expected a file, or a folder of files")
+    if path.exists() and not os.access(path, os.R_OK):
+        raise FaceDiffError(f"{path}: cannot be read (permission denied)")

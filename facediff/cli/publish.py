@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 from facediff.animation.options import LicenceOptions
-from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import hub
@@ -27,7 +26,7 @@ def publish(
     scores: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
     languages: Annotated[Sequence[str] | None, Option(metavar="CODE,…")] = None,
     push: Annotated[str | None, Option(metavar="USER/NAME")] = None,
-    private: bool = False,
+    private: Annotated[bool, Option(needs="push")] = False,
     licence: LicenceOptions,
 ) -> None:
     """Write a trained model as a folder that others can use, and send it to the Hugging Face hub.
@@ -55,9 +54,7 @@ def publish(
         licence: which models are refused.
     """
     hub.check_model_source(checkpoint)
-    if push is None:
-        refuse_idle("is for --push", private=private)
-    elif not hub.is_hub_name(push):
+    if push is not None and not hub.is_hub_name(push):
         raise FaceDiffError(f"--push {push}: is no name of a model on the hub; expected user/name")
     if folder.is_dir() and any(folder.iterdir()):
         raise FaceDiffError(f"{folder}: is not empty; choose a new folder, or remove this one")

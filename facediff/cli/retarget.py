@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import SourceOptions
-from facediff.cli.options import File, Map, Output, Picture, check_picture_path, check_source
-from facediff.cli.parsing import refuse_idle
+from facediff.cli.options import Map, Output, PageServer, Picture, check_source
+from facediff.cli.parsing import changed, refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
-from facediff.utils import ranges
 from facediff.utils.files import check_writable, holds_glb
 from facediff.utils.option import Option
-from facediff.utils.server import LOOPBACK
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -25,32 +23,11 @@ TURNED = 0.7
 """A cosine below this between both meshes' up axes is reported."""
 
 
-def retarget(
-    animation: Annotated[Path, Option(metavar="ANIMATION", reads=True)],
-    *,
-    target_mesh: Annotated[Path, Option(metavar="FILE", reads=True)],
-    output: Output,
-    correspondence: Map = None,
-    landmarks: File = None,
-    part: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
-    pick: bool = False,
-    show: Picture = None,
-    accept_poor: bool = False,
-    add_to_mesh: bool = False,
-    bare_face: bool = False,
-    own_shapes: bool = False,
-    quiet: bool = False,
-    host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
-    port: Annotated[ranges.Port, Option(metavar="N")] = 0,
-    open: bool = False,  # noqa: A002 - the option's name
-    source: SourceOptions,
-) -> None:
-    """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.
+@dataclass(frozen=True)
+class TransferOptions:
+    """Transfer.
 
-    Args:
-        animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
-        target_mesh: the other face at rest: .obj, .ply, .glb …
-        output: file to write
+    Attributes:
         correspondence: .npz to use if it exists, else to write for other animations
         landmarks: places that are the same: .csv with a pair of vertices a line, counted from 0, or a name for a
             vertex, such as `nose_tip,4034`; or the .json that was picked
@@ -67,89 +44,130 @@ def retarget(
             eyes and jaw, and add none. Weights go by name where the motion has ARKit's or is of the built-in face,
             without any search; else they are solved for on the target
         quiet: print the files and warnings alone
-        host: address at which the page of --pick is served; by default nobody but this machine reaches it
-        port: its port; 0 for any free one
-        open: open the page of --pick in the browser
+    """
+
+    correspondence: Map = None
+    landmarks: Annotated[Path | None, Option(metavar="FILE", reads=True, exists="file")] = None
+    part: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None
+    pick: bool = False
+    show: Picture = None
+    accept_poor: bool = False
+    add_to_mesh: Annotated[bool, Option(without="bare_face own_shapes")] = False
+    bare_face: Annotated[bool, Option(without="own_shapes")] = False
+    own_shapes: bool = False
+    quiet: bool = False
+
+
+def retarget(
+    animation: Annotated[Path, Option(metavar="ANIMATION", reads=True, exists="file")],
+    *,
+    target_mesh: Annotated[Path, Option(metavar="FILE", reads=True, exists="file")],
+    output: Output,
+    transfer: TransferOptions,
+    page: PageServer,
+    source: SourceOptions,
+) -> None:
+    """Transfer an animation to another mesh. The suffix of OUT chooses the format, as in `facediff export`.
+
+    Args:
+        animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
+        target_mesh: the other face at rest: .obj, .ply, .glb …
+        output: file to write
+        transfer: how the motion finds its place on the mesh.
+        page: where landmarks are picked.
         source: what completes a bare .npy.
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
     both_glb = holds_glb(output) and target_mesh.suffix.lower() == ".glb" and output != target_mesh
-    for option, chosen in (("--add-to-mesh", add_to_mesh), ("--own-shapes", own_shapes)):
-        if chosen and not both_glb:
-            raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
-    refuse_idle("has no effect with --bare-face", add_to_mesh=add_to_mesh and bare_face)
-    if own_shapes:
-        refuse_idle("has no effect with --own-shapes", add_to_mesh=add_to_mesh, bare_face=bare_face)
-    check_source(source, [animation])
-    for option, file in (("--target-mesh", target_mesh), ("--landmarks", landmarks)):
-        if file is not None and not file.is_file():
-            raise FaceDiffError(f"{option} {file}: no such file")
-    check_picture_path(show)
-    picked = landmarks_path(correspondence or output)
-    if pick:
-        check_pick(picked, landmarks, correspondence)
+    if (transfer.add_to_mesh or transfer.own_shapes) and not both_glb:
+        option = "--add-to-mesh" if transfer.add_to_mesh else "--own-shapes"
+        raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
+    check_source(source)
+    if transfer.pick:
+        picked = landmarks_path(transfer.correspondence or output)
+        check_pick(picked, transfer.landmarks, transfer.correspondence)
     else:
-        refuse_idle("is for --pick", host=host != "127.0.0.1", port=port != 0, open=open)
+        refuse_idle("is for --pick", **changed(page))
 
     from facediff.editing.blendshapes import has_arkit_weights
-    from facediff.editing.fit_check import refuse_poor
-    from facediff.editing.retargeting import has_z_up
-    from facediff.editing.retargeting import retarget as transfer
     from facediff.export import ExportOptions, check_export, write_animations
-    from facediff.export.glb_own_shapes import own_shapes as own_shapes_of
-    from facediff.export.glb_own_shapes import unused_shapes
-    from facediff.export.pictures import draw_correspondence
+    from facediff.export.glb_own_shapes import own_shapes
     from facediff.mesh.glb import wears_more
-    from facediff.mesh.textures import hands_on_textures
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    dressed = add_to_mesh or (not bare_face and holds_glb(output) and wears_more(target_mesh))
-    if (dressed or own_shapes) and output.exists() and output.samefile(target_mesh):
+    dressed = transfer.add_to_mesh or (not transfer.bare_face and holds_glb(output) and wears_more(target_mesh))
+    if (dressed or transfer.own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
-    avatar = own_shapes_of(target_mesh) if own_shapes else None
-    own = SourceReader(source).read(animation)
-    driven = [] if avatar is None else [avatar.summary, *avatar.left_out(own)]
-    if own_shapes and has_arkit_weights(own):
-        idle = {"correspondence": correspondence, "landmarks": landmarks, "part": part, "show": show}
-        refuse_idle(
-            "has no effect, since the motion's weights go by name to --own-shapes",
-            **{name: value is not None for name, value in idle.items()},
-            pick=pick,
-            accept_poor=accept_poor,
-        )
-        written = write_animations(output, [own], ExportOptions(), into=target_mesh, own_shapes=True)
-        tell(*written, *([] if quiet else driven))
+    avatar = own_shapes(target_mesh) if transfer.own_shapes else None
+    motion = SourceReader(source).read(animation)
+    driven = [] if avatar is None else [avatar.summary, *avatar.left_out(motion)]
+    if avatar is not None and has_arkit_weights(motion):
+        idle = {name: given for name, given in changed(transfer).items() if name not in ("own_shapes", "quiet")}
+        refuse_idle("has no effect, since the motion's weights go by name to --own-shapes", **idle)
+        written = write_animations(output, [motion], ExportOptions(), into=target_mesh, own_shapes=True)
+        tell(*written, *([] if transfer.quiet else driven))
         return
-    if pick:
-        pick_on_page(own, target_mesh, part or (), picked, landmarks, host, port, open)
-        landmarks = picked
+    if transfer.pick:
+        pick_on_page(motion, target_mesh, transfer, picked, page)
+        transfer = replace(transfer, landmarks=picked)
+    write_transferred(motion, target_mesh, output, transfer, dressed=dressed, driven=driven)
+
+
+def write_transferred(
+    motion: Animation, target_mesh: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str]
+) -> None:
+    """Transfer a motion by the surface, write it, and say how well it fits.
+
+    Args:
+        motion: the animation.
+        target_mesh: the other face.
+        output: file to write.
+        options: of the command.
+        dressed: whether a copy of the target's file is written, with materials, skins and targets.
+        driven: what is to be said of the shapes that the target has itself.
+    """
+    from facediff.editing.fit_check import refuse_poor
+    from facediff.editing.retargeting import has_z_up, retarget
+    from facediff.export import ExportOptions, write_animations
+    from facediff.export.glb_own_shapes import unused_shapes
+    from facediff.export.pictures import draw_correspondence
+    from facediff.mesh.textures import hands_on_textures
+
     reports = []
 
-    def judge(made: Animation, found: Correspondence, report: FitReport) -> None:
+    def judge(transferred: Animation, fit: Correspondence, report: FitReport) -> None:
         reports.append(report)
-        if show is not None:  # the picture shows what is wrong
-            draw_correspondence(show, own, made, found)
-        if not accept_poor:
+        if options.show is not None:  # the picture shows what is wrong
+            draw_correspondence(options.show, motion, transferred, fit)
+        if not options.accept_poor:
             refuse_poor(target_mesh, reports[-1])
 
-    made, found = transfer(
-        own, target_mesh, correspondence, landmarks, parts=part or (), judge=judge, whole_head=own_shapes
+    transferred, fit = retarget(
+        motion,
+        target_mesh,
+        options.correspondence,
+        options.landmarks,
+        parts=options.part or (),
+        judge=judge,
+        whole_head=options.own_shapes,
     )
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
-    if own_shapes:
+    if options.own_shapes:
         notes += driven
-    elif dressed and not add_to_mesh:
+    elif dressed and not options.add_to_mesh:
         notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
         notes += unused_shapes(target_mesh)
-    notes += surface_notes(target_mesh, output, made)
-    into = target_mesh if dressed or own_shapes or hands_on_textures(target_mesh, output) else None
-    written = write_animations(output, [made], ExportOptions(), into=into, own_shapes=own_shapes, z_up=has_z_up(found))
-    if show is not None:
-        written.append(show)
-    lines = [*remarks(own, made, found, reports[-1]), *axes_notes(found, output, dressed or own_shapes), *notes]
-    tell(*written, *(line for line in lines if not quiet or line.startswith("WARNING")))
+    notes += surface_notes(target_mesh, output, transferred)
+    copied = dressed or options.own_shapes
+    into = target_mesh if copied or hands_on_textures(target_mesh, output) else None
+    written = write_animations(
+        output, [transferred], ExportOptions(), into=into, own_shapes=options.own_shapes, z_up=has_z_up(fit)
+    )
+    written += [] if options.show is None else [options.show]
+    lines = [*remarks(motion, transferred, fit, reports[-1]), *axes_notes(fit, output, copied), *notes]
+    tell(*written, *(line for line in lines if not options.quiet or line.startswith("WARNING")))
 
 
 PICKED = ".landmarks.json"
@@ -177,40 +195,24 @@ def check_pick(picked: Path, landmarks: Path | None, correspondence: Path | None
 
 
 def pick_on_page(
-    animation: Animation,
-    target_mesh: Path,
-    parts: Sequence[str],
-    picked: Path,
-    landmarks: Path | None,
-    host: str,
-    port: int,
-    show: bool,
+    animation: Animation, target_mesh: Path, options: TransferOptions, picked: Path, page: PageServer
 ) -> None:
     """Serve the page on which landmarks are picked, until they are saved."""
     from facediff.export.viewer.picking import pick_landmarks
     from facediff.mesh import read_mesh
     from facediff.mesh.parts import mesh_parts, named_triangles
 
-    def ready(address: str) -> None:
-        tell(f"{address} shows both faces: pick the same places and save; Ctrl-C ends the command")
-        if host not in LOOPBACK:
-            tell(f"note: everybody who reaches {host} may pick, without encryption")
-        if show:
-            import webbrowser
-
-            webbrowser.open(address)
-
     saved = pick_landmarks(
         animation,
         read_mesh(target_mesh),
         picked,
         names=(animation.name, target_mesh.name),
-        start=landmarks,
-        shown=named_triangles(target_mesh, parts) if parts else None,
+        start=options.landmarks,
+        shown=named_triangles(target_mesh, options.part) if options.part else None,
         parts=mesh_parts(target_mesh),
-        host=host,
-        port=port,
-        ready=ready,
+        host=page.host,
+        port=page.port or 0,
+        ready=page.announce("shows both faces: pick the same places and save; Ctrl-C ends the command", "pick"),
     )
     if not saved:
         raise FaceDiffError("--pick: no landmarks were saved; save them on the page, or omit --pick")

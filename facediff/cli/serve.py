@@ -5,23 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from facediff.cli.options import PageServer
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
-from facediff.utils import ranges
 from facediff.utils.hub import is_audio2face, model_or_bundled
 from facediff.utils.option import Option
-from facediff.utils.server import LOOPBACK, require_server
+from facediff.utils.server import require_server
 
 
 def serve(
     model: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None,
     *,
     output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
-    host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
-    port: Annotated[ranges.Port, Option(metavar="N")] = 8010,
-    open: bool = False,  # noqa: A002 - the option's name
     runtime: Annotated[Path | None, Option(metavar="PACKAGE", reads=True)] = None,
     recordings: Annotated[list[Path] | None, Option(metavar="FILE", many=True, reads=True)] = None,
+    page: PageServer,
 ) -> None:
     """Serve a page that animates recordings and the microphone in the browser, until Ctrl-C.
 
@@ -35,11 +33,9 @@ def serve(
     Args:
         model: folder of `facediff export-model` (default: the model that comes with facediff)
         output: folder to write in place of serving: page, model and ONNX Runtime, for any web server
-        host: address to listen at
-        port: to listen at; 0 for any free one
-        open: open the page in the browser
         runtime: npm's package onnxruntime-web (.tgz) or a folder with its files, for machines without network
         recordings: that the page offers to try the model with
+        page: where it is served.
     """
     if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
@@ -58,14 +54,7 @@ def serve(
         size = write_site(site, output)
         tell(f"wrote {output}: {size / 1e6:.1f} MB; offer it by any web server, e.g. python -m http.server -d {output}")
         return
-
-    def ready(address: str) -> None:
-        tell(f"{address} animates with {model}; Ctrl-C ends it")
-        if host not in LOOPBACK:
-            tell(f"note: any machine that reaches {host} may open the page; without https it gets no microphone")
-        if open:
-            import webbrowser
-
-            webbrowser.open(address)
-
-    serve_site(site, host=host, port=port, ready=ready)
+    ready = page.announce(
+        f"animates with {model}; Ctrl-C ends it", "open the page; without https it gets no microphone"
+    )
+    serve_site(site, host=page.host, port=8010 if page.port is None else page.port, ready=ready)

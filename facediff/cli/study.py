@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,25 +10,17 @@ from facediff.cli.options import (
     Folder,
     FrameRate,
     OutputFolder,
+    PageServer,
     Scheduler,
     Seed,
-    Size,
-    View,
     Workers,
-    check_folders,
     named_folders,
 )
-from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError, counted
+from facediff.study.options import StudyOptions
 from facediff.utils import ranges
-from facediff.utils.jobs import check_scheduler
 from facediff.utils.option import Option
-from facediff.utils.ranges import Range
-from facediff.utils.server import LOOPBACK
-
-Controls = Annotated[int, Range(0, 50)]
-LEVEL = 0.95
 
 
 def make(
@@ -43,23 +34,11 @@ def make(
     mesh: File = None,
     frame_rate: FrameRate = None,
     unit: Annotated[str | None, Option(metavar="U")] = None,
-    clips: Annotated[list[str] | None, Option(metavar="CLIP", many=True)] = None,
-    max_clips: Annotated[ranges.Samples, Option(metavar="N")] = 12,
-    design: Literal["latin", "all"] = "latin",
-    pairs: Literal["first", "all"] = "first",
-    still_controls: Annotated[Controls, Option(metavar="N")] = 3,
-    same_controls: Annotated[Controls, Option(metavar="N")] = 1,
-    repeats: Annotated[Controls, Option(metavar="N")] = 1,
-    questions: File = None,
-    languages: Annotated[Sequence[str] | None, Option(metavar="CODE,…")] = None,
-    seed: Seed = 0,
-    size: Size = 384,
-    view: View = "front",
-    video: Literal["mp4", "webm"] = "mp4",
     workers: Workers = None,
     scheduler: Scheduler = None,
     quiet: bool = False,
     yes: bool = False,
+    options: StudyOptions,
 ) -> None:
     """Make a user study from folders of animations: videos side by side, and a page that asks raters about them.
 
@@ -79,52 +58,20 @@ def make(
         mesh: triangles of .npy files: .ply, .obj … (default: the corpus's)
         frame_rate: frames a second of .npy files (default: the corpus's)
         unit: unit of length of .npy files (default: the corpus's)
-        clips: clips to show (default: a seeded choice of those that all have, even among speakers)
-        max_clips: clips that are chosen at most
-        design: latin: every rater sees every clip once, with a pair that changes from rater to rater; all: every clip
-            with every pair
-        pairs: first: the first method with each other one and the truth; all: all with all
-        still_controls: videos of the truth against a still face, for each rater
-        same_controls: videos of one animation on both sides, for each rater
-        repeats: videos that come again with their sides exchanged, for each rater
-        questions: .yaml with questions, consent, title and the rule of exclusion (default: realism, lip_sync, style,
-            comments)
-        languages: of the page, en,de,es,fr,zh (default: all)
-        seed: of the choice of clips, of sides, orders and references
-        size: height and width of a face in pixels
-        view: camera
-        video: format; webm (VP9) for browsers without H.264
         workers: videos drawn at a time (default: as many as processors)
         scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         quiet: no progress bar
         yes: start without a question, however long it takes
+        options: what is asked.
     """
-    check_scheduler(scheduler)
     folders = named_folders(methods)
-    check_folders(folders)
     if truth is not None and not truth.is_dir() and str(truth) != "puppet":
         raise FaceDiffError(f"--truth {truth}: no such folder; expected a corpus, a folder of animations, or puppet")
-    if questions is not None and not questions.is_file():
-        raise FaceDiffError(f"--questions {questions}: no such file; expected a .yaml file of questions")
-    from facediff.study import StudyOptions, plan_study
+    from facediff.study import plan_study
 
     plan = plan_study(
         folders,
-        StudyOptions(
-            clips=clips,
-            max_clips=max_clips,
-            design=design,
-            pairs=pairs,
-            still=still_controls,
-            same=same_controls,
-            repeats=repeats,
-            questions=questions,
-            languages=languages,
-            seed=seed,
-            size=size,
-            view=view,
-            video=video,
-        ),
+        options,
         truth=truth,
         references=style_references,
         identity=identity,
@@ -152,11 +99,9 @@ def make(
 def serve(
     study: Annotated[Path, Option(metavar="STUDY", reads=True, writes="folder")],
     *,
-    host: Annotated[str, Option(metavar="ADDRESS")] = "127.0.0.1",
-    port: Annotated[ranges.Port, Option(metavar="N")] = 8000,
     name: Annotated[str | None, Option(metavar="HOST")] = None,
     max_raters: Annotated[ranges.Raters | None, Option(metavar="N")] = None,
-    open: bool = False,  # noqa: A002 - the option's name
+    page: PageServer,
 ) -> None:
     """Serve a study to raters, until Ctrl-C. Answers go to STUDY/answers.sqlite, and nowhere else.
 
@@ -165,25 +110,16 @@ def serve(
 
     Args:
         study: folder that `facediff study make` has finished
-        host: address to listen at
-        port: to listen at; 0 for any free one
         name: name under which a web server in front offers the page, such as study.lab.example; requests under other
             names are refused
         max_raters: raters that are let in (default: any number)
-        open: open the page in the browser
+        page: where it is served.
     """
     from facediff.study import serve as run
 
-    def ready(address: str) -> None:
-        tell(f"{address} serves {study}; Ctrl-C ends it")
-        if host not in LOOPBACK:
-            tell(f"note: everybody who reaches {host} may answer, without encryption")
-        if open:
-            import webbrowser
-
-            webbrowser.open(address)
-
-    raters = run(study, host=host, port=port, name=name, most_raters=max_raters, ready=ready).raters()
+    ready = page.announce(f"serves {study}; Ctrl-C ends it", "answer")
+    port = 8000 if page.port is None else page.port
+    raters = run(study, host=page.host, port=port, name=name, most_raters=max_raters, ready=ready).raters()
     finished = sum(rater.finished is not None for rater in raters)
     tell(
         f"{study}: {counted(len(raters), 'rater')}, {finished} of them finished; "
@@ -197,15 +133,15 @@ def report(
     answers: Annotated[list[Path] | None, Option(metavar="FILE", many=True, reads=True)] = None,
     output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
     interval: Literal["wilson", "binomial"] = "wilson",
-    level: Annotated[ranges.Level, Option(metavar="P")] = LEVEL,
+    level: Annotated[ranges.Level, Option(metavar="P")] = 0.95,
     bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = 1000,
     seed: Seed = 0,
     json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,
-    plan: Annotated[ranges.Preference | None, Option(metavar="D")] = None,
-    power: Annotated[ranges.Power, Option(metavar="P")] = 0.8,
-    per_rater: Annotated[ranges.PerRater | None, Option(metavar="N")] = None,
-    correlation: Annotated[ranges.Correlation, Option(metavar="R")] = 0.1,
-    comparisons: Annotated[ranges.PerRater | None, Option(metavar="N")] = None,
+    plan: Annotated[ranges.Preference | None, Option(metavar="D", without="answers output json interval")] = None,
+    power: Annotated[ranges.Power, Option(metavar="P", needs="plan")] = 0.8,
+    per_rater: Annotated[ranges.PerRater | None, Option(metavar="N", needs="plan")] = None,
+    correlation: Annotated[ranges.Correlation, Option(metavar="R", needs="plan")] = 0.1,
+    comparisons: Annotated[ranges.PerRater | None, Option(metavar="N", needs="plan")] = None,
 ) -> int:
     """Analyse the answers to studies, or say how many raters one needs.
 
@@ -229,16 +165,7 @@ def report(
         correlation: for --plan: of two answers of one rater to one comparison
         comparisons: for --plan: comparisons that are made (default: as in the study, else 1)
     """
-    if plan is None:
-        idle = {"power": power != 0.8, "per_rater": per_rater is not None, "correlation": correlation != 0.1}
-        refuse_idle("is for --plan", **idle, comparisons=comparisons is not None)
-    else:
-        idle = {"answers": answers is not None, "output": output is not None, "json": json is not None}
-        refuse_idle("is not for --plan, which analyses no answers", **idle, interval=interval != "wilson")
     folders = named_folders(studies or [])
-    for folder in folders.values():
-        if not folder.is_dir():
-            raise FaceDiffError(f"{folder}: no such folder; expected a study that `facediff study make` has made")
     if plan is not None:
         return print_plan(folders, plan, power, level, per_rater, correlation, comparisons)
     if not folders:

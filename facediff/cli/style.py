@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from facediff.animation.options import LicenceOptions
-from facediff.cli.options import Checkpoint, Identity, Output
+from facediff.cli.options import Checkpoint, Identity
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils.hub import check_model_source, split_face
@@ -16,7 +17,7 @@ def extract(
     clips: Annotated[list[str], Option(metavar="CLIP", reads=True)],
     *,
     checkpoint: Checkpoint,
-    output: Output,
+    output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".npy",))],
     identity: Identity = None,
     licence: LicenceOptions,
 ) -> None:
@@ -29,8 +30,6 @@ def extract(
         identity: whose motion it is, where the files' names do not say it; by default the first one trained on
         licence: which models are refused.
     """
-    if output.suffix != ".npy":
-        raise FaceDiffError(f"--output {output}: expected a name that ends in .npy")
     check_model_source(checkpoint, "--checkpoint")
 
     from facediff.animation.style_files import marked

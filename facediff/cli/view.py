@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import SourceOptions
-from facediff.cli.options import Animations, File, Output, check_source, with_different_names
+from facediff.cli.options import Animations, check_source, with_different_names
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, counted
 from facediff.utils import ranges
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def view(
     animations: Animations,
     *,
-    output: Output,
-    truth: File = None,
+    output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".html", ".htm"))],
+    truth: Annotated[Path | None, Option(metavar="FILE", reads=True, exists="file")] = None,
     labels: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
     shortest: bool = False,
     max_mb: Annotated[ranges.Megabytes, Option(metavar="MB")] = 30.0,
@@ -45,10 +45,8 @@ def view(
         open: open the page in the browser
         source: what completes a bare .npy.
     """
-    if output.suffix not in (".html", ".htm"):
-        raise FaceDiffError(f'--output {output}: unknown suffix "{output.suffix}"; expected .html')
     paths = [*([] if truth is None else [truth]), *animations]
-    check_source(source, paths)
+    check_source(source)
     if labels is not None and len(labels) != len(paths):
         raise FaceDiffError(
             f"--labels: {len(labels)} names for {len(paths)} panels; give one for each, the truth's first"

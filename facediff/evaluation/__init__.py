@@ -4,9 +4,6 @@ from facediff.evaluation.evaluator import evaluate
 from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region
 from facediff.evaluation.report import Comparison, EvaluationReport, MethodResult, Score, SequenceScores, text
 from facediff.reporting.statistics import Interval
-from facediff.utils.renamed import old_names
-
-__getattr__ = old_names(__name__)
 
 __all__ = [
     "DEFAULT_PATTERNS",

@@ -13,9 +13,9 @@ from facediff.utils.lazy import lazy_names
 if TYPE_CHECKING:
     from facediff.study.definition import Study as Study
     from facediff.study.definition import read_study as read_study
-    from facediff.study.making import StudyOptions as StudyOptions
     from facediff.study.making import StudyPlan as StudyPlan
     from facediff.study.making import plan_study as plan_study
+    from facediff.study.options import StudyOptions as StudyOptions
     from facediff.study.report import StudyReport as StudyReport
     from facediff.study.report import analyse as analyse
     from facediff.study.report import analyse_folder as analyse_folder
@@ -27,7 +27,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "definition": "Study read_study",
-        "making": "StudyOptions StudyPlan plan_study",
+        "making": "StudyPlan plan_study",
+        "options": "StudyOptions",
         "report": "StudyReport analyse analyse_folder",
         "server": "serve",
         "simulation": "simulate",

@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,61 +22,19 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, choices, counted
 from facediff.render import Camera, Renderer, side_by_side, write_video
 from facediff.study.definition import DATABASE, PAGE_FOLDER, STUDY_FILE, VIDEO_FOLDER, Study, Trial
-from facediff.study.design import STILL, TRUTH, Design, Pairs, Showing, make_forms, make_pairs, make_schedules
+from facediff.study.design import STILL, TRUTH, Showing, make_forms, make_pairs, make_schedules
 from facediff.study.material import MotionFile, StudyAnimations, StudyClip, in_unit_of, read_sound
+from facediff.study.options import StudyOptions
 from facediff.study.page import write_page
 from facediff.study.texts import Questionnaire, check_languages
-from facediff.utils import ranges
 from facediff.utils.batch import RECORDS, FileTask, Recipe, run_batch
 from facediff.utils.checksums import sha256
 from facediff.utils.files import check_folder_writable, locked, remove_partial
 from facediff.utils.progress import progress_bar
-from facediff.utils.ranges import Range
 from facediff.version import __version__
 
 LOCK = ".facediff-study.lock"
 SECONDS_PER_PIXEL = 4e-8  # What drawing and encoding a pixel of a frame takes on one core
-
-Count = Annotated[int, Range(0, 50)]
-
-
-@dataclass(frozen=True)
-class StudyOptions:
-    """How a study is made.
-
-    Attributes:
-        clips: names of the clips; a seeded choice of all that every method has if None.
-        max_clips: that are chosen at most, evenly among the speakers.
-        design: ``latin``: every rater sees every clip once, with pairs that change from rater to rater; ``all``: every
-            clip with every pair.
-        pairs: the first method with each other one and the truth, or ``all`` with all.
-        still: controls of the truth against a still face; none without a truth.
-        same: controls of one animation on both sides.
-        repeats: pairs that come a second time with their sides exchanged.
-        questions: YAML file of questions, texts and the rule of exclusion; the paper's questions if None.
-        languages: of the page; all that are bundled if None.
-        seed: of the choice of clips, of the design and of the references.
-        size: height and width of a face in pixels.
-        view: camera.
-        video: format of the videos.
-    """
-
-    clips: Sequence[str] | None = None
-    max_clips: ranges.Samples = 12
-    design: Design = "latin"
-    pairs: Pairs = "first"
-    still: Count = 3
-    same: Count = 1
-    repeats: Count = 1
-    questions: Path | None = None
-    languages: Sequence[str] | None = None
-    seed: ranges.Seed = 0
-    size: ranges.Pixels = 384
-    view: str = "front"
-    video: Literal["mp4", "webm"] = "mp4"
-
-    def __post_init__(self) -> None:
-        ranges.check_options(self)
 
 
 @dataclass(frozen=True)
@@ -253,15 +211,15 @@ def plan_study(
     questions = [question for question in questionnaire.questions if references or not question.reference]
     if len(questions) < len(questionnaire.questions):
         notes.append("style is not asked about: a clip has no reference, another clip of the same speaker")
-    still = options.still if truth is not None else 0
-    if options.still and not still:
+    still = options.still_controls if truth is not None else 0
+    if options.still_controls and not still:
         notes.append("there are no controls against a still face, since no truth is given")
     forms = make_forms(
         names,
         make_pairs([*methods, *([TRUTH] if truth is not None else [])], options.pairs),
         design=options.design,
         still=still,
-        same=options.same,
+        same=options.same_controls,
         repeats=options.repeats,
         seed=options.seed,
     )

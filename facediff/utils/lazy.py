@@ -11,8 +11,6 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from facediff.utils.renamed import old_names
-
 
 def lazy_names(
     package: str, modules: Mapping[str, str], packages: str = ""
@@ -31,13 +29,12 @@ def lazy_names(
     """
     owner = {name: f"{package}.{module}" for module, names in modules.items() for name in names.split()}
     inside = packages.split()
-    old = old_names(package)
 
     def get(name: str) -> object:
         if name in inside:
             return importlib.import_module(f"{package}.{name}")  # which also makes it an attribute of the package
         if name not in owner:
-            return old(name)
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(importlib.import_module(owner[name]), name)
         setattr(sys.modules[package], name, value)  # found directly from now on
         return value

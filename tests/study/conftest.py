@@ -38,7 +38,13 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lips = "{name: lips, text: {en: 'Whose lips?', de: 'Welche Lippen?'}, no_difference: true}"
     (root / "q.yaml").write_text(f"questions: [realism, {lips}, comments]\ntitle: <b>Faces</b> & more\n")
     options = StudyOptions(
-        questions=root / "q.yaml", languages=["en", "de"], size=48, still=1, same=0, repeats=0, max_clips=2
+        questions=root / "q.yaml",
+        languages=["en", "de"],
+        size=48,
+        still_controls=1,
+        same_controls=0,
+        repeats=0,
+        max_clips=2,
     )
     plan_study(folders, options, truth=truth).make(root / "made", workers=1, progress=False)
     return root / "made"

@@ -227,7 +227,7 @@ def test_a_full_disk_leaves_no_study_and_the_next_run_continues(
 
 @pytest.mark.slow
 def test_killed_and_started_again_it_is_the_same_study(place: Path) -> None:
-    options = StudyOptions(clips=["A_one"], still=1, same=0, repeats=0, size=32, languages=["en"])
+    options = StudyOptions(clips=["A_one"], still_controls=1, same_controls=0, repeats=0, size=32, languages=["en"])
     whole = plan_study({name: place / name for name in ("ours", "theirs")}, options, truth=place / "truth").study
     words = ["study", "make", "ours=ours", "theirs=theirs", "--truth", "truth", "-o", "study", *SMALL, *FEW]
     process = Forked(program("facediff", *words), cwd=place)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.data import read_prepare
+from facediff.cli.data import options_of
+from facediff.cli.parsing import parse
 from facediff.data import Mead3D
 from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_recordings, find_sounds
@@ -267,10 +268,11 @@ def test_sound_from_another_folder(tmp_path: Path, flame: Path) -> None:
 
 def test_options_of_the_command_line(tmp_path: Path, flame: Path) -> None:
     raw = write_raw_emote(tmp_path / "raw", audio="wav")
-    words = ["mead3d", str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
+    words = [str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
     words += ["--shape", "clip", "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]
-    make_plan, values = read_prepare(words)
-    plan = make_plan(values["raw"])
+    values = parse(options_of(mead3d.plan), words, "facediff data prepare mead3d")
+    del values["out"], values["work"]
+    plan = mead3d.plan(**values)
     assert {job.name[:4] for job in plan.jobs} == {"M003", "W040"}
     assert plan.options["dtype"] == "float64"
     assert plan.options["shape"] == "clip"
