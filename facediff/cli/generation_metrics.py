@@ -13,7 +13,7 @@ from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
-from facediff.utils import hints, ranges
+from facediff.utils import ranges
 from facediff.utils.hub import check_model_source
 from facediff.utils.option import Option
 
@@ -108,7 +108,8 @@ def generation_metrics(
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
 
-    expressivity = None if samples.expressivity is None else read_expressivity(samples.expressivity)
+    word = samples.expressivity
+    expressivity = None if word is None else ranges.EXPRESSIVITY.read("--expressivity", word)
     sampling = SamplingOptions(**{**vars(samples), "expressivity": expressivity})
     device = usable_device(device)
     reference = {} if stored is None else means_of(stored, f"--against {against}")
@@ -136,14 +137,6 @@ def generation_metrics(
     if csv is not None:
         write_rows(csv, scores.rows())
     tell(*text(scores).split("\n"))
-
-
-def read_expressivity(word: str) -> float:
-    """The number of ``--expressivity``; regions, as `facediff animate` takes them, have no scores of their own."""
-    try:
-        return float(hints.read(ranges.Expressivity, word))
-    except ValueError as error:
-        raise FaceDiffError(f"--expressivity {word}: expected {error}") from error
 
 
 def corpus_of_checkpoint(

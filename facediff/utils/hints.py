@@ -97,6 +97,14 @@ class Range:
         noun = "a whole number" if whole else "a number" if bounded else "a finite number"
         return f"{noun} {self}".strip()
 
+    def read(self, name: str, text: str, *, whole: bool = False) -> float:
+        """The number of an option or a field that a text spells; an error names it."""
+        try:
+            number: float = read(Annotated[int if whole else float, self], text)
+        except ValueError as error:
+            raise FaceDiffError(f"{name} {shown(text)}: expected {error}") from error
+        return number
+
 
 def _end(number: float) -> str:
     """A number without an exponent where that is readable; nothing for an end that is not there."""

@@ -160,38 +160,20 @@ def test_the_mean_of_several_clips(checkpoint: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(both, (one + two) / 2, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--person", "A"], "the checkpoint knows A"),
-        (["--person", "nobody"], "neither a person's folder"),
-        (["--person", "C", "-o", "out.pt"], "ends in .ckpt"),
-        (["--person", "C", "--epochs", "0"], "--epochs 0"),
-        (["--person", "C", "--data-root", "nowhere"], "nowhere"),
-        (["--face", "LiveLink", "--data-root", "nowhere"], "nowhere"),
-        (["--face", "LiveLink", "--data-root", "."], "no recordings of live_link; expected .csv"),
-        (["--person", "C", "--accelerator", "gpu"], "give --accelerator=cpu"),
-        (["--voices", "2", "--accelerator", "nope"], "--accelerator nope"),
-        (["--voices", "2", "--mode", "joint"], "--mode, --train"),
-        (["--person", "A", "--interpolation", "0.5"], "--interpolation: is an option of --voices"),
-        (["--voices", "2", "--interpolation", "0"], "--interpolation 0: out of range"),
-        (["--voices", "2", "--transcribed", "people"], "--transcribed people: no such folder"),
-        (["--low-latency", "2", "--transcribed", "."], "--transcribed: is an option of --voices"),
-    ],
-)
 def test_what_cannot_work_is_said_before_training(
-    words: list[str],
-    said: str,
-    checkpoint: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.chdir(tmp_path)
-    output = [] if "-o" in words else ["-o", "out.ckpt"]
-    assert main(["adapt", "--checkpoint", str(checkpoint), *output, *words]) == 2
-    assert said in capsys.readouterr().err
+    for words, said in (
+        ("--person A", "the checkpoint knows A"),
+        ("--person nobody", "neither a person's folder"),
+        ("--face LiveLink --data-root .", "no recordings of live_link; expected .csv"),
+        ("--voices 2 --mode joint", "--mode: has no effect without --person"),
+        ("--train head --person C", "--train head: is for --face"),
+        ("", "expected one of them"),
+    ):
+        assert main(["adapt", "--checkpoint", str(checkpoint), "-o", "out.ckpt", *words.split()]) == 2
+        assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -241,7 +223,7 @@ def test_a_persons_folder_is_learnt_by_name(checkpoint: Path, tiny_root: Path, t
     assert load_model(second).identities == ["Eve", "Maria", "A", "B"]
 
 
-def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_voices(checkpoint: Path, tmp_path: Path) -> None:
     """Everything but the encoder's weights, and whose child it is, is what it was, bit for bit."""
     out = tmp_path / "voices.ckpt"
     words = ["adapt", "--checkpoint", str(checkpoint), "-o", str(out), "--accelerator", "cpu", "--quiet"]
@@ -261,9 +243,6 @@ def test_voices(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         torch.testing.assert_close(half[name], middle, atol=1e-6, rtol=1e-4)
     assert before["optimizer_states"]
     assert set(before) <= set(after)
-    for wrong in ([], ["--voices", "2", "--person", "C"], ["--person", "C", "--augmentation", "noise"]):
-        assert main([*words, *wrong]) == 2
-        assert "--voices" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -284,8 +263,5 @@ def test_low_latency_with_another_audio_encoder(
     for name, value in after.state_dict().items():
         assert name in encoder or name.startswith(heard) or torch.equal(value, before.state_dict()[name])
     assert "optimizer_states" not in read_checkpoint(out)
-    for wrong in (["--audio-encoder", "mel", "--voices"], ["--low-latency", "--voices"]):
-        assert main([*words, *wrong]) == 2
-        assert "--low-latency" in capsys.readouterr().err
     assert main([*words, "--low-latency", "2", "--audio-encoder", "mle"]) == 2
     assert "mle" in capsys.readouterr().err

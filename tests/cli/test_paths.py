@@ -86,14 +86,13 @@ def test_every_command_is_known_here() -> None:
     assert set(COMMANDS) == {*(n for n in OWN if "prepare" not in n), "data prepare", *LIGHTNING}
 
 
-@pytest.mark.parametrize("key", DECLARED, ids=" ".join)
-def test_every_path_declares_whether_it_is_read_or_written(key: tuple[str, str]) -> None:
-    parameter = DECLARED[key]
-    option = parameter.option
-    if parameter.is_path and not key[0].startswith("data prepare"):  # what a plan takes is read
-        assert option.reads or option.writes
-    if parameter.value_type is str and get_origin(parameter.value_type) is not Literal:
-        assert parameter.name in NO_PATHS or option.reads or option.writes
+def test_every_path_declares_whether_it_is_read_or_written() -> None:
+    for key, parameter in DECLARED.items():
+        option = parameter.option
+        if parameter.is_path and not key[0].startswith("data prepare"):  # what a plan takes is read
+            assert option.reads or option.writes, key
+        if parameter.value_type is str and get_origin(parameter.value_type) is not Literal:
+            assert parameter.name in NO_PATHS or option.reads or option.writes, key
 
 
 def test_every_command_writes_somewhere_or_prints() -> None:
@@ -102,46 +101,67 @@ def test_every_command_writes_somewhere_or_prints() -> None:
 
 
 WRITING = [key for key, parameter in DECLARED.items() if parameter.option.writes and not parameter.option.reads]
-PAIRS = [
-    (name, source, target)
-    for name, target in WRITING
-    for (other, source), parameter in DECLARED.items()
-    if other == name and (parameter.option.reads or (parameter.is_path and not parameter.option.writes))
-]
+READING = [key for key, p in DECLARED.items() if p.option.reads or (p.is_path and not p.option.writes)]
 
 
 def typed(name: str, parameter: str, path: Path) -> object:
     """A path as the parser gives it."""
-    found = DECLARED[name, parameter]
-    value = path if found.is_path else str(path)
-    return [value] if found.is_list else value
+    declared = DECLARED[name, parameter]
+    value = path if declared.is_path else str(path)
+    return [value] if declared.is_list else value
 
 
-@pytest.mark.parametrize(("name", "source", "target"), PAIRS)
-def test_an_output_that_is_an_input_is_refused_and_stays(name: str, source: str, target: str, tmp_path: Path) -> None:
+def suffix_of(name: str, parameter: str) -> str:
+    return next(iter(DECLARED[name, parameter].option.suffixes), ".bin")
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _ in WRITING}))
+def test_an_output_that_is_an_input_is_refused_and_stays(name: str, tmp_path: Path) -> None:
     """Under the same name, another one, or through a link."""
-    file = tmp_path / "precious.bin"
-    file.write_text("precious")
-    (tmp_path / "soft").symlink_to(file)
-    for output in (file, tmp_path / ".." / tmp_path.name / file.name, tmp_path / "soft"):
-        with pytest.raises(FaceDiffError) as caught, reading():
-            check_paths(flat(OWN[name]), {source: typed(name, source, file), target: typed(name, target, output)})
-        assert str(output) in str(caught.value)
-    assert file.read_text() == "precious"
-    assert len(list(tmp_path.iterdir())) == 2
+    for target in (target for other, target in WRITING if other == name):
+        file = tmp_path / f"precious{suffix_of(name, target)}"
+        file.write_text("precious")
+        link = file.with_stem("soft")
+        link.symlink_to(file)
+        for source in (source for other, source in READING if other == name):
+            for output in (file, tmp_path / ".." / tmp_path.name / file.name, link):
+                with pytest.raises(FaceDiffError) as caught, reading():
+                    check_paths(
+                        flat(OWN[name]), {source: typed(name, source, file), target: typed(name, target, output)}
+                    )
+                assert str(tmp_path) in str(caught.value)
+        assert file.read_text() == "precious"
+        link.unlink()
+        file.unlink()
+    assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "target"), WRITING)
-def test_an_output_that_cannot_be_written_is_refused_by_its_option(name: str, target: str, tmp_path: Path) -> None:
-    parameter = DECLARED[name, target]
+def test_an_output_that_cannot_be_written_is_refused_by_its_option(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     long = "x" * 300
-    for output in (tmp_path / "file" / "a.b", tmp_path / long, tmp_path / "new" / long / "a.b"):
-        with pytest.raises(FaceDiffError) as caught:
-            check_paths(flat(OWN[name]), {target: typed(name, target, output)})
-        assert str(output) in str(caught.value)
-        assert parameter.name.replace("_", "-") in str(caught.value)
+    for name, target in WRITING:
+        for output in (tmp_path / "file" / "a", tmp_path / long, tmp_path / "new" / long / "a"):
+            path = Path(f"{output}{suffix_of(name, target)}")
+            with pytest.raises(FaceDiffError) as caught:
+                check_paths(flat(OWN[name]), {target: typed(name, target, path)})
+            assert str(output) in str(caught.value)
+            assert target.replace("_", "-") in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_names_end_as_declared_and_what_is_read_is_there(tmp_path: Path) -> None:
+    for (name, target), parameter in DECLARED.items():
+        path = tmp_path / "nothing.xyz"
+        if parameter.option.suffixes or parameter.option.exists:
+            expected = "expected a name that ends in" if parameter.option.suffixes else "no such f"
+            with pytest.raises(FaceDiffError, match=expected):
+                check_paths(flat(OWN[name]), {target: typed(name, target, path)})
+
+
+def test_options_name_options_of_their_command() -> None:
+    for (name, _), parameter in DECLARED.items():
+        others = {*parameter.option.needs.split(), *parameter.option.without.split()}
+        assert others <= {p.name for p in flat(OWN[name])}, f"{name} {parameter.flag}"
 
 
 def example(
@@ -188,26 +208,18 @@ def test_data_of_a_folder_that_is_read_is_not_replaced_but_results_in_it_are(tmp
     check("x", "--folder", tmp_path, "-o", tmp_path / "new.npy")
 
 
-@pytest.mark.parametrize("kind", ["fifo", "/dev/zero", "/dev/null", "loop", "long"])
-def test_an_input_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
-    path = Path(kind)
-    if kind == "fifo":
-        path = tmp_path / "fifo"
-        os.mkfifo(path)
-    elif kind == "loop":
-        path = tmp_path / "loop"
-        path.symlink_to(path)
-    elif kind == "long":
-        path = tmp_path / ("x" * 300)
-    with pytest.raises(FaceDiffError) as caught:
-        check(path, "-o", tmp_path / "out")
-    assert str(path)[: 40 if kind == "long" else None] in str(caught.value)
+def test_an_input_that_is_no_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "fifo", Path("/dev/zero"), Path("/dev/null"), tmp_path / ("x" * 300)):
+        with pytest.raises(FaceDiffError) as caught:
+            check(path, "-o", tmp_path / "out")
+        assert str(path)[:40] in str(caught.value)
 
 
-@pytest.mark.parametrize("words", [["", "-o", "a"], ["a", "-o", ""], ["a", "--output="], ["a", "-oa", "--folder", ""]])
-def test_an_empty_word_is_not_the_working_folder(words: list[str]) -> None:
-    with pytest.raises(FaceDiffError, match="is empty"):
-        check(*words)
+def test_an_empty_word_is_not_the_working_folder() -> None:
+    for words in (["", "-o", "a"], ["a", "-o", ""], ["a", "--output="], ["a", "-oa", "--folder", ""]):
+        with pytest.raises(FaceDiffError, match="expected a path"):
+            check(*words)
 
 
 def test_standard_output_is_named_only_where_it_is_meant() -> None:
