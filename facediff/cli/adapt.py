@@ -130,7 +130,9 @@ def adapt(
         if low_latency is not None:
             options = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
-            options = DistillationOptions(steps=voices, seed=seed, transcribed=encoder.transcribed)
+            options = DistillationOptions(
+                steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed, transcribed=encoder.transcribed
+            )
         options = replace(
             options,
             augmentations=encoder.augmentation or options.augmentations,

@@ -140,7 +140,8 @@ def evaluate(
     from facediff.evaluation.parameters import ParameterFiles, holds_parameters
 
     protocols = find_protocols(scores.protocol or ["paper"], files.topology)
-    parameters, corpus = None, truth
+    parameters: ParameterFiles | None = None
+    corpus: Path | None = truth
     if files.layout is not None or holds_parameters(truth):
         layouts = (files.layout, files.truth_layout or files.layout)
         parameters = ParameterFiles.begin(truth, layouts, files.rig, files.truth_stride)

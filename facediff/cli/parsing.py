@@ -21,7 +21,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
+from typing import Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
@@ -97,10 +97,12 @@ class Parameter:
 
     def read(self, word: str) -> Any:  # noqa: ANN401 - the type of the hint
         """One word of the command line as a value."""
-        hint = Annotated[self.value_type, self.range or Range()]
+        bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
         try:
-            if self.is_number or get_origin(self.value_type) is Literal:
-                return read(hint, word)
+            if self.is_number:
+                return (self.range or Range()).read(self.flag, word, whole=self.value_type is int)
+            if get_origin(self.value_type) is Literal:
+                return read(self.value_type, word)
             if not word.strip():
                 raise ValueError("a path" if self.is_path else "text")
             if self.has_commas:
@@ -108,9 +110,10 @@ class Parameter:
                 if "" in names or len({*names}) < len(names):
                     raise ValueError("different names with commas between")
                 return names
+        except FaceDiffError as error:
+            raise FaceDiffError(f"{error}{bare}") from error
         except ValueError as error:
-            bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
-            raise FaceDiffError(f"{self.flag} {shown(word)}: expected {error}{bare}") from error
+            raise FaceDiffError(f"{self.flag} {shown(word)}: expected {error}") from error
         return Path(word) if self.is_path else word
 
 

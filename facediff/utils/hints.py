@@ -344,7 +344,8 @@ def hints_of(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a function or a cl
         return typing.get_type_hints(owner, include_extras=True)
     except (NameError, TypeError):
         pass
-    module, hints = vars(sys.modules[owner.__module__]), {}
+    module = vars(sys.modules[owner.__module__])
+    hints: dict[str, Any] = {}
     for name, hint in owner.__annotations__.items():
         with suppress(NameError, TypeError):
             alone = SimpleNamespace(__annotations__={name: hint})
@@ -360,7 +361,8 @@ def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a data
     Raises:
         OptionError: naming the option and the range.
     """
-    for name, hint in hints_of(type(options)).items():
+    owner: Any = type(options)
+    for name, hint in hints_of(owner).items():
         value = getattr(options, name)
         if value is not None and (expected := mismatch(hint, value)) is not None:
             problem = "out of range" if isinstance(value, Real) and range_of(hint) is not None else "not valid"

@@ -24,7 +24,7 @@ def test_nothing_heavy_is_imported() -> None:
     ours = {name for name in loaded if name.startswith("facediff")}
     others = {name.split(".")[0] for name in set(loaded) - ours}
     rest = {name for name in ours if not name.startswith("facediff.metrics")}
-    utils = {"facediff.utils", "facediff.utils.limits", "facediff.utils.ranges"}
-    utils |= {"facediff.utils.lazy", "facediff.utils.renamed", "facediff.version"}
+    utils = {"facediff.utils", "facediff.utils.hints", "facediff.utils.lazy", "facediff.utils.limits"}
+    utils |= {"facediff.version"}
     assert rest == {"facediff", "facediff.errors", "facediff.registry", *utils}
     assert others <= set(sys.stdlib_module_names), others
