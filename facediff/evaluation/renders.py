@@ -20,7 +20,6 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.registry import UnknownComponentError, render_metric
 from facediff.render.rasteriser import Camera, Renderer, portrait
-from facediff.runtime.graph_check import check_graph
 from facediff.runtime.graphs import open_session, run_session
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.speech.cepstra import mel_filters
@@ -64,22 +63,17 @@ class RenderGraph:
     @cached_property
     def session(self) -> onnxruntime.InferenceSession:
         """The graph, ready to run."""
-        return open_session(self.path, check_graph(self.path))
+        return open_session(self.path)
 
     @property
     def inputs(self) -> dict[str, list[int | str | None]]:
         """Shapes of the inputs by name."""
         return {end.name: list(end.shape) for end in self.session.get_inputs()}
 
-    def run(self, inputs: Mapping[str, Array], seconds: float) -> dict[str, Array]:
-        """The outputs by name, finite.
-
-        Args:
-            inputs: by name.
-            seconds: of motion, which bound how long it may take.
-        """
+    def run(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
+        """The outputs by name, finite, of inputs by name."""
         numbers = {name: np.ascontiguousarray(value, np.float32) for name, value in inputs.items()}
-        results = run_session(self.session, numbers, str(self.path), seconds=seconds)
+        results = run_session(self.session, numbers, str(self.path))
         outputs = dict(zip((end.name for end in self.session.get_outputs()), results, strict=True))
         for name, value in outputs.items():
             if value.dtype.kind != "f" or not value.size or not np.isfinite(value).all():
@@ -119,7 +113,7 @@ class OnnxScores(RenderMetric):
             if not len(speech):
                 raise FaceDiffError(f"{self.graph.path}: reads speech, and the truth has no wav/ next to it")
             inputs["speech"] = speech[None]
-        outputs = self.graph.run(inputs, len(frames) / frame_rate)
+        outputs = self.graph.run(inputs)
         return {name: float(value.mean()) for name, value in outputs.items()}
 
 
@@ -203,7 +197,7 @@ class SyncScores(RenderMetric):
         if isinstance(batch, int):  # it takes neither more nor fewer: copies of the last window fill its last batch up
             windows = windows[np.minimum(np.arange(-(-count // step) * step), count - 1)]
         parts = [
-            next(iter(graph.run({self.names[which]: windows[start : start + step]}, step / 25).values()))
+            next(iter(graph.run({self.names[which]: windows[start : start + step]}).values()))
             for start in range(0, len(windows), step)
         ]
         return np.concatenate([part.reshape(len(part), -1) for part in parts])[:count].astype(np.float64)

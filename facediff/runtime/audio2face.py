@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices
 from facediff.runtime.audio2face_folder import REMEDY, SAMPLE_RATE, Audio2FaceFolder, read_audio2face
-from facediff.runtime.graph_check import check_graph
 from facediff.runtime.graphs import open_session, run_session
 from facediff.utils.licences import Licence
 from facediff.utils.limits import FRAME_RATES, check_number, quoted
@@ -87,8 +86,7 @@ class Audio2Face:
             threads: of the processor; as many as it has cores if 0.
         """
         content = read_audio2face(Path(folder))
-        largest = check_graph(content.network)
-        return cls(content, open_session(content.network, largest, threads=threads))
+        return cls(content, open_session(content.network, threads=threads))
 
     @staticmethod
     def frames(samples: int, frame_rate: float) -> int:
@@ -156,7 +154,7 @@ class Audio2Face:
             rows = slice(first, min(first + self._batch, count))
             windows = np.stack([padded[at : at + facts.buffer] for at in moments[rows]])[:, None]
             inputs = {"input": windows, "emotion": np.ascontiguousarray(emotions[rows][:, None])}
-            result = run_session(self._session, inputs, str(self.folder.network), seconds=len(windows))[self._result]
+            result = run_session(self._session, inputs, str(self.folder.network))[self._result]
             if result.size != len(windows) * facts.size or result.dtype != np.float32 or not np.isfinite(result).all():
                 raise FaceDiffError(
                     f"{self.folder.network}: gives {result.dtype} {result.shape}; expected {facts.size} finite numbers "

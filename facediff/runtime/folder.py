@@ -8,7 +8,7 @@ where its loop starts from more than noise, ``style.onnx`` of one that takes sty
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, damaged
-from facediff.runtime.graph_check import REMEDY, check_graph
+from facediff.runtime.graph_check import REMEDY
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.decoding import ChannelDecoder
 from facediff.speech.voice_activity import OFF, USUAL_GATE
@@ -169,7 +169,7 @@ KINDS: dict[str, type | tuple[type, ...]] = {
 
 
 def read_folder(folder: Path) -> tuple[Description, Arrays]:
-    """Description and arrays of an exported model; its graphs are read by :func:`check_graphs`."""
+    """Description and arrays of an exported model; its graphs are checked where they are opened."""
     path = folder / DESCRIPTION
     content = load_json(path, remedy=EXPECTED)
     if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
@@ -193,15 +193,6 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
     with damaged(folder / ARRAYS, REMEDY):
         _check_arrays(description, arrays)
     return description, arrays
-
-
-def check_graphs(folder: Path, description: Description, names: Iterable[str]) -> int:
-    """Read graphs of a folder before anything runs them, as :func:`~facediff.runtime.graph_check.check_graph` does.
-
-    Returns:
-        how many bytes a node of any of them may have that is computed while it is opened.
-    """
-    return min(check_graph(folder / f"{name}.onnx", description.opset, description.graphs[name]) for name in names)
 
 
 def _check(description: Description) -> None:

@@ -21,7 +21,8 @@ from facediff.errors import FaceDiffError
 from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.export.viewer.page import assemble, script_of
-from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, check_graphs, read_folder
+from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
+from facediff.runtime.graph_check import check_graph
 from facediff.runtime.onnxruntime_web import LICENCE
 from facediff.speech.audio import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
@@ -88,7 +89,8 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
     description, arrays = read_folder(folder)
     # A page takes styles by their names: what encodes them from motion is left out.
     graphs = [graph for graph in description.graphs if graph != "style"]
-    check_graphs(folder, description, graphs)
+    for graph in graphs:
+        check_graph(folder / f"{graph}.onnx")
     examples: dict[str, Path] = {}
     for path in recordings:
         read_recording(path)
