@@ -251,14 +251,13 @@ def _trainings(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[T
 def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:
     path = Path(text).expanduser()
     path = path if path.is_absolute() or path.exists() else plan.file.parent / path
-    if kind == "predictions":
-        if not any(path.rglob("*.npy")):
-            raise FaceDiffError(f"{text}: holds no predictions; expected a folder of .npy files of vertices")
-    elif not path.exists():  # a name of the hub, whose content may change, is none of a plan's
-        raise FaceDiffError(
-            f"{text}: no such checkpoint; expected a file of `facediff fit` or import-checkpoint, or a model folder"
-        )
-    else:
+    expected = "a folder of predictions, .npy files of vertices"
+    if kind == "checkpoint":
+        expected = "a file of `facediff fit` or import-checkpoint, or a model folder"
+    # A name of the hub, whose content may change, is none of a plan's.
+    if not path.exists() or (kind == "predictions" and not any(path.rglob("*.npy"))):
+        raise FaceDiffError(f"{text}: not there, or empty; expected {expected}")
+    if kind == "checkpoint":
         check_model_source(path)
     return path.resolve()
 

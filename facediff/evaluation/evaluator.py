@@ -23,6 +23,7 @@ from facediff.evaluation.files import (
     NamePattern,
     Pair,
     Truth,
+    errors_of,
     index_truths,
     list_names,
     pair_up,
@@ -389,11 +390,9 @@ def find_protocols(protocols: Sequence[str | Protocol], topology: str | None = N
     """Protocols by name, or one's own; each once."""
     settings: dict[str, Protocol] = {}
     for name in protocols:
-        try:
+        with errors_of("protocols"):
             setting = protocol(name) if isinstance(name, str) else name
             setting = setting if topology is None else replace(setting, topology=topology)
-        except ValueError as error:
-            raise FaceDiffError(str(error)) from error
         if settings.setdefault(setting.name, setting) != setting:
             raise FaceDiffError(f"two different protocols are called {setting.name}; give one another name")
     return list(settings.values())

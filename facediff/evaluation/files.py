@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -13,6 +13,16 @@ from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, MOTION_FOLDERS, f
 from facediff.errors import FaceDiffError
 from facediff.metrics import TOPOLOGIES, EyelidPairs, LipPairs, Region
 from facediff.utils.arrays import open_vertices
+
+
+@contextmanager
+def errors_of(subject: str) -> Iterator[None]:
+    """Errors of metrics inside it name a subject, such as the metric."""
+    try:
+        yield
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise FaceDiffError(f"{subject}: {error}") from error
+
 
 # File names: who speaks, what is said, and whose style the prediction was given.
 
@@ -256,12 +266,9 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
     file, above, threshold = chosen.partition(">")
     if not above:
         return find_region(root, [chosen], chosen, n_vertices)
-    try:
+    with errors_of(OPTIONS[part]):
         region = Region.from_weights(root / file, float(threshold), name=chosen)
         region.check(n_vertices)
-    except ValueError as error:
-        message = str(error)
-        raise FaceDiffError(message if str(root / file) in message else f"{root / file}: {message}") from error
     return region
 
 
@@ -290,12 +297,10 @@ def read_pairs(source: str | None, corpus: Path | None, n_vertices: int, kind: t
             f"{where}; give {option}, a file with one upper and one lower {what} vertex a line, or pairs such as "
             f"3531-3504 (the middle of FLAME's lips)"
         )
-    try:
+    with errors_of(f"{option} {source}"):
         if not Path(source).is_file() and all(c.isdecimal() or c in "-," for c in source):
             pairs = kind.from_pairs("given", [[int(i) for i in pair.split("-")] for pair in source.split(",")])
         else:
             pairs = kind.from_file(source)
         pairs.check(n_vertices)
-    except ValueError as error:
-        raise FaceDiffError(f"{option} {source}: {error}") from error
     return pairs

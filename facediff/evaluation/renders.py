@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.registry import UnknownComponentError, render_metric
+from facediff.registry import render_metric
 from facediff.render.rasteriser import Camera, Renderer, portrait
 from facediff.runtime.graphs import open_session, run_session
 from facediff.speech.audio import SAMPLE_RATE
@@ -110,9 +110,7 @@ class OnnxScores(RenderMetric):
         """The mean of each output."""
         inputs: dict[str, Array] = {"frames": frames[None] / np.float32(255)}
         if "speech" in self.graph.inputs:
-            if not len(speech):
-                raise FaceDiffError(f"{self.graph.path}: reads speech, and the truth has no wav/ next to it")
-            inputs["speech"] = speech[None]
+            inputs["speech"] = speech_for(self.graph, speech)[None]
         outputs = self.graph.run(inputs)
         return {name: float(value.mean()) for name, value in outputs.items()}
 
@@ -157,8 +155,7 @@ class SyncScores(RenderMetric):
 
     def score(self, frames: Frames, speech: Speech, frame_rate: float) -> Mapping[str, float]:
         """Both scores and the offset, of one clip."""
-        if not len(speech):
-            raise FaceDiffError(f"{self.video.path}: reads speech, and the truth has no wav/ next to it")
+        speech_for(self.video, speech)
         places = np.rint(np.arange(int(len(frames) / frame_rate * 25 + 1e-6)) * frame_rate / 25).astype(int)
         pictures = frames[places.clip(0, len(frames) - 1)][..., :: -1 if self.order == "bgr" else 1]
         count = min(len(pictures) - 4, (len(speech) - SAMPLE_RATE // 5) // (SAMPLE_RATE // 25) + 1)
@@ -170,8 +167,8 @@ class SyncScores(RenderMetric):
         seen = seen.reshape(count, 15, *self.size) if self.flat else seen
         mel = mel_spectrogram(speech)
         starts = [min(round(3.2 * start), mel.shape[1] - 16) for start in range(count)]
-        heard = np.stack([mel[None, :, start : start + 16] for start in starts])
-        moving, sounding = self._embeddings(self.video, 0, seen), self._embeddings(self.audio, 1, heard)
+        sounds = np.stack([mel[None, :, start : start + 16] for start in starts])
+        moving, sounding = self._embeddings(self.video, 0, seen), self._embeddings(self.audio, 1, sounds)
         if moving.shape != sounding.shape:
             raise FaceDiffError(
                 f"{self.video.path} and {self.audio.path}: give embeddings {moving.shape} and {sounding.shape}; "
@@ -201,6 +198,13 @@ class SyncScores(RenderMetric):
             for start in range(0, len(windows), step)
         ]
         return np.concatenate([part.reshape(len(part), -1) for part in parts])[:count].astype(np.float64)
+
+
+def speech_for(graph: RenderGraph, speech: Speech) -> Speech:
+    """The speech of a clip, which a graph needs."""
+    if not len(speech):
+        raise FaceDiffError(f"{graph.path}: reads speech, and the truth has no wav/ next to it")
+    return speech
 
 
 def mel_spectrogram(speech: Speech) -> Array:
@@ -233,20 +237,11 @@ def _size(path: str, dims: Sequence[int | str | None]) -> tuple[int, int]:
 
 
 def read_render_metrics(texts: Sequence[str]) -> dict[str, RenderMetric]:
-    """Render metrics by ``NAME:option=value,…``, under these texts.
-
-    Raises:
-        FaceDiffError: if there is no such metric or option, or its files do not fit.
-    """
+    """Render metrics by ``NAME:option=value,…``, under these texts."""
     metrics: dict[str, RenderMetric] = {}
     for text in texts:
-        try:
-            name, options = render_metric.read(text)
-        except UnknownComponentError as error:
-            raise FaceDiffError(str(error)) from error
-        metrics[text.partition(":")[0] if text.partition(":")[0] not in metrics else text] = render_metric.get(name)(
-            **options
-        )
+        name, options = render_metric.read(text)
+        metrics[name if name not in metrics else text] = render_metric.get(name)(**options)
     return metrics
 
 

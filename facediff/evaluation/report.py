@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from facediff.errors import FaceDiffError, printable
-from facediff.evaluation.files import Missing, Pair
+from facediff.evaluation.files import Missing, Pair, errors_of
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
 from facediff.reporting.scores import ScoreTable
@@ -260,12 +260,10 @@ class MethodTable:
         for place, column in enumerate(self.columns):
             if not self._pooled(column):
                 whole = self.rows[0][1].states[column.source].clone()
-                try:
+                with errors_of(f"{self.folder}: metric {column.metric}"):
                     for _, scores in self.rows[1:]:
                         whole.merge_state(scores.states[column.source])
                     totals[place] = float(whole.compute())
-                except (ValueError, RuntimeError) as error:
-                    raise FaceDiffError(f"{self.folder}: metric {column.metric}: {error}") from error
             elif math.isnan(totals[place]):
                 raise FaceDiffError(
                     f"{self.folder}: metric {column.metric} has no value on any of its {len(self.rows)} clips; omit it"

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from facediff.errors import FaceDiffError
-from facediff.evaluation.files import Pair
+from facediff.evaluation.files import Pair, errors_of
 from facediff.metrics import (
     FaceDynamicsDeviation,
     Protocol,
@@ -141,7 +141,7 @@ class Scorer:
         self.moments = dict(moments or {})
         self.owners = dict(owners or {})
         for protocol in protocols:
-            try:
+            with errors_of(f"protocol {protocol.name}"):
                 if protocol.channels:
                     if not channels:
                         raise ValueError("it scores channels, and the files hold vertices")
@@ -151,8 +151,6 @@ class Scorer:
                     for region in (built.lips, built.upper):
                         if region is not None:
                             region.check(n_vertices)
-            except ValueError as error:
-                raise FaceDiffError(f"protocol {protocol.name}: {error}") from error
             self.remarks += [remark for remark in built.summary().remarks if remark not in self.remarks]
             for name, metric in built.scores().items():
                 self._add(protocol, name, metric)
@@ -167,10 +165,8 @@ class Scorer:
             over = chosen.over if isinstance(chosen, SequenceMetric) else None
             of_channels = bool(getattr(chosen, "of_channels", False))
             if over is not None and not of_channels:
-                try:
+                with errors_of(f"metric {name}"):
                     over.check(n_vertices)
-                except ValueError as error:
-                    raise FaceDiffError(f"metric {name}: {error}") from error
             pooling: Pooling = getattr(chosen, "pooling", "sequences")
             where = "all vertices" if over is None else over.as_dict()
             better = describe_column(chosen)["better"]
@@ -249,7 +245,7 @@ class Scorer:
             one = chosen.clone()
             channels = bool(getattr(chosen, "of_channels", False))
             moment = self.moments.get(name, "all")
-            try:
+            with errors_of(f"metric {name}"):
                 if "conditions" in getattr(chosen, "needs", ()):
                     motions = [motion.get(channels=channels) for motion in predictions.values()]
                     frames = min(map(len, motions))
@@ -269,8 +265,6 @@ class Scorer:
                     continue
                 frames, sequences = one.counts[:2].tolist()
                 valued.append((one.compute().item(), frames / sequences) if sequences else (math.nan, 0.0))
-            except (ValueError, TypeError) as error:
-                raise FaceDiffError(f"metric {name}: {error}") from error
         return valued, states
 
     def _score(self, name: str, prediction: Motion, truth: Motion, template: Tensor | None) -> ClipScores:
@@ -280,11 +274,9 @@ class Scorer:
         for column in columns:
             if (column.channels, column.rule) not in aligned:
                 # Every rule that does not refuse the lengths leaves the same frames, those that both sides have.
-                try:
+                with errors_of(f"protocol {column.protocol}"):
                     sides = (motion.get(channels=column.channels) for motion in (prediction, truth))
                     clips = align(*sides, clip_names=[name], rule=column.rule)
-                except ValueError as error:
-                    raise FaceDiffError(f"protocol {column.protocol}: {error}") from error
                 # Channels are offsets from a face at rest.
                 clips = clips.attach("template", [None if column.channels else template])
                 aligned[column.channels, column.rule] = clips
@@ -329,10 +321,8 @@ class Scorer:
         # An error over all vertices is finite only if every value of the frames is: the clip need not be read again.
         whole = [by_source[source] for source, metric in errors.items() if metric.region is None]
         if not whole or not all(map(math.isfinite, by_source.values())):
-            try:
+            with errors_of(f"protocol {self.columns[0].protocol}"):
                 clips.check_finite()
-            except ValueError as error:
-                raise FaceDiffError(f"protocol {self.columns[0].protocol}: {error}") from error
         others = metrics.keys() - by_source.keys()
         return by_source | {source: float(metrics[source].clip_value(clip)) for source in others}
 

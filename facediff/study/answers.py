@@ -135,14 +135,12 @@ def check_answer(answer: Answer, study: Study, number: int, source: object) -> N
     """Refuse answers that the study does not ask of a rater of that number."""
     trial = next((trial for trial in study.trials_of(number) if trial.id == answer.trial), None)
     asked = {} if trial is None else asked_of(study, trial)
-    if not asked or answer.answers.keys() != asked.keys():
-        expected = f"one each to {', '.join(asked)}" if asked else "a trial that this rater is asked about"
+    fits = answer.answers.keys() == asked.keys() and all(answer.answers[name] in asked[name] for name in asked)
+    if not asked or not fits:
+        questions = "; ".join(f"{name}: {' or '.join(answers)}" for name, answers in asked.items())
         shown = f"{quoted(answer.trial)} with answers {quoted(dict(answer.answers))}"
+        expected = questions or "a trial that this rater is asked about"
         raise FaceDiffError(f"{source}: trial is {shown}; expected {expected}")
-    for question, given in answer.answers.items():
-        if given not in asked[question]:
-            expected = " or ".join(asked[question])
-            raise FaceDiffError(f"{source}: the answer to {question} is {quoted(given)}; expected {expected}")
 
 
 def asked_of(study: Study, trial: Trial) -> dict[str, Sequence[str]]:

@@ -108,11 +108,8 @@ class Questionnaire:
         entries = (*PAPER_QUESTIONS, "comments") if content.questions is None else content.questions
         self.questions = [self._question(entry, f"questions[{i}]") for i, entry in enumerate(entries)]
         names = [question.name for question in self.questions]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise FaceDiffError(f'{path}: there are two questions "{twice}"; rename one')
-        if not any(question.kind == "choice" for question in self.questions):
-            raise FaceDiffError(f"{path}: questions ask for no choice between two videos; {REMEDY}")
+        if len({*names}) < len(names) or not any(question.kind == "choice" for question in self.questions):
+            raise FaceDiffError(f"{path}: questions are {', '.join(names)}; expected each once, and a choice; {REMEDY}")
 
     def _question(self, content: object, place: str) -> Question:
         content = {"name": content} if isinstance(content, str) else content

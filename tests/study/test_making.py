@@ -162,7 +162,7 @@ def test_mistakes_are_one_sentence_and_leave_nothing(place: Path, refused: Calla
     for text, named in (
         ("questions: [realsim]", "realism"),
         ("questions: [comments]", "choice"),
-        ("questions: [realism, realism]", "two questions"),
+        ("questions: [realism, realism]", "each once"),
         ("questions: [{name: X}]", "questions[0].name"),
         ("questions: [{name: x, text: {de: Ja}}]", "en"),
         ("rule: {least_right: 2}", "rule.least_right"),

@@ -144,10 +144,8 @@ def find_clips(
 
     ``subjects`` are the known speakers; ``identity`` is ``own``, or the identity whose predictions are drawn.
     """
-    if identity == ALL:
-        raise FaceDiffError("--identity all: a figure shows one condition; expected own or an identity's name")
-    if TRUTH in methods:
-        raise FaceDiffError(f'a method cannot be called "{TRUTH}"; name it with NAME=FOLDER')
+    if identity == ALL or TRUTH in methods:
+        raise FaceDiffError("--identity all: a figure shows one condition, and no method is called truth (NAME=FOLDER)")
     names, _ = list_names(truth, [NamePattern(truth_pattern, subjects)])
     truths = dict(sorted(index_truths(names).items()))
     readers = [NamePattern(pattern, subjects) for pattern in patterns]
