@@ -1,4 +1,4 @@
-"""Kills, stops, fills the disk of and locks out every command that writes, and counts losses.
+"""Kills, stops and fills the disk of every command that writes, and counts losses.
 
     python tools/fault_drill.py --markdown results.md
 
@@ -12,9 +12,8 @@ there, runs the command again without a fault, and compares every file with thos
 - ill-mannered: a traceback, an exit status other than the documented one, no end in a minute.
 
 Faults of a command: ``kill`` (SIGKILL, half of them at the moment of a write, half at any time), ``stop`` (SIGTERM or
-Ctrl-C), ``full`` (a disk with room for a part of what the command writes) and ``denied`` (folders that may not be
-written, files that may not be read). ``fit`` is killed and resumed by ``--ckpt_path last`` until it ends; its curve and
-weights must equal an uninterrupted run's bit for bit.
+Ctrl-C) and ``full`` (a disk with room for a part of what the command writes). ``fit`` is killed and resumed by
+``--ckpt_path last`` until it ends; its curve and weights must equal an uninterrupted run's bit for bit.
 
 Runs are forks of a process that has imported everything, which saves seconds each. The small disk is a tmpfs, for which
 this program must be root (``unshare --map-root-user --mount`` where users may have namespaces). The exit status is 1 if
@@ -26,7 +25,6 @@ from __future__ import annotations
 import argparse
 import atexit
 import csv
-import ctypes
 import hashlib
 import importlib
 import json
@@ -57,7 +55,7 @@ if str(ROOT) not in sys.path:
 from tools.drill_commands import DRILLS, FIT, WEB_RUNTIME, Drill, write_inputs  # noqa: E402
 
 COUNTS = ("lost", "corrupt", "wrong", "left over", "ill-mannered")
-FAULTS = ("kill", "stop", "full", "denied")
+FAULTS = ("kill", "stop", "full")
 MINUTE = 60.0
 SLACK = 4.0  # a machine that others use as well; the law's minute is for an idle one
 LIBRARIES = (
@@ -65,7 +63,6 @@ LIBRARIES = (
 )
 LIBRARIES += " scipy.optimize trimesh pygltflib soundfile soxr cv2 av PIL.Image h5py yaml rich.table rich.progress"
 LIBRARIES += " matplotlib.pyplot fast_simplification dtaidistance tensorboard pxr.Usd"
-CAPABILITIES = (1, 2, 3)  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAP_FOWNER: what lets root ignore permissions
 
 
 # Running a command
@@ -412,22 +409,6 @@ class Disk:
         subprocess.run(["umount", "-l", str(self.folder)], check=False)
 
 
-def obey_permissions() -> None:
-    """Give up root's right to ignore permissions, in this process and those that it starts."""
-    if os.geteuid() != 0:
-        return
-    libc = ctypes.CDLL(None, use_errno=True)
-    for capability in CAPABILITIES:
-        libc.prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
-    header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # _LINUX_CAPABILITY_VERSION_3, this process
-    sets = (ctypes.c_uint32 * 6)()
-    if libc.capget(header, sets) == 0:
-        for capability in CAPABILITIES:
-            for index in range(3):  # effective, permitted, inheritable; the first 32 capabilities
-                sets[index] &= ~(1 << capability) & 0xFFFFFFFF
-        libc.capset(header, sets)
-
-
 # Rounds
 
 
@@ -656,38 +637,6 @@ class Driller:
         (folder / "matplotlib").mkdir(exist_ok=True)
         return folder
 
-    def denied(self, score: Score) -> None:
-        """Folders that may not be written, or an input that may not be read; with permission, run again."""
-        writing = self.random.random() < 0.6 or not self.input_files(self.scratch / "begin" / "work")
-        with self.round(score, "no permission to write" if writing else "no permission to read") as place:
-            work = place / "work"
-            if writing:
-                shut = [work, *(path for path in work.rglob("*") if path.is_dir())]
-                mode = 0o555
-            else:
-                shut = [self.random.choice([path for path in self.input_files(work)])]
-                self.what += f" {shut[0].relative_to(work)}"
-                mode = 0
-            for path in shut:
-                os.chmod(path, mode)
-            run = execute(self.drill.argv(), place, prepare=obey_permissions)
-            for path in shut:
-                os.chmod(path, 0o755 if writing else 0o644)  # noqa: S103
-            score.struck += run.status != 0
-            self.judge_manners(run, (0, 1, 2) if not writing else (1, 2))
-            self.judge_files(place, clean=True, other_inputs=not writing)
-            if run.status == 0:  # what it could not read was not needed
-                self.judge_result(place)
-            else:
-                self.judge_again(place)
-
-    def input_files(self, work: Path) -> list[Path]:
-        """Files of the inputs, in a folder of a round."""
-        earlier = {name for name in self.before if name in self.after and self.before[name] != self.after[name]}
-        files = [path for path in sorted(work.rglob("*")) if path.is_file()]
-        skipped = {"bystander.txt", "demo.yaml"}
-        return [path for path in files if path.name not in skipped and path.relative_to(work).as_posix() not in earlier]
-
 
 def copy(source: Path, target: Path) -> None:
     """Copy a file or a folder."""
@@ -807,7 +756,7 @@ def drill_one(drill: Drill, inputs: Path, scratch: Path, args: argparse.Namespac
 def drill_on(drill: Drill, inputs: Path, scratch: Path, disk: Disk, args: argparse.Namespace) -> dict[str, Score]:
     """The rounds, on a disk."""
     driller = Driller(drill, inputs, scratch, disk, args.seed)
-    wanted = {"kill": args.kills, "stop": args.stops, "full": args.full, "denied": args.denied}
+    wanted = {"kill": args.kills, "stop": args.stops, "full": args.full}
     scores = {}
     for fault in FAULTS:
         score = scores[fault] = Score()
@@ -883,7 +832,6 @@ def options(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--kills", type=int, default=6, metavar="N", help="kill -9 of each command (default: 6)")
     parser.add_argument("--stops", type=int, default=2, metavar="N", help="SIGTERM or Ctrl-C of each command")
     parser.add_argument("--full", type=int, default=3, metavar="N", help="full disks of each command")
-    parser.add_argument("--denied", type=int, default=2, metavar="N", help="permissions removed, of each command")
     parser.add_argument(
         "--fit-kills", type=int, default=50, metavar="N", help="kill -9 of fit, each followed by a resume"
     )

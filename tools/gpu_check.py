@@ -186,31 +186,9 @@ class Check:
         yield Row("loading, to the device", f"{read:.1f} clips/s, {read / trained:.1f} × training", "≥ 1 × training",
                   self.speed(read >= trained))  # fmt: skip
 
-    def long_batches(self) -> Iterator[Row]:
-        """A training step on one long clip."""
-        from training import FLOAT32, MIXED
-
-        from facediff.data import Batch, Sample, collate
-
-        bench, seconds = self.training, 60 if self.cuda else 4
-        frames, n_vertices = seconds * 25, self.sizes.vertices
-        found: Batch = collate([
-            Sample(
-                audio=0.1 * torch.randn(frames * 640), motion=1e-3 * torch.randn(frames, n_vertices, 3),
-                template=torch.zeros(n_vertices, 3), identity=0, reference=1e-3 * torch.randn(100, n_vertices, 3),
-                name="long", identity_name="F2", sentence="", reference_name="reference",
-            )
-        ])  # fmt: skip
-        self.peak()
-        way = MIXED if self.cuda else FLOAT32
-        taken = self.clock(lambda: bench.step_with(way, found), repeats=1)
-        yield Row(f"a training step on a clip of {seconds} s", f"{taken:.2f} s, {self.peak()}", "fits", True)
-
     def sampling(self) -> Iterator[Row]:
-        """Real-time factors by sampler, the first frame, memory, and folded against vertex space."""
+        """Real-time factors and memory by sampler."""
         from sampling import build
-
-        from facediff.data.batch import Reference
 
         bench = build(self.sizes, self.sizes.vertices, tiny_encoder=self.sizes.tiny_encoder)
         model, batch, seconds = bench.model, bench.batch, self.sizes.seconds
@@ -219,20 +197,6 @@ class Check:
             factor = self.clock(lambda: model.generate(batch), 2) / seconds
             told = f"real-time factor {factor:.4f}, {self.peak()}"
             yield Row(f"sampling, {name}, {model.sampler.steps} steps", told, "< 1", self.speed(factor < 1))
-        style = Reference("reference", batch.reference[0])
-        speech = (0.1 * torch.randn(16000 * 6, generator=torch.Generator().manual_seed(0))).numpy()
-
-        def first_frame() -> None:
-            with model.choosing():
-                stream = model.stream(identity="F2", style=style, seeds=[0])
-                for start in range(0, len(speech), 1600):
-                    if len(stream.feed(torch.from_numpy(speech[start : start + 1600]))[0]):
-                        return
-
-        taken = self.clock(first_frame, 2)
-        ahead = model.windows.look_ahead
-        yield Row("first frame of a stream", f"computed in {taken:.3f} s, after {ahead:.2f} s of speech",
-                  "computed within the 3 s until the next frames", self.speed(taken < 3))  # fmt: skip
 
     def tests(self) -> Iterator[Row]:
         """The tests that need CUDA."""
@@ -288,7 +252,7 @@ def train_distributed(device: str) -> None:
 def run(check: Check, limit: float) -> Iterator[Row]:
     """Rows of all checks; a check that breaks is a row of its own, and one that there is no time for too."""
     started = time.monotonic()
-    parts = ("environment", "distributed", "train", "loader", "long_batches", "sampling", "tests")
+    parts = ("environment", "distributed", "train", "loader", "sampling", "tests")
     for name in parts:
         used = (time.monotonic() - started) / limit
         if used > (1 - RESERVE if name != "tests" else 0.9):

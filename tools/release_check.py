@@ -43,21 +43,7 @@ USES: dict[str, list[list[str]]] = {
         ["python", "-c", "import facediff.metrics as m; print(m.protocol('paper'))"],
     ],
     "train": [["facediff", "fit", "--help"], ["facediff", "components", "model"]],
-    "live": [
-        [
-            "facediff",
-            "live",
-            SPEECH,
-            "--to",
-            "jsonl:frames.jsonl",
-            "--shapes",
-            "puppet",
-            "--seconds",
-            "3",
-            "--sound",
-            "off",
-        ]
-    ],
+    "live": [f"facediff live {SPEECH} --to jsonl:frames.jsonl --shapes puppet --seconds 3 --sound off".split()],
     "all": [["python", "-m", "pip", "check"], ["facediff", "demo", "--fast"]],
 }
 

@@ -30,7 +30,6 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
-from functools import lru_cache
 from itertools import cycle, product
 from pathlib import Path
 from typing import Any
@@ -53,7 +52,7 @@ from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read
 from facediff.speech.pitch import HOP, SIZE, signal, spectra
 from facediff.synthetic.cast import KEPT_OUT_PEOPLE
 from facediff.synthetic.sentences import TEST
-from facediff.synthetic.voices import Flite, installed_voices, open_voice
+from facediff.synthetic.voices import installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic
 from facediff.utils.tables import print_table
@@ -234,45 +233,6 @@ def noisy(decibels: float, kind: Callable[[int, int], Array] = tone) -> Change:
     return lambda speech: speech + kind(len(speech), 1) * level(speech) * 10 ** (-decibels / 20)
 
 
-@lru_cache
-def crowd_voice(text: str, semitones: float) -> Array:
-    """One of a crowd: flite's slt at another pitch."""
-    return pitched(Flite("slt").speak(text).samples.astype(np.float64), semitones)
-
-
-def babble(count: int, seed: int) -> Array:
-    """Six people who talk at once, as loud as unit speech."""
-    random = np.random.default_rng(seed + 1)
-    people = [crowd_voice(*each) for each in zip(CROWD, random.uniform(-7, 4, len(CROWD)), strict=True)]
-    crowd = np.asarray(sum(np.resize(np.roll(each, int(random.integers(len(each)))), count) for each in people))
-    return crowd / level(crowd)
-
-
-CROWD = (
-    "The committee meets again on Thursday afternoon in the larger room upstairs",
-    "My brother has never been able to whistle and drive at the same time",
-    "They painted every window frame a different shade of green",
-    "Please remember to bring the umbrella when you come back from work",
-    "Half of the bakery's bread is sold before seven in the morning",
-    "Nobody in our family has ever really enjoyed playing cards",
-)
-"""What the crowd says."""
-
-
-def music(count: int, seed: int) -> Array:
-    """Plucked strings (Karplus and Strong 1983), three at a time, as loud as unit speech."""
-    random, made = np.random.default_rng(seed + 3), np.zeros(count + 2 * SAMPLE_RATE)
-    for start in range(0, count, 4800):
-        for note in random.choice([0, 3, 5, 7, 10, 12, 15, 19], 3, replace=False):
-            period = round(SAMPLE_RATE / (110 * 2 ** (note / 12)))
-            burst = np.concatenate([random.uniform(-1, 1, period), np.zeros(SAMPLE_RATE)])
-            feedback = np.zeros(period + 2)
-            feedback[0], feedback[-2:] = 1, -0.498
-            made[start : start + len(burst)] += lfilter([1.0], feedback, burst)
-    made = made[:count]
-    return np.asarray(made / level(made))
-
-
 def both(first: Change, second: Change) -> Change:
     """One after the other."""
     return lambda speech: second(first(speech))
@@ -307,10 +267,6 @@ PAUSES: dict[str, Change] = {
     "hiss -30 dB": noisy(30, hiss),
     "hum -30 dB": noisy(30, hum),
     "lower voice, room tone -30 dB": both(voice(-3, 0.9), noisy(30)),
-    "music -20 dB": noisy(20, music),
-    "music -12 dB": noisy(12, music),
-    "babble -20 dB": noisy(20, babble),
-    "babble -12 dB": noisy(12, babble),
 }
 """Changes of sentences with pauses, by name."""
 

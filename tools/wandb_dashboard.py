@@ -155,20 +155,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--project", default="facediff", help="project; default: facediff")
     parser.add_argument("--clips", nargs="+", default=[], metavar="CLIP", help="clips whose preview videos get a panel")
     parser.add_argument("--terms", nargs="+", default=TERMS, metavar="TERM", help="terms of the loss, for other models")
-    parser.add_argument("--dry-run", action="store_true", help="print the view's JSON; no network, nothing saved")
     parser.add_argument("--output", type=Path, help="write the view's JSON to a file; no network, nothing saved")
     options = parser.parse_args(arguments)
     try:
         view = build(options.entity, options.project, clips=options.clips, terms=options.terms)
-        if options.dry_run:
-            print(as_json(view))
         if options.output is not None:
             from facediff.utils.files import atomic
 
             with atomic(options.output) as temporary:
                 temporary.write_text(as_json(view) + "\n", encoding="utf-8")
             print(f"written: {options.output}", file=sys.stderr)
-        if not options.dry_run and options.output is None:
+        if options.output is None:
             print(f"saved: {save(view)}")
     except FaceDiffError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.site.search import ranking
+from tests.fakes.site_search import ranking
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -82,9 +82,9 @@ def test_sections_columns_and_groups(view: dict[str, Any]) -> None:
     assert {panel["config"]["xAxis"] for panel in lines} == {"trainer/global_step"}
 
 
-def test_other_loss_terms(tool: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    assert tool.main(["--entity=team", "--dry-run", "--terms", "cycle"]) == 0
-    shown = set(texts(json.loads(capsys.readouterr().out)))
+def test_other_loss_terms(tool: ModuleType, tmp_path: Path) -> None:
+    assert tool.main(["--entity=team", "--output", str(tmp_path / "view.json"), "--terms", "cycle"]) == 0
+    shown = set(texts(json.loads((tmp_path / "view.json").read_text())))
     assert {"train/loss", "train/cycle", "val/cycle"} <= shown
     assert "train/velocity" not in shown
 
@@ -95,7 +95,7 @@ def test_without_the_package(
     for name in [name for name in sys.modules if name.split(".")[0] == "wandb_workspaces"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "wandb_workspaces", None)
-    assert tool.main(["--entity=team", "--dry-run"]) == 2
+    assert tool.main(["--entity=team", "--output=view.json"]) == 2
     assert "pip install wandb wandb-workspaces" in capsys.readouterr().err
 
 

@@ -3,8 +3,8 @@
     python tools/benchmarks/live.py puppet-onnx --shapes puppet --minutes 10
 
 An exported model hears speech of the built-in corpus on standard input: the lag is from the moment that the last sample
-of a frame is written until the frame's packet arrives. Packets arrive at sockets of this program: Live Link Face and
-VMC by UDP, JSON lines by TCP, the page's frames by WebSocket.
+of a frame is written until the frame's packet arrives. Packets arrive at sockets of this program: Live Link Face by
+UDP, JSON lines by TCP, the page's frames by WebSocket.
 """
 
 from __future__ import annotations
@@ -65,19 +65,6 @@ def listen_live_link(sock: socket.socket, arrivals: Arrivals) -> None:
         arrivals.add(number - first)
 
 
-def listen_vmc(sock: socket.socket, arrivals: Arrivals, rate: float) -> None:
-    """Bundles by python-osc; a frame has arrived with its last message."""
-    from pythonosc.osc_bundle import OscBundle
-
-    index = 0
-    while data := sock.recv(65_536):
-        for message in OscBundle(data):
-            if message.address == "/VMC/Ext/T":
-                index = round(message.params[0] * rate)
-            elif message.address == "/VMC/Ext/Blend/Apply":
-                arrivals.add(index)
-
-
 def listen_lines(port: int, arrivals: Arrivals) -> None:
     """JSON lines of a TCP port."""
     with connected(lambda: socket.create_connection(("127.0.0.1", port))) as connection:
@@ -124,45 +111,25 @@ def free_port(kind: int = socket.SOCK_STREAM) -> int:
 
 
 class Listeners:
-    """A listener for each protocol, in threads of their own.
+    """A listener for each protocol, in threads of their own."""
 
-    Args:
-        rate: frames a second.
-    """
-
-    def __init__(self, rate: float) -> None:
-        self.arrivals = [Arrivals(name) for name in ("Live Link Face", "VMC", "JSON lines", "page")]
-        self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
-        for sock in self._sockets:
-            sock.bind(("127.0.0.1", 0))
-        udp = [sock.getsockname()[1] for sock in self._sockets]
-        tcp = [free_port() for _ in range(2)]
-        link, vmc, lines, page = self.arrivals
-        work: list[tuple[Callable[..., None], tuple[Any, ...]]] = [
-            (listen_live_link, (self._sockets[0], link)),
-            (listen_vmc, (self._sockets[1], vmc, rate)),
-            (listen_lines, (tcp[0], lines)),
-            (listen_page, (tcp[1], page)),
-        ]
-        for target, arguments in work:
-            threading.Thread(target=target, args=arguments, daemon=True).start()
-        self.addresses = [
-            f"livelink://127.0.0.1:{udp[0]}",
-            f"vmc://127.0.0.1:{udp[1]}",
-            f"jsonl:{tcp[0]}",
-            f"browser:{tcp[1]}",
-        ]
+    def __init__(self) -> None:
+        self.arrivals = [Arrivals(name) for name in ("Live Link Face", "JSON lines", "page")]
+        datagrams = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        datagrams.bind(("127.0.0.1", 0))
+        lines, page = free_port(), free_port()
+        work = (listen_live_link, datagrams), (listen_lines, lines), (listen_page, page)
+        for (target, source), arrivals in zip(work, self.arrivals, strict=True):
+            threading.Thread(target=target, args=(source, arrivals), daemon=True).start()
+        link = datagrams.getsockname()[1]
+        self.addresses = [f"livelink://127.0.0.1:{link}", f"jsonl:{lines}", f"browser:{page}"]
 
 
-def write_in_real_time(
-    samples: npt.NDArray[np.int16], descriptor: int, times: list[float], stop: Callable[[], bool] = lambda: False
-) -> None:
+def write_in_real_time(samples: npt.NDArray[np.int16], descriptor: int, times: list[float]) -> None:
     """Write samples as a microphone gives them, 10 ms at a time; ``times`` gets when each piece was written."""
     start = time.monotonic()
     for first in range(0, len(samples), PIECE):
         time.sleep(max(0.0, start + (first + PIECE) / SAMPLE_RATE - time.monotonic()))
-        if stop():
-            break
         os.write(descriptor, samples[first : first + PIECE].tobytes())
         times.append(time.monotonic())
     os.close(descriptor)
@@ -196,7 +163,7 @@ def model(options: argparse.Namespace) -> Iterator[str]:
     description = json.loads((options.model / "model.json").read_text())
     rate, seconds = float(description["frame_rate"]), 60 * options.minutes
     samples, written, sizes = speech(seconds), list[float](), list[tuple[float, float]]()
-    listeners = Listeners(rate)
+    listeners = Listeners()
     words = [sys.executable, "-m", "facediff", "live", str(options.model), "-", "--shapes", str(options.shapes)]
     words += ["--window", str(options.window)] if options.window else []
     words += ["--threads", str(options.threads)] if options.threads else []

@@ -1,4 +1,4 @@
-"""How many pictures a second: facediff's renderer, and matplotlib where it is installed; seconds for videos.
+"""How many pictures a second the renderer draws, and what a second of video costs.
 
 Run ``python tools/benchmarks/rendering.py``; half a minute. The meshes are dented spheres with about as many
 vertices as FLAME (5 023) and BIWI (23 370). OpenCV is held to one thread, and seconds are the process's own, so that
@@ -9,8 +9,6 @@ other programs on the machine disturb little.
 """
 
 import argparse
-import importlib
-import importlib.util
 import json
 import math
 import os
@@ -67,34 +65,6 @@ def frames_per_second(draw: Callable[[Array], object], frames: Array) -> float:
         draw(frame)
         seconds.append(time.process_time() - start)
     return 1 / float(np.median(seconds))
-
-
-def matplotlib_painter(faces: Faces, pixels: int) -> Callable[[Array], object]:
-    """The usual way without a rasteriser: flat polygons, painted from back to front."""
-    # By name: matplotlib is not among the packages that the project's type checker sees.
-    agg, collections, figures = (
-        importlib.import_module(f"matplotlib.{name}") for name in ("backends.backend_agg", "collections", "figure")
-    )
-    figure = figures.Figure(figsize=(pixels / 100, pixels / 100), dpi=100)
-    canvas = agg.FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
-    axes.set_axis_off()
-    polygons = collections.PolyCollection([])
-    axes.add_collection(polygons)
-
-    def draw(vertices: Array) -> object:
-        corners = vertices[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        front = np.flatnonzero(normals[:, 2] > 0)
-        order = front[np.argsort(corners[front, :, 2].mean(axis=1))]
-        shade = np.clip(normals[order] @ [-0.4, 0.45, 0.8], 0.1, 1)
-        polygons.set_verts(corners[order, :, :2])
-        polygons.set_facecolor(shade[:, None] * [0.9, 0.75, 0.66])
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())
-
-    return draw
 
 
 def talking_faces(frames: int) -> dict[str, tuple[Array, Faces, npt.NDArray[np.uint8]]]:
@@ -181,11 +151,8 @@ def drawing() -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    compare = importlib.util.find_spec("matplotlib") is not None
     print(f"{machine()}; OpenCV {cv2.__version__}, one thread, seconds of its core")
     print(f"512 x 512, median of {FRAMES} frames")
-    if not compare:
-        print("matplotlib is not installed: no comparison")
     print(f"{'vertices':>9}{'faces':>9}  {'drawn by':<34}{'frames/s':>9}{'ratio':>7}")
     for size in SIZES:
         vertices, faces = head(size)
@@ -199,15 +166,10 @@ def drawing() -> None:
             "facediff, 2 x 2, vertex colours": tinted.render,
             "facediff, 1 sample": coarse.render,
         }
-        if compare:
-            ways = {
-                "matplotlib, PolyCollection": matplotlib_painter(faces, 512),
-                **ways,
-            }
         base: float | None = None
         for name, draw in ways.items():
             speed = frames_per_second(draw, frames)
-            base = speed if base is None and compare else base
+            base = speed if base is None else base
             ratio = f"{speed / base:.1f}" if base else "-"
             print(f"{len(vertices):>9}{len(faces):>9}  {name:<34}{speed:>9.1f}{ratio:>7}")
 

@@ -40,7 +40,6 @@ IDENTITIES = ["F2", "F3", "F4", "M3", "M4", "M5"]
 PEER_STEPS = 500
 """Steps of a peer that encodes the speech and projects to vertices in each of them."""
 STUDENT_STEPS = 3
-FLAME = 5023
 SPACES: tuple[SamplingSpace, ...] = ("folded", "vertices")
 CONFIGURATIONS = (("ddpm", 1000), ("ddim", 50), ("ddim", 25), ("ddim", 10), ("dpm_solver", 20), ("dpm_solver", 10))
 TINY_HUBERT: dict[str, Any] = {
@@ -228,16 +227,6 @@ def main(args: argparse.Namespace) -> None:
     peer = seconds["conditions"] + PEER_STEPS * (seconds["audio encoder"] + seconds["ddpm vertices"])
     print(f"\nencoding the speech and projecting in each of {PEER_STEPS} steps: {peer:.1f} s (EXTRAPOLATED), "
           f"{peer / seconds['default']:.0f} times the default sampler")  # fmt: skip
-    small = build(args, FLAME, tiny_encoder=True)
-    ddpm = registry.sampler.get("ddpm")
-    steppers = {
-        str(one.model.hparams["n_vertices"]): one.stepper(
-            "folded", ddpm(process=one.model.process, steps=1000), one.conditions()
-        )
-        for one in (small, bench)
-    }
-    by_size = bench.in_turn(steppers, 3 * bench.repeats)
-    print("a folded step by vertices: " + ", ".join(f"{n}: {1e3 * took:.3f} ms" for n, took in by_size.items()))
     student = build(args, args.vertices, tiny_encoder=args.tiny_encoder, student=True)
     student.model.choose_sampler(steps=STUDENT_STEPS)
     seconds["student"] = student.quickest(lambda: student.model.generate(student.batch))

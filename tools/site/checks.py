@@ -1,18 +1,12 @@
-"""What a strict build of MkDocs does not notice: pages that read differently on a code host, raw links, the network."""
+"""What a strict build of MkDocs does not notice: raw links that lead nowhere, and the network."""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
-
-from markdown_it import MarkdownIt
-
-COMPARED = {"blockquote", "em", "h1", "h2", "h3", "h4", "img", "li", "ol", "pre", "strong", "table", "td", "th", "ul"}
-"""Elements of which a page has as many on a code host as on the site; others depend on the theme."""
 
 FETCHED = {"audio", "iframe", "img", "link", "script", "source", "video"}
 """Elements whose address a browser opens by itself."""
@@ -37,20 +31,6 @@ class Elements(HTMLParser):
         named = dict(attrs)
         self.found.append((tag, named))
         self.anchors |= {str(named[key]) for key in ("id", "name") if named.get(key)}
-
-
-def differences(markdown: str, html: str) -> Iterator[str]:
-    """Where a page of the site has other elements than CommonMark, as code hosts read it, makes of its source.
-
-    The two dialects differ in lists (indentation, blank lines before them), and a page that relies on one of them looks
-    broken in the other.
-    """
-    host = MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(markdown)
-    counts = [Counter(tag for tag, _ in Elements(text).found if tag in COMPARED) for text in (host, html)]
-    for tag in sorted(COMPARED):
-        there, here = (count[tag] for count in counts)
-        if there != here:
-            yield f"<{tag}>: {there} on a code host, {here} on the site; is a list indented by less than four spaces?"
 
 
 def broken(site: Path) -> Iterator[str]:

@@ -109,14 +109,6 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:  # noqa: ANN40
     return LINK.sub(moved, markdown)
 
 
-def on_page_content(html: str, page: Page, **_: Any) -> str:  # noqa: ANN401
-    """A page that a code host shows differently is reported."""
-    if page.file.abs_src_path:
-        for problem in checks.differences(Path(page.file.abs_src_path).read_text(encoding="utf-8"), html):
-            log.warning("%s: %s", page.file.src_uri, problem)
-    return html
-
-
 def on_post_build(config: MkDocsConfig) -> None:
     """Links in raw HTML, and whatever a page would fetch from elsewhere, are reported."""
     for problem in checks.broken(Path(config.site_dir)):
