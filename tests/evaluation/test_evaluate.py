@@ -101,16 +101,6 @@ def test_what_is_missing_stands_under_the_scores(files: Files, capsys: pytest.Ca
     assert "the methods were not scored on the same sequences" in told
 
 
-def test_nothing_is_written_when_something_is_wrong(files: Files, tmp_path: Path) -> None:
-    path = files.truth / "B_C_e02.npy"
-    array = files.read(path)
-    array[0] = np.inf
-    files.write(path, array)
-    with pytest.raises(FaceDiffError, match="B_C_e02"):
-        evaluate(files.method(), files.root, "--json", tmp_path / "out" / "a.json", "--csv", tmp_path / "out" / "a.csv")
-    assert not (tmp_path / "out").exists()
-
-
 def test_mistakes_on_the_command_line(files: Files, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(files.truth, bare)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -163,25 +162,6 @@ def test_a_clip_of_which_one_method_has_no_value_is_not_compared(corpus: Files) 
     assert (found.difference, found.sequences) == (pytest.approx(np.mean(gaps)), len(clips))
     (line,) = [line for line in text(report).splitlines() if f"theirs − ours: {metric}" in line]
     assert line.split()[-1] == str(len(clips))
-
-
-@pytest.mark.parametrize(
-    ("metric", "missing", "names"),
-    [
-        ("mouth_opening_difference", "regions/inner_lip_pairs.txt", ["--lip-pairs"]),
-        ("frame_speech_lip_correlation", "manifest.json", ["--frame-rate"]),
-        ("identity_diversity", "", ["--identity all"]),
-        ("face_dynamics_deviation", "", ["--templates"]),
-    ],
-)
-def test_what_is_missing_is_asked_for_by_name(corpus: Files, metric: str, missing: str, names: list[str]) -> None:
-    path = corpus.root / missing
-    if missing:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    options = {"templates": None} if metric == "face_dynamics_deviation" else {}
-    with pytest.raises(FaceDiffError) as error:
-        scored(corpus, metric, **options)
-    assert all(name in str(error.value) for name in [metric, *names])
 
 
 class PlainError(Metric):

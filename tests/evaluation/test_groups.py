@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.evaluation import text
 from facediff.evaluation.groups import attributes_of
 from tests.evaluation.conftest import LENGTHS, Files, write_corpus
@@ -43,11 +42,6 @@ def test_groups_are_pooled_as_the_whole_is(moody: Files) -> None:
             assert group.scores[name] == pytest.approx(np.average(values, weights=frames if pooled else None))
     assert "by mood" in text(report)
     assert report.as_dict()["groups"][0]["attributes"] == {"mood": "calm"}
-
-
-def test_an_attribute_that_no_clip_has_is_refused(moody: Files) -> None:
-    with pytest.raises(FaceDiffError, match=r"--by mod: .*mood"):
-        moody.evaluate(corpus=moody.root, by=["mod"])
 
 
 def test_names_of_3dmead_and_biwi_say_emotions() -> None:

@@ -109,22 +109,6 @@ def test_a_sequence_has_one_number(value: torch.Tensor) -> None:
     assert metric.coverage().sequences == 0
 
 
-def test_a_region_of_a_larger_mesh_is_refused() -> None:
-    with pytest.raises(ValueError, match="index 4, a mesh of 4 vertices ends at 3"):
-        LipVertexError([0, 4]).update(motion(), motion())
-
-
-def test_unknown_options_are_refused_with_the_nearest() -> None:
-    with pytest.raises(ValueError, match='did you mean "mean"'):
-        MeanVertexError(reduction="meen")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="unknown pooling"):
-        MeanVertexError(pooling="x")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="unknown length rule"):
-        MeanVertexError(length_rule="x")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="unknown sign"):
-        FaceDynamicsDeviation([0], sign="x")  # type: ignore[arg-type]
-
-
 def test_clips_of_one_frame_count_and_do_not_vary() -> None:
     assert face_dynamics_deviation(motion(frames=1), motion(frames=1) * 3, [0, 1]).item() == 0.0
     assert mean_vertex_error(motion(frames=1), motion(frames=1) * 3).item() > 0

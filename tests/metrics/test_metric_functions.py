@@ -13,8 +13,7 @@ from torch import Tensor
 
 import facediff.metrics as fm
 from facediff import registry
-from facediff.metrics import Clip, LipMetric, SequenceMetric, functional
-from facediff.utils.hints import defaults
+from facediff.metrics import Clip, LipMetric, functional
 
 NAMES = registry.metric.names()
 
@@ -94,11 +93,6 @@ def test_arrays_may_be_backwards_or_of_the_other_order_of_bytes() -> None:
     assert fm.lip_vertex_error(motion[::-1], motion.astype(">f4"), [0]) == expected > 0
 
 
-def test_a_metric_that_defines_nothing_says_so() -> None:
-    with pytest.raises(NotImplementedError):
-        SequenceMetric(definition="nothing").update(torch.zeros(1, 2, 3), torch.zeros(1, 2, 3))
-
-
 # A score is only comparable with another of the same definition, so the definition that comes without options stays.
 DEFAULTS: dict[str, dict[str, Any]] = {
     "bilabial_closure_rate": {"threshold": 0.2, "count": "frames", "of": "prediction", "pooling": "frames"},
@@ -122,16 +116,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "temporal_misalignment": {"at": "extrema", "smoothing": 2.0, "frames_per_second": None},
     "upper_face_vertex_error": {"reduction": "mean", "squared": False, "pooling": "frames"},
 }
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_definition_without_options_stays(name: str) -> None:
-    found = defaults(registry.metric.get(name))
-    promised = DEFAULTS.get(name, {}) | {"sync_on_compute": True, "process_group": None}
-    promised |= {
-        option: value for option, value in {"length_rule": "min", "check_finite": True}.items() if option in found
-    }
-    assert {option: found.get(option) for option in promised} == promised
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -91,13 +91,6 @@ def test_smoothing_is_a_convolution_with_mirrored_ends(values: list[int], deviat
     assert smooth(series, 0.0) is series
 
 
-def test_smoothing_keeps_plateaus_exactly() -> None:
-    series = torch.cat([torch.full((40,), 0.1), torch.full((40,), 0.3)]).double()
-    found = smooth(series, 2.0)
-    assert len(set(found[:30].tolist())) == len(set(found[50:].tolist())) == 1
-    assert not extrema(found.tolist())
-
-
 @few
 @given(st.lists(st.integers(0, 2), min_size=1, max_size=12))
 def test_extrema_are_runs_above_or_below_their_neighbours(values: list[int]) -> None:
@@ -131,14 +124,3 @@ def test_lags_reach_the_neighbouring_extrema_and_the_ends_themselves() -> None:
         for column in range(1, 8):
             found = matched_lags([(row, column)], truth, turning(column, way))
             assert found == ([abs(row - column)] if column in reached else []), (row, column)
-
-
-def test_a_misalignment_says_its_unit_its_moments_and_its_smoothing() -> None:
-    said = [
-        TemporalMisalignment([(0, 1)], **options).describe()  # type: ignore[arg-type]
-        for options in ({}, {"frames_per_second": 25.0, "at": "path", "smoothing": 0.0})
-    ]
-    assert said[0].endswith("[frames]")
-    assert said[1].endswith("[ms]")
-    assert "smoothed over 2 frames), over pairs of like extrema;" in said[0]
-    assert "not smoothed), over all its pairs;" in said[1]

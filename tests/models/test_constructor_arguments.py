@@ -26,7 +26,6 @@ from facediff.data import SpeechMotionDataModule
 from facediff.data.parametric import FlameClips
 from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models import AnimationModel
-from facediff.models.samplers import NoiseProcess
 from facediff.registry import alias_path
 from facediff.utils.hints import defaults
 from facediff.utils.ranges import Range
@@ -237,12 +236,6 @@ def test_wild_arguments_of_a_corpus(
     assert draw(made, lambda **options: made(**{**needed, **options}), use, "data", values) == []
 
 
-@WILD
-@pytest.mark.parametrize("made", CALLBACKS, ids=lambda made: made.__name__)
-def test_wild_arguments_of_a_callback(made: type[Callback], values: Iterable[object]) -> None:
-    assert draw(made, made, lambda callback: None, made.__name__, values) == []
-
-
 @pytest.mark.parametrize(
     ("options", "named"),
     [
@@ -267,8 +260,3 @@ def test_arguments_that_do_not_go_together(options: dict[str, object], named: st
         registry.model.get("DualPathDiffusion")(**{**SIZES, **TINY, **MODELS["DualPathDiffusion"], **fixed, **options})
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301 - own bytes
     assert caught.value.sentence("--").startswith("--model.")
-
-
-def test_a_schedule_that_loses_the_signal_is_refused() -> None:
-    with pytest.raises(FaceDiffError, match="diffusion_steps 100000"):
-        NoiseProcess(100_000, "linear")

@@ -47,22 +47,6 @@ def test_decoder_frame_sees_past_and_future(decoder: nn.Module) -> None:
     assert reach(lambda x: decoder(x, STYLE, MASK)).all()
 
 
-def test_gru_of_one_direction_sees_the_past_only() -> None:
-    one_way = GruDecoder(dim=DIM, style_dim=6, num_layers=1, bidirectional=False).eval()
-    seen = reach(lambda x: one_way(x, STYLE, MASK))
-    assert torch.equal(seen, torch.ones(FRAMES, FRAMES).tril().bool())
-
-
-def test_decoder_does_not_see_padding(decoder: nn.Module) -> None:
-    mask = torch.arange(FRAMES)[None] < 8
-    assert not reach(lambda x: decoder(x, STYLE, mask))[:8, 8:].any()
-
-
-def test_decoder_does_not_depend_on_the_order_of_style_tokens(decoder: nn.Module) -> None:
-    x = torch.randn(1, FRAMES, DIM)
-    torch.testing.assert_close(decoder(x, STYLE.flip(1), MASK), decoder(x, STYLE, MASK), rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("part", [(kind, n) for kind in ("fusion", "decoder") for n in registry.KINDS[kind].names()])
 @pytest.mark.parametrize("clips", [(0, 1, 2, 3), (3,)], ids=["padded", "whole"])
 def test_prepare_changes_nothing(

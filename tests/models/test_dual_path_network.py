@@ -89,49 +89,6 @@ def test_step_table_is_kept_until_the_weights_change(make_model: Make) -> None:
     (first * torch.ones(DIM, requires_grad=True)).sum().backward()
 
 
-def test_prepared_conditions_leave_nothing_constant_to_a_step(make_model: Make, tiny: Tiny) -> None:
-    """Ten steps call as many maps of what is constant as one step does."""
-    calls: dict[str, int] = {}
-    sampler = partial(registry.sampler.ddim, steps=10)
-    model = make_model(decoder=partial(registry.decoder.style_transformer, num_layers=2), sampler=sampler)
-    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    network = model.eval().network
-    once = {
-        "speech's norm": network.fusion.audio_norm,
-        "speech's query": network.fusion.audio_from_motion.query,
-        "style's keys": network.decoder.blocks[0].style_attention.key_value,
-        "style's keys in the next block": network.decoder.blocks[1].style_attention.key_value,
-        "step": network.step_embedding.mlp,
-    }
-    watched: dict[str, nn.Module] = {**once, "motion's norm": network.fusion.motion_norm}
-    for name, module in watched.items():
-
-        def count(*_: object, name: str = name) -> None:
-            calls[name] = calls.get(name, 0) + 1
-
-        module.register_forward_hook(count)
-    batch = collate([tiny.dataset("val")[0]])
-    first = model.generate(batch)
-    assert calls == dict.fromkeys(once, 1) | {"motion's norm": 10}
-    calls.clear()
-    assert torch.equal(model.generate(batch), first)
-    assert calls.get("step", 0) == 0  # the table of the steps belongs to the model
-
-
-def test_training_works_after_inference_mode(make_model: Make, tiny: Tiny) -> None:
-    model = make_model()
-    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    batch = collate([tiny.dataset("val")[0]])
-    with torch.inference_mode():
-        before: Tensor = model.generate(batch)
-    model.losses(batch)["loss"].backward()
-    with torch.no_grad():
-        for parameter in model.network.step_embedding.parameters():
-            parameter.add_(0.5)
-    with torch.inference_mode():
-        assert not torch.allclose(model.generate(batch), before)
-
-
 @pytest.mark.parametrize("part", ["audio_encoder", "style_encoder", "fusion", "decoder"])
 def test_a_component_that_gives_another_shape_is_named(part: str, make_model: Make, tiny: Tiny) -> None:
     """In training and inference."""

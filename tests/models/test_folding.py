@@ -39,14 +39,6 @@ def test_fold_products(dim: int, coordinates: int, chunk: int, monkeypatch: pyte
     assert torch.linalg.eigvalsh(made.root).min() > -1e-7
 
 
-def test_fold_multiplies_float32_weights_in_float64() -> None:
-    first, last = ends(4, 20_000, torch.float32)
-    made = fold(first.weight.detach(), last.weight.detach(), last.bias.detach())
-    exact = (first.weight.double() @ last.weight.double()).float()
-    assert made.product.dtype == torch.float32
-    torch.testing.assert_close(made.product, exact, rtol=1e-6, atol=1e-9)
-
-
 CHANGES: dict[str, Callable[[nn.Linear, nn.Linear], object]] = {
     "in place": lambda first, _: first.weight.detach().mul_(1.001),
     # As weight averages are swapped: no version counter sees it.
@@ -228,26 +220,6 @@ def test_sampling_space_is_vertices_without_linear_ends(ready: Make, batch: Batc
     assert torch.equal(model.generate(batch), same.generate(batch))
 
 
-def test_folded_sampling_works_without_biases(ready: Make, batch: Batch) -> None:
-    model = ready().double()
-    model.network.embed.bias = model.network.unembed.bias = None
-    network, batch = model.network, cast(batch, torch.float64)
-    start = torch.randn(*batch.motion.shape[:2], 72, dtype=torch.float64)
-    with torch.no_grad():
-        plain = run(model, vertices(model, batch), lambda: start)
-        folded = run(model, choose(model, batch), lambda: start @ network.embed.weight.T)
-    torch.testing.assert_close(folded, plain, rtol=0, atol=1e-10)
-
-
-def test_sampling_space_is_vertices_for_a_sampler_that_is_not_linear(
-    ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = ready()
-    monkeypatch.setattr(type(model.sampler), "linear", False)
-    assert isinstance(choose(model, batch).space, VertexSpace)
-    assert model.generate(batch).shape == batch.motion.shape
-
-
 def test_sampler_that_is_wrongly_declared_linear_is_an_error(
     ready: Make, batch: Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,16 +239,6 @@ def test_generate_does_not_depend_on_the_other_clips_of_a_batch(ready: Make, tin
     for samples, place in (([short, long], 0), ([long, dataset[3], short], 2)):
         together = model.generate(collate(samples), seed=5)[place, : len(short.motion)]
         torch.testing.assert_close(together * model.scale, alone * model.scale, rtol=0, atol=1e-4)
-
-
-def test_folded_noise_is_independent_over_frames_and_zero_on_padding(ready: Make, batch: Batch) -> None:
-    space = choose(ready(), batch)
-    unit = torch.randn(*batch.motion.shape[:2], space.width) * batch.mask[..., None]
-    noise = space.noise(unit)
-    assert not noise[~batch.mask].any()
-    other = unit.clone()
-    other[:, 3] = 0
-    assert torch.equal((space.noise(other) != noise).any(-1).any(0).nonzero()[:, 0], torch.tensor([3]))
 
 
 def test_folded_sampling_follows_changed_weights(ready: Make, batch: Batch) -> None:

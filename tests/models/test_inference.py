@@ -13,8 +13,8 @@ from torch import Tensor
 
 from facediff.data import Batch, Sample, collate
 from facediff.models.audio_encoders import AudioEncoder
-from facediff.models.inference import ClipNoise, Inference, SpeechStream, WindowNoise, with_speech
-from facediff.speech.windows import FramePlan, MotionWindow, WindowPlan
+from facediff.models.inference import ClipNoise, Inference, SpeechStream, WindowNoise
+from facediff.speech.windows import MotionWindow, WindowPlan
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
 HOP, FRAMES, SHARED, BEFORE, AFTER = 20, 30, 10, 12, 5
@@ -99,14 +99,6 @@ def test_long_speech_is_the_loop_over_windows(frames: int, loudness: float) -> N
     np.testing.assert_allclose(made.numpy(), wanted, rtol=1e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("wanted", [59, 61, 64])
-def test_long_speech_may_be_told_how_many_frames_it_lasts(wanted: int) -> None:
-    """Speech that is a little too short or too long for its frames is padded or cut."""
-    speech = 0.2 * np.random.default_rng(0).standard_normal(60 * 640)
-    made = torch.cat(list(SpeechStream(Echo(), clip()).parts(torch.from_numpy(speech).float(), frames=wanted)), 1)
-    np.testing.assert_allclose(made[0, :, 0, 0].numpy(), expected(speech, wanted), rtol=1e-3, atol=2e-3)
-
-
 @pytest.mark.parametrize(("samples", "seconds"), [(30 * 640, 2), (32_000, 2), (32_001, 3), (640, 1)])
 def test_long_speech_is_heard_by_the_second(samples: int, seconds: int) -> None:
     """A recording is fed as from a microphone, second by second, which is what progress counts."""
@@ -125,16 +117,6 @@ def test_long_speech_is_heard_by_the_second(samples: int, seconds: int) -> None:
     assert heard == [min(16_000, samples - 16_000 * second) for second in range(seconds)]
 
 
-def test_a_window_of_speech_keeps_the_face_and_has_motion_of_zeros() -> None:
-    known = clip()
-    heard = with_speech(known, torch.ones(3200), 5)
-    assert heard.motion.shape == (1, 5, 2, 3)
-    assert not heard.motion.any()
-    assert (heard.audio.shape, heard.audio_lengths.tolist(), heard.frame_lengths.tolist()) == ((1, 3200), [3200], [5])
-    assert heard.mask.tolist() == [[True] * 5]
-    assert heard.template is known.template
-
-
 def test_a_microphones_noise_is_not_amplified() -> None:
     """Below the deviation of a quiet room the level is that of the room."""
     speech = 1e-4 * np.random.default_rng(0).standard_normal(30 * 640)
@@ -142,22 +124,6 @@ def test_a_microphones_noise_is_not_amplified() -> None:
     made = torch.cat([stream.feed(torch.from_numpy(speech).float()), stream.finish()], 1)[0, :, 0, 0].numpy()
     # 0.1 a frame from where it lies; the speech itself adds next to nothing.
     np.testing.assert_allclose(made, 0.1 * np.arange(30) + 0.003 * 30, rtol=0, atol=1e-2)
-
-
-def test_windows_lie_a_hop_apart() -> None:
-    plan = PLAN.in_frames(25.0)
-    assert plan == FramePlan(FRAMES, SHARED, BEFORE, AFTER)
-    assert plan.hop == HOP
-    windows = [MotionWindow(plan, index, FRAMES) for index in range(4)]
-    assert [(w.start, w.end, w.context, w.shared, w.kept) for w in windows] == [
-        (0, 30, 0, 0, 10),
-        (20, 50, 12, 10, 10),
-        (40, 70, 12, 10, 10),
-        (60, 90, 12, 10, 10),
-    ]
-    assert MotionWindow(plan, 1, 7).end == 27
-    assert [PLAN.in_one_pass(frames, 25.0) for frames in (50, 51)] == [True, False]
-    assert PLAN.look_ahead == pytest.approx(1.4)
 
 
 def test_clip_noise_is_unit_gaussian_by_name_and_seed() -> None:

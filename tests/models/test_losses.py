@@ -83,17 +83,6 @@ def test_loss_against_numpy(name: str, lengths: tuple[int, ...], extra: int) -> 
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_loss_in_float32_does_not_depend_on_padding(name: str) -> None:
-    truths, predictions = clips((6,), 2), clips((6,), 3)
-    values = []
-    for extra in (0, 1, 5):
-        (truth, mask), (prediction, _) = pad(truths, extra), pad(predictions, extra)
-        prediction[~mask] *= -1
-        values.append(loss(name, prediction.float(), truth.float(), mask))
-    torch.testing.assert_close(values[1:], [values[0]] * 2, rtol=2e-7, atol=0)
-
-
-@pytest.mark.parametrize("name", REFERENCES)
 def test_loss_gradient_is_that_of_the_formula_and_zero_on_padding(name: str) -> None:
     truths, predictions = clips((5, 3), 4), clips((5, 3), 5)
     (truth, mask), (prediction, _) = pad(truths, 2), pad(predictions, 2)
@@ -141,14 +130,6 @@ def test_face_loss_sees_its_region_only() -> None:
     assert torch.equal(loss("face", prediction, truth, mask), before)
     prediction[:, 0, REGION[0]] += 1
     assert not torch.equal(loss("face", prediction, truth, mask), before)
-
-
-def test_face_loss_compares_deviations_not_positions() -> None:
-    (truth, mask) = pad(clips((8,), 10))
-    assert loss("face", truth.flip(1), truth, mask).item() == pytest.approx(0, abs=1e-12)
-    assert loss("face", truth * 3, truth, mask).item() == pytest.approx(
-        2 * np.linalg.norm(truth[0].numpy(), axis=-1)[:, REGION].std(axis=0).mean()
-    )
 
 
 WEIGHTS = {"reconstruction": 1.0, "velocity": 0.3, "acceleration": 0.7, "face": 0.5}
@@ -266,14 +247,6 @@ def test_fused_losses_have_finite_gradients_without_any_motion() -> None:
     terms["loss"].backward()
     assert torch.isfinite(features.grad).all()
     assert torch.isfinite(bias.grad).all()
-
-
-def test_fused_losses_in_float32_do_not_depend_on_padding() -> None:
-    found = []
-    for extra in (0, 1, 5):
-        *parts, truth, mask = linear_parts((6, 4), extra, torch.float32)
-        found.append(losses_fused.fused_losses(*parts, truth, mask, torch.tensor(REGION), WEIGHTS))
-    torch.testing.assert_close(found[1:], [found[0]] * 2, rtol=5e-7, atol=0)
 
 
 def test_fused_losses_in_bfloat16_predict_in_full_precision() -> None:

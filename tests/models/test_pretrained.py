@@ -18,7 +18,7 @@ from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.checkpoint import checked_file, read_assets, read_checkpoint
-from facediff.models.pretrained import coded, decoded, read_model, stored_once, write_model
+from facediff.models.pretrained import coded, decoded, stored_once
 from facediff.utils.licences import Licence, commercial_use
 from facediff.utils.torch_files import read_safetensors
 from tests.fakes.tiny import Tiny, write_tiny
@@ -89,12 +89,6 @@ def test_the_weights_are_the_averaged_ones_and_nothing_of_the_training(checkpoin
     }
 
 
-def test_every_file_has_the_permissions_of_other_files(published: Path, tmp_path: Path) -> None:
-    (tmp_path / "usual").touch()
-    usual = (tmp_path / "usual").stat().st_mode
-    assert all(path.stat().st_mode == usual for path in published.iterdir())
-
-
 def test_no_path_of_this_machine_leaves_it(checkpoint: Path, published: Path) -> None:
     words = (published / "config.json").read_text() + (published / "README.md").read_text()
     assert str(checkpoint.parent) not in words
@@ -131,17 +125,6 @@ def test_equal_tensors_are_stored_once(checkpoint: Path, published: Path) -> Non
         **json.loads((published / "config.json").read_text())["shared"],
     }
     assert total.keys() == torch.load(checkpoint, weights_only=True)["state_dict"].keys()
-
-
-def test_half_leaves_a_buffer_that_equals_a_parameter_as_it_is(checkpoint: Path, tmp_path: Path) -> None:
-    model = load_model(checkpoint)
-    values = torch.linspace(0, 1, 1000)
-    model.network.step_embedding.register_buffer("constant", values)
-    model.network.embed.weight = torch.nn.Parameter(values.clone())
-    write_model(model, tmp_path, half=True)
-    written = read_model(tmp_path)["state_dict"]
-    torch.testing.assert_close(written["network.embed.weight"], values.half(), rtol=0, atol=0)
-    torch.testing.assert_close(written["network.step_embedding.constant"], values, rtol=0, atol=0)
 
 
 def test_half_is_smaller_and_near(checkpoint: Path, published: Path, tmp_path: Path) -> None:
@@ -248,14 +231,6 @@ def test_the_card_states_licence_data_and_scores_with_their_conditions(checkpoin
         "corpus tiny",
     ):
         assert word in body
-
-
-@pytest.mark.parametrize("text", ["a,b\n1,2\n", "", "split,method,protocol,frames,lve\na,model,p,3,<script>\n"])
-def test_scores_of_another_form_are_refused_and_nothing_is_written(checkpoint: Path, tmp_path: Path, text: str) -> None:
-    (tmp_path / "odd.csv").write_text(text)
-    with pytest.raises(FaceDiffError, match="odd.csv"):
-        load_model(checkpoint).save_pretrained(tmp_path / "out", scores=tmp_path / "odd.csv")
-    assert {path.name for path in tmp_path.iterdir()} == {"odd.csv"}
 
 
 def test_a_folder_with_content_is_not_replaced(checkpoint: Path, copy: Path) -> None:

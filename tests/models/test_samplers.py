@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from facediff import registry
-from facediff.errors import FaceDiffError
 from facediff.models import samplers
-from facediff.models.samplers import SCHEDULES, DdimSampler, DpmSolverSampler, NoiseProcess, Sampler, unit_noise
+from facediff.models.samplers import SCHEDULES, DpmSolverSampler, NoiseProcess, Sampler, unit_noise
 
 
 @pytest.mark.parametrize("steps", [10, 1000])
@@ -64,15 +63,6 @@ def test_add_noise_is_the_product_of_single_steps(schedule: str) -> None:
         assert noise[n] ** 2 == pytest.approx(variance, rel=2e-3)
 
 
-def test_add_noise_takes_each_clips_own_step() -> None:
-    process = NoiseProcess(30)
-    clean, noise, step = torch.randn(3, 4, 6), torch.randn(3, 4, 6), torch.tensor([29, 0, 11])
-    together = process.add_noise(clean, noise, step)
-    for i in range(3):
-        kept = process.signal[step[i]]
-        torch.testing.assert_close(together[i], kept.sqrt() * clean[i] + (1 - kept).sqrt() * noise[i])
-
-
 def test_steps_are_drawn_in_proportion_to_their_weights() -> None:
     process, weights = NoiseProcess(10), torch.arange(1.0, 11.0)
     torch.manual_seed(0)
@@ -119,19 +109,6 @@ def test_unit_noise_does_not_depend_on_the_number_of_threads(monkeypatch: pytest
     assert not torch.equal(found[0], unit_noise((3, 7, 50), torch.device("cpu"), torch.Generator().manual_seed(6)))
     with torch.inference_mode():
         assert torch.equal(found[0], unit_noise((3, 7, 50), torch.device("cpu"), torch.Generator().manual_seed(5)))
-
-
-def test_unit_noise_is_many_streams_whose_seeds_come_from_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Equal seeds give equal noise in every version, so the parts and their seeds are part of the definition."""
-    monkeypatch.setattr(samplers, "PART", 100)
-    made = unit_noise((3, 7, 50), torch.device("cpu"), torch.Generator().manual_seed(5))
-    seeds = torch.randint(2**63 - 1, (11,), generator=torch.Generator().manual_seed(5)).tolist()
-    sizes = [100] * 10 + [50]
-    parts = [
-        torch.empty(size).normal_(generator=torch.Generator().manual_seed(seed))
-        for size, seed in zip(sizes, seeds, strict=True)
-    ]
-    assert torch.equal(made.flatten(), torch.cat(parts))
 
 
 def test_unit_noise_is_unit_gaussian_with_independent_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,16 +194,6 @@ def test_spread_takes_samples_twice_that_factor_further_from_the_mean() -> None:
         torch.testing.assert_close(wide - mean, spread**2 * (plain - mean), rtol=0.01, atol=0.01)
     once = DpmSolverSampler(process=process, steps=1, spread=1.3).run(predict, start)
     torch.testing.assert_close(once, predict(start, 999))
-
-
-@every_sampler
-def test_sampler_repeats_a_seed_bit_for_bit_whatever_the_global_state(name: str) -> None:
-    start = torch.randn(2, 3, 4)
-    runs = []
-    for state in (1, 2):
-        torch.manual_seed(state)
-        runs.append(trace(make(name, NoiseProcess(20), steps=10), lambda x, _: 0.5 * x.tanh(), start, seed=3)[1][-1])
-    assert torch.equal(*runs)
 
 
 @pytest.mark.parametrize("steps", [20, 7])
@@ -392,12 +359,6 @@ def test_log_snr_spacing_is_even_in_the_solvers_time(scale: float, steps: int, f
     assert (np.abs(times - even) <= nearest + 0.05)[1:][even[1:] > every[990]].all()
 
 
-@pytest.mark.parametrize("options", [{"spacing": "steps"}, {"spacing": "log_snr", "last_noise": 50.0}])
-def test_the_first_noise_is_for_log_snr_and_above_the_last(options: dict[str, object]) -> None:
-    with pytest.raises(FaceDiffError, match="first_noise"):
-        DdimSampler(process=NoiseProcess(), first_noise=40.0, **options)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("name", ["ddim", "dpm_solver", "ddpm"])
 @pytest.mark.parametrize("spacing", ["steps", "log_snr"])
 @pytest.mark.parametrize("steps", [1, 2, 60, 600])
@@ -417,20 +378,3 @@ def test_any_spacing_visits_each_step_once(name: str, spacing: str, steps: int, 
         ),
         torch.ones(2, 3),
     )
-
-
-def test_sampler_of_another_package_implements_update_alone() -> None:
-    """It gets the latest predictions, the present one last, and as many as it asks for."""
-
-    class Averaging(Sampler):
-        memory = 2
-
-        def update(
-            self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: Callable[[Tensor], Tensor]
-        ) -> Tensor:
-            assert [float(prediction) for prediction in predictions] == self.timesteps[max(0, i - 1) : i + 1]
-            return torch.stack(list(predictions)).mean(0)
-
-    sampler = Averaging(NoiseProcess(20), steps=4)
-    assert sampler.timesteps == [19, 14, 9, 4]
-    assert float(sampler.run(lambda _, step: torch.tensor(float(step)), torch.tensor(0.0))) == 6.5

@@ -117,24 +117,6 @@ def test_several_processes_give_every_hubert_weight_a_gradient(
     assert [name for name, value in encoder.named_parameters() if value.requires_grad and value.grad is None] == []
 
 
-@pytest.mark.parametrize("frames", [1, 2, 13, 50])
-def test_hubert_has_two_steps_for_every_frame(hubert_source: Path, frames: int) -> None:
-    encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
-    steps: list[int] = []
-    encoder.hubert.feature_projection.register_forward_pre_hook(lambda _, args: steps.append(args[0].shape[1]))
-    assert encoder(*clip(frames)).shape == (1, frames, 8)
-    assert steps == [2 * frames]
-
-
-def test_hubert_encodes_clips_of_equal_length_together(hubert_source: Path) -> None:
-    encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
-    sizes: list[tuple[int, ...]] = []
-    encoder.hubert.feature_extractor.register_forward_pre_hook(lambda _, args: sizes.append(tuple(args[0].shape)))
-    lengths = torch.tensor([3, 5, 3])
-    encoder(torch.randn(3, 5 * 640), lengths * 640, lengths)
-    assert sorted(sizes) == [(1, 5 * 640 + 80), (2, 3 * 640 + 80)]
-
-
 def test_hubert_convolutions_keep_time(hubert_source: Path) -> None:
     """The centre of what a step hears is the centre of its own 320 samples."""
     encoder = HubertEncoder(dim=8, source=str(hubert_source)).eval()
@@ -173,11 +155,6 @@ def test_hubert_reads_pretrained_weights(hubert_source: Path) -> None:
     stored = load_file(hubert_source / "model.safetensors")
     state = HubertEncoder(dim=8, source=str(hubert_source)).hubert.state_dict()
     assert all(torch.equal(state[name], value) for name, value in stored.items())
-
-
-def test_hubert_missing_directory_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"no directory .*/absent; expected one with config.json"):
-        HubertEncoder(dim=8, source=str(tmp_path / "absent"))
 
 
 def edit(key: str, value: object) -> Change:

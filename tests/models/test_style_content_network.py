@@ -137,12 +137,6 @@ def test_the_speech_branch_asks_with_the_middle_step(window: int, ratio: float, 
         np.testing.assert_allclose(made[frame], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_a_layer_of_windows_widens_twice_in_its_feed_forward_part() -> None:
-    part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=3, num_heads=2, num_layers=1)
-    weights = part.layers[0].feed_forward.parameters()
-    assert {tuple(weight.shape) for weight in weights if weight.ndim == 2} == {(16, 8), (8, 16)}
-
-
 def test_windows_of_any_number_of_clips_become_a_graph() -> None:
     """The exporter must not take the number of clips that it was shown for a constant."""
 

@@ -70,27 +70,6 @@ def test_training_asks_the_data_for_what_the_options_say(
     assert not model.alignment_allowed()
 
 
-@pytest.mark.parametrize(("weight", "pairs", "noted"), [(1.0, True, False), (1.0, False, True), (0.0, False, False)])
-def test_a_weight_without_effect_is_noted(
-    tmp_path: Path,
-    make_trainer: MakeTrainer,
-    capsys: pytest.CaptureFixture[str],
-    weight: float,
-    pairs: bool,
-    noted: bool,
-) -> None:
-    """The gap between the inner lips needs a file that says which vertices they are."""
-    root = write_tiny(tmp_path / "tiny", sentences=5)
-    if not pairs:
-        (root / "regions" / "inner_lip_pairs.txt").unlink()
-    model, trainer = make(lip_gap_weight=weight), make_trainer()
-    model.trainer, trainer.datamodule = trainer, Tiny(root=str(root))  # type: ignore[attr-defined]
-    model.setup("fit")
-    assert ("lip_gap_weight" in capsys.readouterr().out) == noted
-    model.setup("validate")
-    assert "lip_gap_weight" not in capsys.readouterr().out
-
-
 def test_a_new_basis_starts_from_principal_components_and_a_trained_one_stays(
     tiny_root: Path, make_trainer: MakeTrainer
 ) -> None:
@@ -125,13 +104,6 @@ def test_an_epoch_takes_as_many_windows_as_it_should() -> None:
     assert len(list(batches)) == len(batches)
     once = [ClipBatches([9] * 6, batch_size=4, training=True, groups=groups, copies=each) for each in (None, [1] * 6)]
     assert list(once[0]) == list(once[1])
-
-
-def test_windows_that_fill_a_clip(tiny_root: Path) -> None:
-    data = Tiny(root=str(tiny_root), batch_size=2, window=8, windows_per_clip=None)
-    data.train_dataloader()
-    frames = [data.corpus.frames(clip) for clip in data.clips("train")]
-    assert sum(len(batch) for batch in data.train_dataloader()) == sum(-(-count // 8) for count in frames)
 
 
 def test_masks_may_be_left_out_of_others(tmp_path: Path) -> None:

@@ -70,21 +70,6 @@ def test_a_vector_of_another_model_is_refused(
         read_style(str(path), "B", model)
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("F1_e03", [("F1_e03", None)]),
-        ("a.npy:0.3,b.npy:0.7", [("a.npy", 0.3), ("b.npy", 0.7)]),
-        (r"C:\ann\x.npy", [(r"C:\ann\x.npy", None)]),
-        (r"C:\ann\x.npy:-.5,D:/y.npy:1.5e0", [(r"C:\ann\x.npy", -0.5), ("D:/y.npy", 1.5)]),
-        ("take:2.npy, other.npz : 2", [("take:2.npy", None), ("other.npz", 2.0)]),
-        ("a,b,c", [("a", None), ("b", None), ("c", None)]),
-    ],
-)
-def test_weights_are_read_from_the_right(words: str, expected: list[tuple[str, float | None]]) -> None:
-    assert split_styles(words) == [Weighted(*pair) for pair in expected]
-
-
 def test_what_is_a_file_or_a_clip_as_a_whole_is_one_style(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one, two.npy").touch()

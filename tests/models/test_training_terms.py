@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -78,12 +76,6 @@ def test_losses_draw_a_step_for_each_clip_and_unit_noise(
     assert not torch.equal(noise[0, 0], noise[0, 1])
 
 
-def test_losses_follow_their_generator(model: DualPathDiffusion, batch: Batch) -> None:
-    first, again, other = (model.losses(batch, torch.Generator().manual_seed(seed))["loss"] for seed in (1, 1, 2))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-
-
 def test_losses_change_with_each_clips_step(model: DualPathDiffusion, batch: Batch) -> None:
     """The step embedding is not the only place: the motion is noised by the clip's own step."""
     noise = torch.randn(8, batch.motion.shape[1], 3 * VERTICES)
@@ -127,12 +119,6 @@ def test_the_style_path_sees_scaled_motion(model: DualPathDiffusion, batch: Batc
     torch.testing.assert_close(seen[1], seen[0])
 
 
-def test_a_batchs_own_styles_replace_its_references(model: DualPathDiffusion, batch: Batch) -> None:
-    style = torch.randn(8, 16)
-    made = model.conditions(replace(batch, style=style)).style[:, -1]
-    torch.testing.assert_close(made, model.network.style_tokens.projections[-1](style))
-
-
 class StopError(Exception):
     """Ends sampling at its first state."""
 
@@ -160,23 +146,6 @@ def test_sampling_starts_from_unit_noise(make_model: Make, tiny: Tiny, batch: Ba
         assert float((flat.T @ flat / len(flat) - expected).abs().max()) < 7 * size / len(flat) ** 0.5
     assert not torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
-
-
-@pytest.mark.parametrize("space", ["vertices", "components"])
-def test_samples_are_in_the_corpus_unit(make_model: Make, tiny: Tiny, batch: Batch, space: str) -> None:
-    """What the sampler ends with is divided by the scale that training multiplies by."""
-    model = in_components(make_model, tiny) if space == "components" else known(make_model(sampling_space=space), tiny)
-    clean = model.motion_space.encode(SCALE * batch.motion)
-    model.sampler.run = lambda *_, **__: clean  # type: ignore[method-assign, assignment]
-    made = model.generate(batch)[batch.mask]
-    expected = batch.motion
-    if space == "components":
-        basis, mean = (
-            part.double().numpy() for part in (model.motion_space.components.basis, model.motion_space.components.mean)
-        )
-        offsets = SCALE * batch.motion.double().numpy().reshape(-1, 3 * VERTICES) - mean
-        expected = torch.from_numpy((offsets @ basis.T @ basis + mean) / SCALE).view(batch.motion.shape)
-    torch.testing.assert_close(made.double(), expected[batch.mask].double(), rtol=1e-4, atol=1e-6)
 
 
 def test_losses_in_components_are_their_formulas(make_model: Make, tiny: Tiny, batch: Batch) -> None:
@@ -212,14 +181,6 @@ def test_losses_in_components_are_their_formulas(make_model: Make, tiny: Tiny, b
         assert float(found[name].detach()) == pytest.approx(terms[name], rel=1e-3)
     loss = sum(model.loss_weights[name] * value for name, value in terms.items())
     assert float(found["loss"].detach()) == pytest.approx(loss, rel=1e-3)
-
-
-def test_training_in_components_starts_from_the_posterior_mean(make_model: Make) -> None:
-    space = partial(registry.motion_space.components, count=6)
-    network = make_model(motion_space=space).network
-    assert not network.unembed.weight.any()
-    assert not network.unembed.bias.any()
-    assert make_model().network.unembed.weight.any()
 
 
 @pytest.mark.parametrize("form", ["levels", "single"])
@@ -260,32 +221,6 @@ def test_conditions_are_of_eq_14_and_keep_to_their_clips(model: DualPathDiffusio
     assert torch.equal(part.audio, conditions.audio[:, 2:5])
     assert torch.equal(part.mask, conditions.mask[:, 2:5])
     assert torch.equal(part.style, conditions.style)
-
-
-def test_kept_features_of_speech_stand_for_the_speech(make_model: Make, tiny: Tiny, hubert_source: Path) -> None:
-    """The frozen part of the audio encoder is not asked again where its features came with the batch."""
-    encoder = partial(registry.audio_encoder.hubert, source=str(hubert_source))
-    model = known(make_model(audio_encoder=encoder), tiny)
-    batch = collate([tiny.dataset("train")[place] for place in (0, 7)])
-    hears = model.network.audio_encoder
-    with torch.no_grad():
-        features, steps = hears.frozen_features(batch.audio, batch.audio_lengths)
-        kept = replace(batch, features=features, feature_lengths=steps)
-        heard = model.conditions(batch).audio
-        hears.frozen_features = None  # type: ignore[method-assign, assignment]
-        assert torch.equal(model.conditions(kept).audio, heard)
-        other = model.conditions(replace(kept, features=features.roll(1, 1))).audio
-    assert not torch.allclose(other, heard, atol=1e-3)
-
-
-def test_personal_modules_are_identity_and_style(model: DualPathDiffusion, make_model: Make) -> None:
-    network = model.network
-    parts: list[Any] = [network.identity_encoder, network.mesh_encoder, network.style_encoder, network.style_tokens]
-    assert model.personal_modules() == parts
-    bare = make_model(style_encoder=registry.style_encoder.none)
-    assert bare.network.mesh_encoder is None
-    names = ("identity_encoder", "style_encoder", "style_tokens")
-    assert bare.personal_modules() == [getattr(bare.network, name) for name in names]
 
 
 def test_without_a_seed_it_is_zero(model: DualPathDiffusion, batch: Batch) -> None:
