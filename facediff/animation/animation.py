@@ -24,8 +24,9 @@ from facediff.mesh.flame import rotations
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.space import metres_per_unit as metres_per_unit
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import check_number
 from facediff.utils.lazy import late
-from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, check_number, in_range
+from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, in_range
 
 MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are released
 OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"

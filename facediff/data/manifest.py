@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import FRAME_RATES, check_format, check_number, quoted
+from facediff.utils.hints import check_number
+from facediff.utils.limits import FRAME_RATES, check_format, quoted
 from facediff.utils.plain_files import load_json
 
 FORMAT = 1

@@ -27,9 +27,10 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import check_number
 from facediff.utils.hub import EXPECTED_TO_ANIMATE, check_animating_source, is_audio2face, is_exported, model_or_bundled
 from facediff.utils.licences import Commercial, commercial_use, in_words
-from facediff.utils.limits import SAMPLE_RATES, check_number
+from facediff.utils.limits import SAMPLE_RATES
 
 if TYPE_CHECKING:
     import numpy as np

@@ -19,8 +19,9 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, choices
 from facediff.runtime.audio2face_folder import REMEDY, SAMPLE_RATE, Audio2FaceFolder, read_audio2face
 from facediff.runtime.graphs import open_session, run_session
+from facediff.utils.hints import check_number
 from facediff.utils.licences import Licence
-from facediff.utils.limits import FRAME_RATES, check_number, quoted
+from facediff.utils.limits import FRAME_RATES, quoted
 
 if TYPE_CHECKING:
     import onnxruntime  # type: ignore[import-untyped]

@@ -287,6 +287,45 @@ def read(hint: Any, word: str) -> Any:  # noqa: ANN401 - a type hint and its val
     raise ValueError(describe(hint))
 
 
+def check_number(
+    source: object,
+    name: str,
+    value: object,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    whole: bool = False,
+    text: bool = False,
+    remedy: str = "",
+) -> float:
+    """A number that a file states, if it lies in a range.
+
+    Args:
+        source: the file, for the message.
+        name: the number's name in the file.
+        value: what the file holds.
+        low: smallest allowed number.
+        high: largest allowed number.
+        whole: whether it must be a whole number.
+        text: whether the file holds it as text, as tables do.
+        remedy: what the message advises.
+
+    Example:
+        >>> check_number("manifest.json", "frame_rate", 25, 0.1, 1000)
+        25.0
+    """
+    number = value
+    if text and isinstance(value, str):
+        number = float(value) if _DECIMAL.fullmatch(value.strip()) else value
+    with suppress(OverflowError):  # a whole number that no float holds
+        if number in Range(low, high) and (not whole or number == int(number)):  # type: ignore[call-overload]
+            return float(number)  # type: ignore[arg-type]
+    advice = f"; {remedy}" if remedy else ""
+    raise FaceDiffError(
+        f"{source}: {name} is {quoted(value)}; expected {Range(low, high).numbers(whole=whole)}{advice}"
+    )
+
+
 # Texts.
 
 

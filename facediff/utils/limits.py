@@ -7,7 +7,6 @@ A file of a few kilobytes can declare sizes of terabytes. Every reader compares 
 from __future__ import annotations
 
 import math
-import numbers
 import os
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -112,59 +111,6 @@ def brief(error: object) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     text = "".join(character if character.isprintable() else "?" for character in text)
     return text if len(text) <= 2 * WORDS_SHOWN else f"{text[: 2 * WORDS_SHOWN - 1]}…"
-
-
-def check_number(
-    source: object,
-    name: str,
-    value: object,
-    low: float = -math.inf,
-    high: float = math.inf,
-    *,
-    whole: bool = False,
-    text: bool = False,
-    remedy: str = "",
-) -> float:
-    """A number that a file (or an option) gives, once it is known to be one, finite and in range.
-
-    Every number that enters from outside passes here, so that no reader forgets one of NaN, infinity, a truth value,
-    a text, or a whole number that no float holds.
-
-    Args:
-        source: the file, for the message.
-        name: the number's name in the file.
-        value: what the file holds.
-        low: smallest allowed number.
-        high: largest allowed number.
-        whole: whether it must be a whole number.
-        text: whether the file holds it as text, as tables do.
-        remedy: what the message advises.
-
-    Returns:
-        the number; ``int`` of it is exact where ``whole`` is given.
-
-    Example:
-        >>> check_number("manifest.json", "frame_rate", 25, *FRAME_RATES)
-        25.0
-    """
-    number = math.nan
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if real or (text and isinstance(value, str)):
-        try:
-            number = float(value)  # type: ignore[arg-type]
-        except (ValueError, OverflowError):
-            number = math.nan
-    if not (math.isfinite(number) and low <= number <= high and (not whole or number == int(number))):
-        kind = "a whole number" if whole else "a number"
-        if math.isfinite(low) and math.isfinite(high):
-            bounds = f" from {low:.10g} to {high:.10g}"
-        elif math.isfinite(low) or math.isfinite(high):
-            bounds = f" of at least {low:.10g}" if math.isfinite(low) else f" of at most {high:.10g}"
-        else:
-            bounds = ", neither infinite nor NaN"
-        advice = f"; {remedy}" if remedy else ""
-        raise FaceDiffError(f"{source}: {name} is {quoted(value)}; expected {kind}{bounds}{advice}")
-    return number
 
 
 def check_format(source: object, stated: object, expected: str | int) -> None:

@@ -90,33 +90,10 @@ def test_scores_next_to_the_checkpoint_are_on_the_card_unless_older(
     assert "test_scores.csv" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "named"),
-    [("0.25", ".", "its lve is '.'"), ("0.25", "1.2.5", "its lve is '1.2.5'"), (",paper,33,2\n", "\n", "row 2")],
-)
-def test_a_damaged_table_of_scores_is_refused(tmp_path: Path, old: str, new: str, named: str) -> None:
-    (tmp_path / "scores.csv").write_text(SCORES.replace(old, new))
-    with pytest.raises(FaceDiffError, match=named):
+def test_a_damaged_table_of_scores_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "scores.csv").write_text(SCORES.replace("0.25", "1.2.5"))
+    with pytest.raises(FaceDiffError, match=r"its lve is '1\.2\.5'"):
         read_scores(tmp_path / "scores.csv")
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--private"], "--private"),
-        (["--push", "nobody"], "--push"),
-        (["--push", "a/b@v1"], "--push"),
-        (["--license", "${oc.env:HOME}"], "--license"),
-        (["--languages", "Klingon!"], "--languages"),
-        (["--scores", "nowhere.csv"], "nowhere.csv"),
-    ],
-)
-def test_wrong_options_are_named_and_nothing_is_written(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], named: str
-) -> None:
-    assert main(["publish", str(checkpoint), str(tmp_path / "out"), *words]) == 2
-    assert named in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_with_content_and_a_missing_model_are_refused(

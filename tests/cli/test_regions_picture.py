@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -59,27 +57,13 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
     assert "from mine.txt, 2 repeated indices counted once" in printed
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words", "printed"),
-    [
-        (lambda root: (root / "tiny.ply").unlink(), [], "put tiny.ply into this folder"),
-        (lambda root: (root / "regions" / "fdd.txt").unlink(), [], "vertices of the upper face"),
-        (lambda root: None, ["--lips", "none.txt"], "none.txt"),
-        (lambda root: (root / "regions" / "lve.txt").write_text("1, 24"), [], "24 vertices ends at 23"),
-        (lambda root: None, ["-o", "regions.jpg"], "regions.jpg"),
-        (lambda root: None, ["--corpus", "biwy"], 'there is no "biwy": did you mean "biwi"'),
-        (shutil.rmtree, [], "no such folder"),
-    ],
-)
-def test_what_is_missing_is_named_and_nothing_written(
-    root: Path, tmp_path: Path, spoil: Callable[[Path], object], words: list[str], printed: str
-) -> None:
-    spoil(root)
-    every = ["-o", str(tmp_path / "regions.png"), *TINY, *words]
-    given = dict(zip(every[::2], every[1::2], strict=True))  # the last word on an option counts
-    with pytest.raises(FaceDiffError) as error:
-        run("data regions", [str(root), *chain.from_iterable(given.items())])
-    assert printed in str(error.value)
+def test_what_is_missing_is_named_and_nothing_written(root: Path, tmp_path: Path) -> None:
+    (root / "regions" / "lve.txt").write_text("1, 24")
+    with pytest.raises(FaceDiffError, match="24 vertices ends at 23"):
+        run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY])
+    (root / "tiny.ply").unlink()
+    with pytest.raises(FaceDiffError, match=r"put tiny\.ply into this folder"):
+        run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY])
     assert not list(tmp_path.glob("*.*"))
 
 

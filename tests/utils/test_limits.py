@@ -10,16 +10,8 @@ import numpy as np
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.utils.limits import (
-    FRAME_RATES,
-    LIMITS,
-    Limits,
-    check_array,
-    check_format,
-    check_nesting,
-    check_number,
-    quoted,
-)
+from facediff.utils.hints import check_number
+from facediff.utils.limits import FRAME_RATES, LIMITS, Limits, check_array, check_format, check_nesting, quoted
 
 HUGE = 10**6000
 """More digits than Python agrees to write."""

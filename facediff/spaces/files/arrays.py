@@ -19,7 +19,8 @@ from facediff.spaces.layouts import LAYOUTS, Layout, find_layout, layouts_of_wid
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.files import atomic
 from facediff.utils.hdf5 import HDF5_SUFFIXES, read_frames
-from facediff.utils.limits import FRAME_RATES, check_number
+from facediff.utils.hints import check_number
+from facediff.utils.limits import FRAME_RATES
 
 RELEASE = "flame_3dmead_release"
 RELEASE_WIDTHS = {"shape": 300, "exp": 100, "global_pose": 3, "jaw": 3}

@@ -14,7 +14,8 @@ from facediff.spaces.files.clips import ParameterClip, checked
 from facediff.spaces.files.tables import rate_of
 from facediff.spaces.layouts import LAYOUTS, layout
 from facediff.spaces.space import Space
-from facediff.utils.limits import FRAME_RATES, check_number, quoted
+from facediff.utils.hints import check_number
+from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json, write_json
 
 REMEDY = "expected names and frames with weights, as BEAT and LAM write them"

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.spaces.operations import at_times
 from facediff.spaces.space import Space
-from facediff.utils.limits import FRAME_RATES, check_number
+from facediff.utils.hints import check_number
+from facediff.utils.limits import FRAME_RATES
 
 Values = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
