@@ -235,8 +235,8 @@ model = Kind(
     "facediff.models.dual_path "
     "facediff.models.style_content "
     "facediff.models.published.artalk "
-    "facediff.models.published.codetalker facediff.models.published.codetalker_checkpoints "
-    "facediff.models.published.diffposetalk facediff.models.published.diffposetalk_checkpoints "
+    "facediff.models.published.codetalker "
+    "facediff.models.published.diffposetalk "
     "facediff.models.published.diffspeaker "
     "facediff.models.published.emotalk "
     "facediff.models.published.facediffuser "
@@ -244,7 +244,7 @@ model = Kind(
     "facediff.models.published.lam "
     "facediff.models.published.selftalk "
     "facediff.models.published.talkingstyle "
-    "facediff.models.published.unitalker facediff.models.published.unitalker_checkpoints "
+    "facediff.models.published.unitalker "
     "facediff.models.published.voca",
     "a method, as a LightningModule",
 )

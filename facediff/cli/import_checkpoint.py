@@ -9,7 +9,6 @@ from typing import Annotated
 from facediff.animation.options import LicenceOptions
 from facediff.cli.options import CheckpointFile
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
 from facediff.models.published.import_options import ImportOptions
 from facediff.utils.option import Option
 
@@ -30,7 +29,7 @@ def import_checkpoint(
 ) -> None:
     """Make a model of a published method's checkpoint, as its authors distribute it.
 
-    The method is recognised by the names of the tensors, all sizes by their shapes. The model gives what the authors'
+    The method is recognised by the names of the tensors. The model gives what the authors'
     code gives, and is like any other: animate, test, evaluate, export. docs/methods.md has a page for each method.
 
     For example:
@@ -44,16 +43,12 @@ def import_checkpoint(
         facts: what the checkpoint does not hold
         licence: which licences are accepted
     """
-    for path in files:
-        if not path.is_file():
-            raise FaceDiffError(f"{path}: no such file; expected the checkpoint of a published method")
-    if doctor:
-        from facediff.models.published.doctor import examine
+    from facediff.models.published.importing import examine, import_files, save_model
 
+    if doctor:
         for line in examine(files, facts):
             tell(line)
         return
-    from facediff.models.published.importing import import_files, save_model
     from facediff.utils.licences import require_cleared
 
     imported = import_files(files, facts)

@@ -11,6 +11,9 @@ from typing import Any
 
 from facediff.errors import FaceDiffError
 
+ANY = "any"
+"""Of a size, which the shapes of the weights tell as well, or of what changes nothing but the time that is taken."""
+
 REMOVED: dict[str, dict[str, Any]] = {
     "facediff.models.dual_path.model.DualPathDiffusion": {
         "min_snr": None,
@@ -26,9 +29,43 @@ REMOVED: dict[str, dict[str, Any]] = {
     "facediff.models.mesh_encoders.SpiralMeshEncoder": {"negative_slope": 0.2, "max_frames": None},
     "facediff.models.speaker_encoders.HierarchicalIdentity": {"unseen": "mean"},
     "facediff.data.puppet.Puppet": {"edition": (None, 2)},
+    "facediff.models.published.faceformer.FaceFormer": {"loop": ANY, "alignment": "auto"},
+    "facediff.models.published.talkingstyle.TalkingStyle": {
+        **{"loop": ANY, "alignment": "auto", "mouth_weight": 0.6, "style_attention": "one_key"},
+    },
+    "facediff.models.published.codetalker.CodeTalker": {
+        **{"loop": ANY, "alignment": "auto", "kernel": 5, "token_maps": ANY, "out_bias": ANY},
+        **{"positions": "constant", "attention_scale": "width", "first_frame": "duplicated", "output": "together"},
+        **{"commitment": 0.25, "quantisation_weight": 1.0, "feature_weight": 1.0},
+    },
+    "facediff.models.published.facediffuser.FaceDiffuser": {"encode_speech": ANY, "alignment": "auto"},
+    "facediff.models.published.diffspeaker.DiffSpeaker": {
+        **{"time_dim": ANY, "loss_mean": "padded", "unknown_speaker": "first", "alignment": "interpolated"},
+    },
+    "facediff.models.published.selftalk.SelfTalk": {"lip_heads": 8, "alignment": "auto"},
+    "facediff.models.published.voca.Voca": {
+        "rows_per_frame": lambda options: (None, max(1, round(60.0 / options["frame_rate"]))),
+        "alignment": "auto",
+    },
+    "facediff.models.published.emotalk.EmoTalk": {"content_dim": ANY, "period": None, "alignment": "auto"},
+    "facediff.models.published.lam.LamAudio2Expression": {"chunk_seconds": 1.0, "alignment": "auto"},
+    "facediff.models.published.unitalker.UniTalker": {
+        **{"period": 30, "component_weight": 0.01, "value_weight": 1e-4, "common_share": 0.1, "alignment": "auto"},
+        **{"long_windows": "published", "normalize_windows": True},
+    },
+    "facediff.models.published.diffposetalk.DiffPoseTalk": {
+        **{"indicator": True, "memory_width": 1, "padding": "zero", "speech_context": True, "threshold": None},
+        **{"guidance_form": "published", "velocity_weight": 5.0, "smoothness_weight": 0.5, "head_weight": 0.05},
+        **{"head_velocity_weight": 5.0, "style_weight": 0.1, "temperature": 0.1, "alignment": "interpolated"},
+        **{"style_positions": "published", "jaw": "x"},
+    },
+    "facediff.models.published.artalk.ARTalk": {
+        **{"memory_chunks": 1, "flipped_bits": 0.3, "dropped": 0.1, "velocity_weight": 5.0, "head_weight": 1.0},
+        **{"commitment_weight": 0.2, "jaw": "all", "alignment": "interpolated", "style_positions": "published"},
+    },
 }
 """By class path, the removed options and the value that each has for good, as plain data of a checkpoint; a tuple
-holds several such values."""
+holds several such values, a function makes them of the other options."""
 
 SHORT_NAMES = {"mel": "MelEncoder", "spiral": "SpiralMeshEncoder", "hierarchical": "HierarchicalIdentity"}
 """Registered names of components of :data:`REMOVED`, by which configs and checkpoints name them, and their classes."""
@@ -61,8 +98,9 @@ def _present(class_path: object, options: Mapping[str, Any], source: object) -> 
     """The options of a class that it still has."""
     removed = _removed_of(class_path)
     for name in removed.keys() & options.keys():
-        usual = removed[name] if isinstance(removed[name], tuple) else (removed[name],)
-        if _plain(options[name]) not in usual:
+        usual = removed[name](options) if callable(removed[name]) else removed[name]
+        usual = usual if isinstance(usual, tuple) else (usual,)
+        if usual != (ANY,) and _plain(options[name]) not in usual:
             now = " or ".join(map(str, usual))
             raise FaceDiffError(
                 f"{source}: {name}={options[name]} of {class_path} is an option of facediff 1.1 that is gone (it is "

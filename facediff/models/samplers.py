@@ -65,6 +65,7 @@ class NoiseProcess:
         scale: what motion is multiplied by before it is noised (Chen 2023, arXiv 2301.10972): below 1, noise hides more
             of it at every step. The noisy motion is divided by its new size, so that this is another schedule for the
             same motion: ᾱ becomes b²ᾱ / (b²ᾱ + 1 − ᾱ).
+        variances: those of another schedule, in the precision in which all is computed; instead of steps and schedule.
 
     Attributes:
         variances: the noise variance α_n of each step, float32.
@@ -76,12 +77,18 @@ class NoiseProcess:
         [0.847, 0.494, 0.144, 0.0]
     """
 
-    def __init__(self, steps: int = 1000, schedule: str = "squaredcos_cap_v2", scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        steps: int = 1000,
+        schedule: str = "squaredcos_cap_v2",
+        scale: float = 1.0,
+        variances: Float[Tensor, " steps"] | None = None,
+    ) -> None:
         if schedule not in SCHEDULES:
             raise FaceDiffError(f'noise_schedule: there is no schedule "{schedule}": {choices(schedule, SCHEDULES)}')
-        self.steps = steps
+        self.steps = steps if variances is None else len(variances)
         self.schedule = schedule
-        self.variances: Tensor = SCHEDULES[schedule](steps)
+        self.variances: Tensor = SCHEDULES[schedule](steps) if variances is None else variances
         self.signal = torch.cumprod(1.0 - self.variances, dim=0)
         self.scale = scale
         if scale != 1:
@@ -107,8 +114,8 @@ class NoiseProcess:
         step: Int[Tensor, " batch"],
     ) -> Float[Tensor, "batch ..."]:
         """Mⁿ = √ᾱ_n M⁰ + √(1 − ᾱ_n) ε, the closed form of n applications of eq. 1."""
-        signal = self.signal.to(clean)[step.to(clean.device)].view(-1, *[1] * (clean.dim() - 1))
-        return signal.sqrt() * clean + (1 - signal).sqrt() * noise
+        signal = self.signal.to(clean.device)[step.to(clean.device)].view(-1, *[1] * (clean.dim() - 1))
+        return signal.sqrt().to(clean) * clean + (1 - signal).sqrt().to(clean) * noise
 
     def draw_steps(
         self,

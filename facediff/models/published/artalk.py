@@ -8,10 +8,10 @@ authors' checkpoints. The codec stands in :mod:`facediff.models.published.artalk
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,21 +25,29 @@ from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
-from facediff.models.layers import Heads, Layers, Share, Width
+from facediff.models.layers import Heads, Layers, Width
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
-from facediff.models.published.clip_style import convert_style
-from facediff.models.published.diffposetalk_checkpoints import count_layers
+from facediff.models.published.clip_style import read_table
 from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
-Weight = Annotated[float, Range(0, 1e9)]
+if TYPE_CHECKING:
+    from facediff.models.published.cards import AuthorFiles, Facts
 
 STYLE_FRAMES = 50
 """Frames of a style clip."""
+
+FLIPPED_BITS = 0.3
+"""Share of the given bits that are turned over in training."""
+
+DROPPED = 0.1
+"""Share of clips whose style, speech or chunk before is taken away in training, each by itself."""
+
+WEIGHTS = {"velocity": 5.0, "head": 1.0, "commitment": 0.2}
+"""Of the codec's errors of first differences and, once more, of the head, and of the distance of codes from bits."""
 
 LARGEST_SCALE = math.log(100)
 """Of the logarithm that attention's queries are multiplied by."""
@@ -73,21 +81,15 @@ class ARTalk(ParametricModel):
         codec_layers: layers of its encoder, and of its decoder.
         codec_heads: their attention heads.
         style_scale: how far the style goes from no style; 1 takes it as it is.
-        memory_chunks: chunks that the generator attends to.
         smooth: filter the result (Savitzky–Golay), as the authors' programs do.
         still_jaw: set the jaw's rotation about y and z to zero, as they do.
         stage: train the ``codec``, the ``generator`` with the codec as it is, or ``both``; the authors train one after
             the other.
-        flipped_bits: share of the given bits that are turned over in training.
-        dropped: share of clips whose style, speech or chunk before is taken away in training, each by itself.
-        velocity_weight: weight of the codec's error of first differences.
-        head_weight: weight of the codec's error of the head, on top of the other channels'.
-        commitment_weight: weight of the distance of codes from their bits.
-        jaw: all of a jaw's rotation is generated.
         options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
     """
 
     hears_whole_clips: ClassVar[bool] = False  # but chunks that are cut anew in each step
+    jaw_opens: ClassVar[bool] = False
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="facebook/wav2vec2-xls-r-300m", edges=False
     )
@@ -108,19 +110,12 @@ class ARTalk(ParametricModel):
         codec_layers: Layers = 8,
         codec_heads: Heads = 8,
         style_scale: Annotated[float, Range(0, 100)] = 1.1,
-        memory_chunks: Annotated[int, Range(1, 100)] = 1,
         smooth: bool = True,
         still_jaw: bool = True,
         stage: Literal["codec", "generator", "both"] = "both",
-        flipped_bits: Share = 0.3,
-        dropped: Share = 0.1,
-        velocity_weight: Weight = 5.0,
-        head_weight: Weight = 1.0,
-        commitment_weight: Weight = 0.2,
-        jaw: Literal["all"] = "all",
         **options: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(jaw=jaw, **options)
+        super().__init__(**options)
         if len(scales) < 2 or scales[0] != 1 or list(scales) != sorted(set(scales)):
             raise ArgumentError({"scales": list(scales)}, "expected growing numbers from 1, such as 1, 5, 25, 50, 100")
         for width, heads, name in ((dim, num_heads, "dim"), (codec_dim, codec_heads, "codec_dim")):
@@ -128,8 +123,6 @@ class ARTalk(ParametricModel):
                 raise ArgumentError({name: width}, "it must be a multiple of its attention heads")
         self.scales, self.style_scale = tuple(scales), style_scale
         self.smooth, self.still_jaw, self.stage = smooth, still_jaw, stage
-        self.flipped_bits, self.dropped = flipped_bits, dropped
-        self.weights = {"velocity": velocity_weight, "head": head_weight, "commitment": commitment_weight}
         channels = len(self.modelled)
         self.codec = BitCodec(channels, scales, code_dim, codec_dim, codec_layers, codec_heads)
         self.style_encoder = self.make_style_encoder()
@@ -144,12 +137,22 @@ class ARTalk(ParametricModel):
             num_heads=num_heads,
             feed_forward_dim=feed_forward_dim or 4 * dim,
             scales=scales,
-            memory_chunks=memory_chunks,
         )
         self.codec.requires_grad_(stage != "generator")
         if stage == "codec":
             for module in (self.generator, self.style_encoder, self.audio_encoder):
                 module.requires_grad_(False)
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The rates, and the statistics by which channels are standardised; there are no shapes of persons."""
+        files.tensors |= {name: files[f"basic_vae.{name}"] for name in ("motion_mean", "motion_std")}
+        files.tensors["shapes"] = torch.zeros(len(facts.identities), 0)
+        return {
+            "scales": torch.unique(files["lvl_idx"], return_counts=True)[1].tolist(),
+            "codec_layers": files.count("basic_vae.encoder.encoder_transformer.") // 2,
+            "style_rows": read_table(files, "style_encoder.PE.pe", files.size("style_cond_embed.weight", 1)),
+        }
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
         """Take the mean and the deviation of every channel, which codec and style encoder have as well."""
@@ -205,17 +208,17 @@ class ARTalk(ParametricModel):
             terms["head"] = error[..., list(self.head_places)].abs().sum() / count
             terms["commitment"] = distance
             total = terms["reconstruction"] + sum(
-                (weight * terms[name] for name, weight in self.weights.items()), start=total
+                (weight * terms[name] for name, weight in WEIGHTS.items()), start=total
             )
         if self.stage != "codec":
             with torch.no_grad():
-                flipped = self.codec.quantise(codes[:, size:], self.flipped_bits)[1] if self.training else bits
+                flipped = self.codec.quantise(codes[:, size:], FLIPPED_BITS)[1] if self.training else bits
                 memory_bits = bits_past.clone()
             style = self.drop(self.style_token(batch), self.generator.no_style)
             audio = torch.stack([self.hear_chunk(wave) for wave in self.chunk_waves(batch, first)])
             audio = self.drop(audio, torch.zeros((), device=self.device))
             memory = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(memory_bits))], 1)
-            memory = self.drop(memory, self.generator.no_style).repeat(1, self.generator.memory_chunks, 1)
+            memory = self.drop(memory, self.generator.no_style)
             tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(flipped))], 1)
             logits = self.generator(tokens, memory, audio)
             counted = self.counted_tokens(valid)
@@ -235,9 +238,9 @@ class ARTalk(ParametricModel):
 
     def drop(self, values: Tensor, instead: Tensor) -> Tensor:
         """In training, some clips without what is replaced."""
-        if not self.training or not self.dropped:
+        if not self.training:
             return values
-        without = torch.rand(len(values), device=values.device) < self.dropped
+        without = torch.rand(len(values), device=values.device) < DROPPED
         return torch.where(without.view(-1, *[1] * (values.dim() - 1)), instead, values)
 
     def chunk_waves(self, batch: Batch, first: Int[Tensor, " batch"]) -> Float[Tensor, "batch samples"]:
@@ -309,7 +312,7 @@ class ARTalk(ParametricModel):
         """The state before the first chunk: that of motion that is zero."""
         rest = style.new_zeros(1, self.scales[-1], len(self.modelled))
         bits = self.codec.bits_of(rest)
-        return ChunkState(bits, self.memory_of(bits, style).repeat(1, self.generator.memory_chunks, 1))
+        return ChunkState(bits, self.memory_of(bits, style))
 
     def memory_of(self, bits: Bits, style: Float[Tensor, "1 1 dim"]) -> Float[Tensor, "1 tokens dim"]:
         """A chunk's tokens as the next chunk attends to them."""
@@ -330,9 +333,7 @@ class ARTalk(ParametricModel):
                 tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(bits))], 1)
         _, motion = self.codec.decode(state.bits, bits)
         again = self.codec.bits_of(motion)
-        own = self.memory_of(again, style)
-        memory = torch.cat([state.memory[:, own.shape[1] :], own], 1)
-        return motion[0], logits[0], ChunkState(again, memory)
+        return motion[0], logits[0], ChunkState(again, self.memory_of(again, style))
 
     @property
     def stream_timing(self) -> tuple[float, float]:
@@ -463,7 +464,7 @@ def smoothed(motion: npt.NDArray[np.float32], head: Sequence[int]) -> npt.NDArra
 
 
 class PastAttention(nn.Module):
-    """Attention of a chunk's tokens to those of the chunks before and to each other, by the angle between them.
+    """Attention of a chunk's tokens to those of the chunk before and to each other, by the angle between them.
 
     Args:
         dim: channels.
@@ -518,7 +519,7 @@ class ModulatedBlock(nn.Module):
 
 
 class BitGenerator(nn.Module):
-    """Bits of a chunk's tokens from the tokens, those of the chunks before, and speech.
+    """Bits of a chunk's tokens from the tokens, those of the chunk before, and speech.
 
     Args:
         code_dim: bits of a token.
@@ -529,7 +530,6 @@ class BitGenerator(nn.Module):
         num_heads: attention heads.
         feed_forward_dim: channels between the two maps of a block.
         scales: tokens of each rate.
-        memory_chunks: chunks before.
     """
 
     mask: Tensor
@@ -546,15 +546,14 @@ class BitGenerator(nn.Module):
         num_heads: int,
         feed_forward_dim: int,
         scales: Sequence[int],
-        memory_chunks: int,
     ) -> None:
         super().__init__()
-        self.memory_chunks, self.code_dim = memory_chunks, code_dim
+        self.code_dim = code_dim
         count, deviation = sum(scales), math.sqrt(1 / (3 * dim))
         self.code_in, self.style_in = nn.Linear(code_dim, dim), nn.Linear(style_dim, dim)
         self.no_style = nn.Parameter(torch.randn(1, 1, dim) * 0.5)
         self.positions = nn.Parameter(torch.randn(1, count, dim) * deviation)
-        self.past_positions = nn.Parameter(torch.randn(1, count * memory_chunks, dim) * deviation)
+        self.past_positions = nn.Parameter(torch.randn(1, count, dim) * deviation)
         self.level_table = nn.Parameter(torch.randn(len(scales), dim) * deviation)
         self.blocks = nn.ModuleList(
             ModulatedBlock(dim, audio_width, num_heads, feed_forward_dim) for _ in range(num_layers)
@@ -565,7 +564,7 @@ class BitGenerator(nn.Module):
         levels = torch.repeat_interleave(torch.arange(len(scales)), torch.tensor(list(scales)))
         # A token sees all of the past, and of its own chunk what is as coarse as itself or coarser.
         finer = torch.zeros(count, count).masked_fill(levels[:, None] < levels, -torch.inf)
-        self.register_buffer("mask", F.pad(finer, (count * memory_chunks, 0)), persistent=False)
+        self.register_buffer("mask", F.pad(finer, (count, 0)), persistent=False)
         self.register_buffer("levels", levels, persistent=False)
 
     def forward(
@@ -578,11 +577,11 @@ class BitGenerator(nn.Module):
 
         Args:
             tokens: of the rates so far: the style, then for each finer rate what the coarser ones stand for.
-            memory: tokens of the chunks before.
+            memory: tokens of the chunk before.
             audio: speech of the tokens.
         """
         count, level = tokens.shape[1], self.level_table[self.levels]
-        memory = memory + level.repeat(self.memory_chunks, 1) + self.past_positions
+        memory = memory + level + self.past_positions
         x = tokens + (level + self.positions)[:, :count]
         mask = self.mask[:count, : memory.shape[1] + count]
         for block in self.blocks:
@@ -590,93 +589,3 @@ class BitGenerator(nn.Module):
         scale, shift = self.modulation(audio).chunk(2, 2)
         scores: Tensor = self.bits_out(self.norm(x) * (1 + scale) + shift)
         return scores.view(*scores.shape[:2], self.code_dim, 2)
-
-
-# The authors' checkpoints.
-
-BLOCK_NAMES = (
-    ("attn.scale_mul_1H11", "attention.scale"),
-    ("attn.", "attention."),
-    ("ffn.", "feed_forward."),
-    ("ada_lin.", "modulation."),
-)
-
-CODEC_NAMES = (
-    ("inp_mapping.", "first."),
-    ("encoder_transformer.", "blocks."),
-    ("decoder_transformer.", "blocks."),
-    ("code_mapping.", "last."),
-    ("out_mapping.", "last."),
-)
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """ARTalk's tensors under the names of this file, and its options."""
-    scales: list[int] = torch.unique(weights.get("lvl_idx"), return_counts=True)[1].tolist()
-    _, past, dim = weights.shape("prev_pos_embed", 3)
-    first = next((name for name in weights.tensors if name.endswith("feature_extractor.conv_layers.0.conv.weight")), "")
-    prefix = first.removesuffix("feature_extractor.conv_layers.0.conv.weight") or "audio_encoder."
-    encoder = weights.backbone(prefix, kind="wav2vec2", facts=facts, **ARTalk.encoder_settings())
-    for part in ("encoder", "decoder"):
-        weights.move_all(f"basic_vae.{part}.", f"codec.{part}.", CODEC_NAMES)
-    for old, new in (
-        ("basic_vae.enc_pos_embed", "codec.encoder_positions"),
-        ("basic_vae.dec_pos_embed", "codec.decoder_positions"),
-        ("basic_vae.motion_mean", "codec.motion_mean"),
-        ("basic_vae.motion_std", "codec.motion_std"),
-        ("style_encoder.motion_mean", "style_mean"),
-        ("style_encoder.motion_std", "style_std"),
-        ("null_style_cond", "generator.no_style"),
-        ("pos_embed", "generator.positions"),
-        ("prev_pos_embed", "generator.past_positions"),
-        ("lvl_embed.weight", "generator.level_table"),
-    ):
-        weights.move(old, new)
-    for old, new in (
-        ("vqfeat_embed.", "code_in."),
-        ("style_cond_embed.", "style_in."),
-        ("logits_head.", "bits_out."),
-        ("cond_logits_head.ada_lin.", "modulation."),
-    ):
-        weights.move_all(old, f"generator.{new}")
-    weights.move_all("attn_blocks.", "generator.blocks.", BLOCK_NAMES)
-    rows = convert_style(weights, "style_encoder.", "style_encoder.")
-    for name in ("attn_bias_for_masking", "basic_vae.attn_mask"):
-        weights.ignore(name, "follows from the rates")
-    weights.add("motion_mean", weights.get("basic_vae.motion_mean"))
-    weights.add("motion_std", weights.get("basic_vae.motion_std"))
-    weights.add("shapes", torch.zeros(len(facts.identities), 0))
-    style_dim, _ = weights.shape("style_encoder.encoder.motion_proj.weight")
-    codec_dim, _ = weights.shape("basic_vae.encoder.inp_mapping.0.weight")
-    return {
-        "audio_encoder": encoder,
-        "dim": dim,
-        "num_layers": count_layers(weights, "attn_blocks."),
-        "num_heads": weights.shape("attn_blocks.0.attn.scale_mul_1H11", 4)[1],
-        "feed_forward_dim": weights.shape("attn_blocks.0.ffn.0.weight")[0],
-        "scales": scales,
-        "code_dim": weights.shape("vqfeat_embed.weight")[1],
-        "codec_dim": codec_dim,
-        "codec_layers": count_layers(weights, "basic_vae.encoder.encoder_transformer.") // 2,
-        "style_dim": style_dim,
-        "style_layers": count_layers(weights, "style_encoder.encoder.transformer.layers."),
-        "style_rows": rows,
-        "memory_chunks": past // max(1, sum(scales)),
-    }
-
-
-register(
-    Recogniser(
-        method="ARTalk",
-        marks=("basic_vae.enc_pos_embed", "prev_pos_embed", "vqfeat_embed.weight"),
-        unless=(),
-        convert=convert,
-        vertices=lambda weights: weights.shape("basic_vae.motion_mean", 1)[0],
-        count=lambda _: 0,
-        frame_rate=25.0,
-        layout="flame_artalk",
-        licence="MIT",
-        commercial="allowed",
-        licence_source="github.com/xg-chu/ARTalk",
-    )
-)

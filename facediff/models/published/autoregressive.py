@@ -7,9 +7,8 @@ own for each frame, so the keys and values of earlier frames never change, and m
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -17,17 +16,14 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError, OptionError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import StepRule
 from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width
 from facediff.models.published.base import LongSpeech, PublishedModel, still_map
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts
+from facediff.models.published.positions import periodic_bias, periodic_positions
 from facediff.utils.ranges import Range
-
-Loop = Literal["cached", "literal"]
-"""How frames are made: with the keys and values of earlier frames kept, or from all earlier frames again each time."""
 
 Period = Annotated[int, Range(1, 100_000)]
 
@@ -42,9 +38,6 @@ class AutoregressiveModel(PublishedModel):
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: in the decoder and on its positions.
         period: frames after which positions and the attention's bias repeat; those of a second if None.
-        loop: ``cached`` keeps the keys and values of earlier frames, which changes nothing but rounding (and which
-            random numbers dropout draws in training); ``literal`` computes all earlier frames again for each frame,
-            as the published code does.
         long_speech: what is done with more than 600 frames, for which the published tables have no rows: ``refuse``
             them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
         options: those of :class:`PublishedModel`.
@@ -62,7 +55,6 @@ class AutoregressiveModel(PublishedModel):
         feed_forward_dim: Width | None = None,
         dropout: Share = 0.1,
         period: Period | None = None,
-        loop: Loop = "cached",
         long_speech: LongSpeech = "refuse",
         **options: Any,  # noqa: ANN401
     ) -> None:
@@ -80,15 +72,10 @@ class AutoregressiveModel(PublishedModel):
             "period": period or max(1, round(self.frame_rate)),
             "steps": 2 if self.pairs else 1,
         }
-        self.loop: Loop = loop
         self.plan_long_speech(long_speech)
 
     def graphs(self) -> Graphs:
-        """None: each frame needs those before it.
-
-        Raises:
-            FaceDiffError: always.
-        """
+        """None: each frame needs those before it."""
         raise FaceDiffError(
             f"{type(self).__name__}: decodes frame by frame, which needs a graph with a memory, and cannot be "
             f"exported; export a model that generates all frames in one pass, or animate with facediff animate"
@@ -141,7 +128,7 @@ class OffsetModel(AutoregressiveModel):
         else:
             # The published training: every frame follows generated ones and gradients pass through the whole chain. It
             # is slow, but the network meets its own errors, as it will in inference.
-            predicted = self.network.generate(style, memory, self.loop)
+            predicted = self.network.generate(style, memory)
         return predicted, truth, frames
 
     def generate_frames(
@@ -150,7 +137,7 @@ class OffsetModel(AutoregressiveModel):
         """Frame by frame; nothing is random."""
         self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
-        motion = self.network.generate(style, memory, self.loop)
+        motion = self.network.generate(style, memory)
         return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
 
 
@@ -295,7 +282,7 @@ class PeriodicDecoder(nn.Module):
         frames = tokens.shape[1]
         x, bias = self.dropout(tokens + self.positions(frames)), self.bias(frames)
         for layer in self.layers:
-            # A prefix of the frames goes with a prefix of the speech: the literal loop decodes 1, 2, 3 … frames.
+            # A prefix of the frames goes with a prefix of the speech.
             speech = layer.cross_attention.keys_values(memory[:, : frames * self.steps])  # type: ignore[union-attr, operator]
             x = layer(x, speech, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
         return x
@@ -354,29 +341,6 @@ class Continuation:
         for store, part in zip(kept, new, strict=True):
             store[:, :, self.frame : self.frame + 1] = part
         return ProjectedKeysValues(*(store[:, :, : self.frame + 1] for store in kept))
-
-
-def periodic_positions(
-    frames: int, dim: int, period: int, *, start: int = 0, device: torch.device | None = None
-) -> Float[Tensor, "frames dim"]:
-    """Row p: sin((p mod period)·w_m) in the even channels 2m, the cosines in the odd ones, w_m = 10000^(−2m/dim)."""
-    places = torch.arange(start, start + frames, device=device) % period
-    rates = torch.exp(torch.arange(0, dim, 2, device=device).float() * (-math.log(10_000.0) / dim))
-    angle = places[:, None].float() * rates
-    return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
-
-
-def periodic_bias(
-    frames: int, heads: int, period: int, *, start: int = 0, device: torch.device | None = None
-) -> Float[Tensor, "heads frames positions"]:
-    """−2^(−8(h+1)/heads)·⌊(i − j)/period⌋ for head h, frame i and position j ≤ i; −∞ for j > i."""
-    rows = torch.arange(start, start + frames, device=device)[:, None]
-    distance = rows - torch.arange(start + frames, device=device)
-    # ALiBi's slopes (Press et al. 2022) on the distance in whole periods, as in FaceFormer, so that the frames of one
-    # period count alike. Added to the scaled scores, as PyTorch does with a float mask.
-    slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
-    bias = -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
-    return bias.masked_fill(distance < 0, -torch.inf)
 
 
 class SpokenDecoder(nn.Module):
@@ -446,25 +410,12 @@ class AutoregressiveNetwork(SpokenDecoder):
         return self.motion_out(self.after_motion(style, memory, motion))
 
     def generate(
-        self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"], loop: Loop
+        self, style: Float[Tensor, "batch dim"], memory: Float[Tensor, "batch steps dim"]
     ) -> Float[Tensor, "batch frames coordinates"]:
         """Every frame from the frame that was generated before it."""
-        frames = memory.shape[1] // self.decoder.steps
-        return self._literal(style, memory, frames) if loop == "literal" else self._cached(style, memory, frames)
-
-    def _literal(self, style: Tensor, memory: Tensor, frames: int) -> Tensor:
-        tokens = style[:, None]
-        while True:
-            motion = self.motion_out(self.decoder(tokens, memory))
-            if tokens.shape[1] == frames:
-                return motion
-            # Only the newest frame is fed back. The frames before it are computed again from the same tokens and come
-            # out the same, as the mask is causal.
-            tokens = torch.cat([tokens, self.motion_in(motion[:, -1:]) + style[:, None]], 1)
-
-    def _cached(self, style: Tensor, memory: Tensor, frames: int) -> Tensor:
-        # From one frame to the next, motion passes through two maps without anything between them: their product has
-        # the width of the decoder, and the vertices are needed only once, at the end.
+        # The published code computes all earlier frames again for each frame; with their keys and values kept, the same
+        # frames come out. From one frame to the next, motion passes through two maps without anything between them:
+        # their product has the width of the decoder, and the vertices are needed only once, at the end.
         first, last = self.motion_in, self.motion_out
         with torch.autocast(memory.device.type, enabled=False):
             # In the weights' own precision: autocast would round the product to half precision, and it is applied in
@@ -472,43 +423,7 @@ class AutoregressiveNetwork(SpokenDecoder):
             turn = first.weight @ last.weight
             shift = first.weight @ last.bias + first.bias
         state, token, features = self.decoder.start(memory), style[:, None], []
-        for _ in range(frames):
+        for _ in range(memory.shape[1] // self.decoder.steps):
             features.append(state.step(token))
             token = F.linear(features[-1], turn, shift) + style[:, None]
         return self.motion_out(torch.cat(features, 1))
-
-
-# What the authors' checkpoints of these methods share.
-
-
-def decoder_sizes(weights: AuthorsWeights, prefix: str, dim: int) -> dict[str, Any]:
-    """The decoder's options by the shapes of its tensors."""
-    layers = {name.removeprefix(f"{prefix}layers.").split(".")[0] for name in weights.names(f"{prefix}layers.")}
-    hidden, _ = weights.shape(f"{prefix}layers.0.linear1.weight")
-    return {"dim": dim, "num_layers": len(layers), "feed_forward_dim": hidden}
-
-
-def read_period(weights: AuthorsWeights, name: str, facts: CheckpointFacts, *, any_rate: bool = False) -> int:
-    """The period of a table of positions, which must be what the formula gives and, unless ``any_rate``, fit the data.
-
-    Raises:
-        FaceDiffError: if it is another table, or that of another frame rate.
-    """
-    weights.shape(name, 3)
-    table = weights.get(name)[0].float()
-    # The period is no entry of the checkpoint, but the first row that repeats row 0 tells it.
-    same = (table[1:] - table[0]).abs().amax(1) < 1e-6
-    period = int(same.int().argmax()) + 1 if bool(same.any()) else len(table)
-    expected = periodic_positions(len(table), table.shape[1], period)
-    if table.shape != expected.shape or not torch.allclose(table, expected, rtol=0, atol=1e-5):
-        raise FaceDiffError(
-            f"{weights.source}: its table of positions {name} is not what the published formula gives; the checkpoint "
-            f"is of a variant of the method"
-        )
-    if not any_rate and period != round(facts.frame_rate):
-        raise OptionError.naming(
-            f"{{dataset}} {facts.dataset}: the positions of {weights.source} repeat every {period} frames, and "
-            f"{facts.dataset} has {facts.frame_rate:g} a second; give the data set that it was trained on"
-        )
-    weights.ignore(name, "the table of positions is computed by its formula")
-    return period

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 import zlib
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from facediff.data import Batch, Reference
 from facediff.errors import ArgumentError, FaceDiffError, OptionError
-from facediff.hyperparameters import component_class
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.checkpoint_content import MotionScale
@@ -41,11 +40,10 @@ from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import FrameClock, Rule
-from facediff.utils.hints import fits, options_of
 
-Alignment = Literal["auto", "pairs", "interpolated"]
-"""How speech at 50 steps a second meets motion: as ``pairs`` of steps for each frame, as the projects do on BIWI at 25
-frames a second, or ``interpolated`` to the frames, as they do on VOCASET at 30; ``auto`` chooses by the frame rate."""
+if TYPE_CHECKING:
+    from facediff.models.published.cards import AuthorFiles, Facts
+    from facediff.models.published.import_options import ImportOptions
 
 LongSpeech = Literal["refuse", "windows", "extend"]
 """What is done with speech beyond the tables of the published code."""
@@ -66,14 +64,14 @@ class PublishedModel(AnimationModel):
     Class attributes:
         published_encoder: the audio encoder as the method's authors use it.
         table_frames: frames for which the published tables of attention have rows; None where there are none.
-        clock_rule: how frames are counted where speech is resampled to them, whatever the alignment: of the motion
-            nothing is cut then; None to count by the steps of the speech network.
+        clock_rule: how frames are counted where speech is resampled to them at every frame rate: of the motion nothing
+            is cut then; None to count by the steps of the speech network.
+        interpolates: whether speech is interpolated to the frames at 25 frames a second too, where the other methods
+            take pairs of steps.
 
     Args:
         audio_encoder: speech to features; the method's own pretrained network with its settings if None.
         audio_dim: channels of an encoder that does not state them by itself, as a pretrained network does.
-        alignment: how speech at 50 steps a second meets motion: ``pairs`` of steps for each frame, or ``interpolated``;
-            ``auto`` takes pairs at 25 frames a second, as the projects do.
         motion_scale: as in :class:`facediff.models.AnimationModel`; the published methods scale nothing.
         weight_decay: AdamW's; the published methods train with Adam, which is AdamW with a decay of 0.
         unseen_identity: as in the same class; the published methods condition an unseen speaker on each training
@@ -85,6 +83,7 @@ class PublishedModel(AnimationModel):
     published_encoder: ClassVar[AudioEncoderFactory]
     table_frames: ClassVar[int | None] = None
     clock_rule: ClassVar[Rule | None] = None
+    interpolates: ClassVar[bool] = False
     long_speech: LongSpeech = "extend"
 
     def __init__(
@@ -92,7 +91,6 @@ class PublishedModel(AnimationModel):
         *,
         audio_encoder: AudioEncoderFactory | None = None,
         audio_dim: Width | None = None,
-        alignment: Alignment = "auto",
         motion_scale: MotionScale = "none",
         weight_decay: Decay = 0.0,
         unseen_identity: IdentityPolicy = "each_seen",
@@ -101,7 +99,8 @@ class PublishedModel(AnimationModel):
         super().__init__(
             motion_scale=motion_scale, weight_decay=weight_decay, unseen_identity=unseen_identity, **options
         )
-        self.pairs = self.frame_rate == 25.0 if alignment == "auto" else alignment == "pairs"
+        # Speech at 50 steps a second: pairs of steps for each frame on BIWI, interpolated to the frames on VOCASET.
+        self.pairs = self.frame_rate == 25.0 and not self.interpolates
         self.audio_encoder, self.audio_width = make_encoder(audio_encoder or self.published_encoder, audio_dim)
 
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
@@ -116,6 +115,22 @@ class PublishedModel(AnimationModel):
         return {name: value for name, value in keywords.items() if name != "source"}
 
     # What a method adds.
+
+    @classmethod
+    def author_facts(cls, files: AuthorFiles, options: ImportOptions) -> Facts | None:  # noqa: ARG003
+        """Faces and data of an author's checkpoint; None where the data set and the templates say them."""
+        return None
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:  # noqa: ARG003
+        """Change an author's tensors as no table of names can; the options of the model that follow.
+
+        Args:
+            files: the tensors.
+            facts: faces and data.
+            asked: options of the import and of the model that the user gives.
+        """
+        return {}
 
     @abstractmethod
     def generate_frames(
@@ -154,11 +169,7 @@ class PublishedModel(AnimationModel):
         self.windows = type(self.windows)(above=above)
 
     def check_length(self, frames: Int[Tensor, " batch"], names: Sequence[str]) -> None:
-        """Refuse clips of more frames than the published tables have.
-
-        Raises:
-            FaceDiffError: with what to do instead.
-        """
+        """Refuse clips of more frames than the published tables have, with what to do instead."""
         most, rows = int(frames.max()), self.table_frames
         if rows is not None and most > rows and self.long_speech != "extend":
             raise OptionError.naming(
@@ -277,21 +288,17 @@ class DirectModel(PublishedModel):
         """Steps that the audio encoder is asked for, for each frame."""
         return 1
 
-    def after_network(self) -> dict[str, str]:
-        """The options that are chosen and change what the network gives, which no graph does; none by default."""
-        return {}
+    @property
+    def unexported(self) -> str:
+        """Options that were chosen and change what the network gives, which no graph does; none by default."""
+        return ""
 
     def graphs(self) -> Graphs:
-        """Speech to features, features to motion.
-
-        Raises:
-            FaceDiffError: if the model goes on after its network, which graphs cannot.
-        """
-        if chosen := self.after_network():
-            named = " and ".join(f"{name}={value}" for name, value in chosen.items())
+        """Speech to features, features to motion; a model that goes on after its network is refused."""
+        if self.unexported:
             raise FaceDiffError(
-                f"{type(self).__name__}: {named} cannot be exported, since graphs end with the network; import or "
-                f"train the model without {' and '.join(chosen)}, and export that"
+                f"{type(self).__name__}: {self.unexported} cannot be exported, since graphs end with the network; "
+                f"import or train the model without it, and export that"
             )
         return direct_graphs(self)
 
@@ -381,17 +388,13 @@ def still_map(dim: int, coordinates: int) -> nn.Linear:
 
 
 def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEncoder, int]:
-    """An audio encoder and its channels.
-
-    Raises:
-        ArgumentError: if its channels are not stated, and it does not know them by itself.
-    """
-    encoder_class = component_class(factory)
-    if dim is None and not fits(options_of(encoder_class)["dim"].annotation, None):
-        raise ArgumentError(
-            {"audio_dim": dim}, f"{encoder_class.__name__} does not state its channels by itself; give them, e.g. 64"
-        )
-    encoder = factory(dim=dim)  # type: ignore[arg-type]
+    """An audio encoder and its channels, which it must be told unless it knows them by itself."""
+    try:
+        encoder = factory(dim=dim)  # type: ignore[arg-type]
+    except ArgumentError as error:
+        if dim is None and "dim" in error.values:
+            raise ArgumentError({"audio_dim": dim}, "the audio encoder's channels; give them, e.g. 64") from error
+        raise
     width: int = getattr(encoder, "width", dim or 0)
     return encoder, width
 

@@ -2,17 +2,18 @@
 
 Xing, Xia, Zhang, Cun, Wang, Wong: "CodeTalker: Speech-Driven 3D Facial Animation with Discrete Motion Prior". Two
 stages of one model: a prior, which learns to write motion in a table of codes (``motion_prior.py``), and a predictor,
-FaceFormer's decoder, which finds the codes that speech asks for. Its authors' files are read in
-``codetalker_checkpoints.py``; docs/methods.md says what of the published code is an option here.
+FaceFormer's decoder, which finds the codes that speech asks for. docs/methods.md says what of the published code is an
+option here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -25,24 +26,24 @@ from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, Le
 from facediff.models.base import AnimationModel
 from facediff.models.checkpoint_content import IMPORTED
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
-from facediff.models.layers import Frames, Heads, Layers, Weight, Width, frame_mask
+from facediff.models.layers import Frames, Heads, Layers, Width, frame_mask
 from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, masked_mean
-from facediff.models.published.motion_prior import MotionPrior, PriorPositions, PriorScale, perplexity
+from facediff.models.published.motion_prior import MotionPrior, perplexity
 from facediff.models.squared_errors import mean_squared_error
 from facediff.utils.ranges import Range
+
+if TYPE_CHECKING:
+    from facediff.models.published.cards import AuthorFiles, Facts
 
 Stage = Literal["prior", "predictor"]
 """What is trained: the autoencoder of motion, or what finds its codes by the speech."""
 
-FirstFrame = Literal["duplicated", "still"]
-"""What the second frame follows: a decoding of the first frame alone, or a face that does not move."""
-
 History = Literal["true", "own"]
 """Which frames the predictor continues in training: the true ones, or those that it makes itself."""
 
-Output = Literal["together", "fed_back"]
-"""Which motion is given: all codes decoded together at the end, or the frames that were fed back."""
+COMMITMENT = 0.25
+"""Weight with which tokens are drawn to their codes."""
 
 RECIPE = "configs/experiment/puppet_codetalker_prior.yaml"
 
@@ -63,28 +64,17 @@ class CodeTalker(AutoregressiveModel):
         prior_layers: Transformer layers of each half.
         prior_heads: their attention heads.
         prior_feed_forward_dim: channels of their feed-forward layers.
-        kernel: frames that the convolution of each half sees; odd.
         tokens: codes of a frame; 8 at 25 frames a second and 16 otherwise if None.
         token_dim: channels of a code; an equal part of ``prior_dim`` if None.
         codes: rows of the table of codes.
-        token_maps: a linear map between the halves and the tokens; at 25 frames a second alone if None.
-        out_bias: a bias of the prior's map to vertices; not at 25 frames a second if None.
         leak: slope of the prior's activation below zero.
-        positions: what the prior adds to frames: the ``constant`` vector of position 0 to each, as the published code
-            does since it counts clips in place of frames; or each of ``frames`` its own.
-        attention_scale: the root of the ``width`` of the whole layer by which the prior divides scores, as published,
-            which flattens its attention; or, as is usual, that of its ``heads``.
-        first_frame: what the second frame follows: the first frame's codes ``duplicated`` and decoded as published,
-            which gives one constant face whatever the speech is, since normalisation over equal frames leaves nothing
-            of them; or a ``still`` face.
+        corrected: correct the published slips: the prior adds to each frame its own position, and not that of frame 0;
+            it divides scores by the root of a head's width, and not of the whole layer's; and the second frame
+            follows a still face, and not the first frame's codes decoded alone, which is one constant face whatever the
+            speech is.
         history: which frames the predictor continues in training: the ``true`` ones as published, which lets it learn
             to continue motion without regard to the speech; or its ``own``, generated from a face that does not move,
             and then again from its own output, in one to three passes.
-        output: which motion is given: all codes decoded ``together`` as published, or the frames that were ``fed_back``
-            while it was generated, each decoded with those before it only.
-        commitment: weight with which tokens are drawn to their codes.
-        quantisation_weight: of both terms that bring tokens and codes together, in training the prior.
-        feature_weight: of the distance from the codes of true motion, in training the predictor.
         options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
     """
 
@@ -106,21 +96,12 @@ class CodeTalker(AutoregressiveModel):
         prior_layers: Layers = 6,
         prior_heads: Heads = 8,
         prior_feed_forward_dim: Width = 1536,
-        kernel: Annotated[int, Range(1, 255)] = 5,
         tokens: Annotated[int, Range(1, 4096)] | None = None,
         token_dim: Width | None = None,
         codes: Annotated[int, Range(1, 1_000_000)] = 256,
-        token_maps: bool | None = None,
-        out_bias: bool | None = None,
         leak: Annotated[float, Range(0, 1)] = 0.2,
-        positions: PriorPositions = "constant",
-        attention_scale: PriorScale = "width",
-        first_frame: FirstFrame = "duplicated",
+        corrected: bool = False,
         history: History = "true",
-        output: Output = "together",
-        commitment: Weight = 0.25,
-        quantisation_weight: Weight = 1.0,
-        feature_weight: Weight = 1.0,
         **options: Any,  # noqa: ANN401
     ) -> None:
         if stage == "prior":
@@ -128,32 +109,30 @@ class CodeTalker(AutoregressiveModel):
         super().__init__(dim=dim or 1024, **options)
         self.stage: Stage = stage
         self.prior_file = prior
-        self.first_frame: FirstFrame = first_frame
         self.history: History = history
-        self.output: Output = output
-        self.commitment, self.quantisation_weight = commitment, quantisation_weight
-        self.feature_weight = feature_weight
+        self.corrected = corrected
         # VOCASET's predictor has 6 layers and 16 tokens of 64 channels a frame, BIWI's 12 layers and 8 tokens of 128;
         # the product is 1024 both times. BIWI's prior alone has linear maps around its tokens, and no bias in its last
         # map.
         self.decoder_options["num_layers"] = num_layers or (12 if self.pairs else 6)
         tokens = tokens or (8 if self.pairs else 16)
-        token_maps = self.pairs if token_maps is None else token_maps
-        check_sizes(prior_dim, prior_heads, kernel, tokens, token_dim, token_maps)
+        if prior_dim % prior_heads or prior_dim % 2 or (token_dim is None and prior_dim % tokens):
+            raise ArgumentError(
+                {"prior_dim": prior_dim, "prior_heads": prior_heads, "tokens": tokens},
+                "prior_dim must be even, and a multiple of prior_heads and tokens",
+            )
         self.prior_options: dict[str, Any] = {
             "dim": prior_dim,
             "num_layers": prior_layers,
             "num_heads": prior_heads,
             "hidden_dim": prior_feed_forward_dim,
-            "kernel": kernel,
             "tokens": tokens,
             "token_dim": token_dim or prior_dim // tokens,
             "codes": codes,
-            "token_maps": token_maps,
-            "out_bias": not self.pairs if out_bias is None else out_bias,
+            "token_maps": self.pairs,
+            "out_bias": not self.pairs,
             "leak": leak,
-            "scale": attention_scale,
-            "positions": positions,
+            "corrected": corrected,
         }
         self.prior = MotionPrior(n_vertices=self.n_vertices, dims=self.dims, **self.prior_options)
         self._lacks_prior = stage == "predictor"
@@ -190,18 +169,11 @@ class CodeTalker(AutoregressiveModel):
         return self._lacks_prior and IMPORTED not in self.provenance
 
     def check_training(self, *, resumed: bool) -> None:
-        """Take the prior of a new predictor, before a run writes anything.
-
-        Raises:
-            FaceDiffError: if there is none, with what to train first; or as :meth:`take_prior`.
-        """
+        """Take the prior of a new predictor, before a run writes anything; it is asked for if there is none."""
         if resumed:
             self.prior_file = None  # the checkpoint holds the prior
-        if resumed or not self.lacks_prior:
-            return
-        if self.prior_file is None:
-            raise no_prior()
-        self.take_prior(self.prior_file)
+        elif self.lacks_prior:
+            self.take_prior(self.prior_file)
 
     def setup(self, stage: str) -> None:
         """Take the prior's weights and its scale of motion, where a predictor has none."""
@@ -215,61 +187,83 @@ class CodeTalker(AutoregressiveModel):
         self._lacks_prior = False
 
     def on_fit_start(self) -> None:
-        """Refuse to train a predictor on a prior that was never trained; a checkpoint has been loaded by now.
-
-        Raises:
-            FaceDiffError: with what to train first.
-        """
+        """Refuse to train a predictor on a prior that was never trained; a checkpoint has been loaded by now."""
         super().on_fit_start()
         if self.lacks_prior:
-            raise no_prior()
+            self.take_prior(None)
 
-    def take_prior(self, path: str) -> None:
+    def take_prior(self, path: str | None) -> None:
         """Take the prior of another checkpoint of CodeTalker, with its scale of motion and its licences.
 
         Args:
             path: a checkpoint of either stage, a model folder, or a name of the Hugging Face hub.
 
         Raises:
-            FaceDiffError: if it cannot be read, or its prior has other sizes or options.
+            OptionError: if there is none, it cannot be read, or its prior has other sizes or options.
         """
         from facediff.models.loading import load_model
         from facediff.utils.licences import merged
 
+        if path is None:
+            raise FaceDiffError(
+                f"--model.prior: is missing, and CodeTalker's predictor learns to speak a trained prior's codes; train "
+                f"one with --model.stage=prior ({RECIPE}) and give its checkpoint"
+            )
         try:
             trained = load_model(path)
         except FaceDiffError as error:
             raise FaceDiffError(f"--model.prior {error}") from error
-        if not isinstance(trained, CodeTalker):
+        mine, theirs = self.prior_facts(), trained.prior_facts() if isinstance(trained, CodeTalker) else {}
+        if differing := [name for name in mine if mine[name] != theirs.get(name)]:
             raise FaceDiffError(
-                f"--model.prior {path}: is a checkpoint of {type(trained).__name__}; expected one of CodeTalker, "
-                f"trained with model.stage=prior"
+                f"--model.prior {path}: is of {type(trained).__name__} with {differing[0]} "
+                f"{theirs.get(differing[0])}, and this model has {mine[differing[0]]}; expected a checkpoint of "
+                f"CodeTalker's prior, trained with the same options"
             )
-        mine, theirs = self.prior_facts(), trained.prior_facts()
-        for name, value in theirs.items():
-            if mine[name] != value:
-                raise FaceDiffError(
-                    f"--model.prior {path}: its {name} is {value}, and this model has {mine[name]}; give the options "
-                    f"with which the prior was trained"
-                )
+        assert isinstance(trained, CodeTalker)  # noqa: S101 - else all options differ
         self.prior.load_state_dict(trained.prior.state_dict())
         self.licences = merged(self.licences, trained.licences)
         # The codes stand for motion as it was scaled when they were learnt.
         self._assets = replace(trained.assets, identities=self.identities)
         self._lacks_prior = False
 
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The prior, which a file of the second stage may hold by itself, with its layers counted as here.
+
+        Raises:
+            FaceDiffError: if the files hold no prior.
+        """
+        if inner := files.beginning("autoencoder."):
+            for prefix in ("encoder.", "decoder.", "quantize."):
+                files.ignore(prefix, "the file of the second stage holds a prior of its own")
+            for name in inner:
+                files.tensors[name.removeprefix("autoencoder.")] = files.tensors.pop(name)
+        if "quantize.embedding.weight" not in files.tensors:
+            raise FaceDiffError(
+                f"{files.source}: is CodeTalker's second stage without the first, whose prior it needs; give both "
+                f"files, such as vocaset_stage1.pth.tar and vocaset_stage2.pth.tar"
+            )
+        for name in list(files.tensors):
+            # The authors number attention (even) and feed-forward layers (odd) in one list.
+            if found := re.fullmatch(r"(\w+\.\w+_transformer\.net\.)(\d+)\.(.+)", name):
+                part = ("attention", "hidden")[int(found[2]) % 2]
+                files.tensors[f"{found[1]}{int(found[2]) // 2}.{part}.{found[3]}"] = files.tensors.pop(name)
+        width = files.size("encoder.vertice_mapping.0.weight", 0)
+        maps = "encoder.encoder_linear_embedding_post.net.weight"
+        width = files.size(maps, 0) if maps in files.tensors else width
+        return {"tokens": width // files.size("quantize.embedding.weight", 1)}
+
     def prior_facts(self) -> dict[str, object]:
         """What two models must agree on to have the same prior, by the names of the options."""
-        renamed = {
-            "dim": "prior_dim",
-            "num_layers": "prior_layers",
-            "num_heads": "prior_heads",
-            "hidden_dim": "prior_feed_forward_dim",
-            "scale": "attention_scale",
-        }
-        options = {renamed.get(name, name): value for name, value in self.prior_options.items()}
         own = {"n_vertices": self.n_vertices, "frame_rate": self.frame_rate, "motion_scale": self.motion_scaling}
-        return {**own, **options}
+        sizes = {name: value for name, value in self.prior_options.items() if name not in ("dim", "num_layers")}
+        return {
+            **own,
+            **sizes,
+            "prior_dim": self.prior_options["dim"],
+            "prior_layers": self.prior_options["num_layers"],
+        }
 
     # Training.
 
@@ -291,13 +285,13 @@ class CodeTalker(AutoregressiveModel):
         # share, would follow single clips.
         committed = masked_mean((codes.chosen.detach() - tokens).square(), frames)
         moved = masked_mean((codes.chosen - tokens.detach()).square(), frames)
-        quantisation = self.commitment * committed + moved
+        quantisation = COMMITMENT * committed + moved
         used = codes.numbers[frame_mask(frames, codes.numbers.shape[1])].flatten()
         return {
             "reconstruction": error,
             "quantisation": quantisation,
             "perplexity": perplexity(used, len(self.prior.codebook)),
-            "loss": error + self.quantisation_weight * quantisation,
+            "loss": error + quantisation,
         }
 
     def predictor_losses(
@@ -321,7 +315,7 @@ class CodeTalker(AutoregressiveModel):
             true_codes = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
         error = mean_squared_error(self.motion_of(features, frames), truth, frames)
         distance = mean_squared_error(features, true_codes, frames)
-        return {"reconstruction": error, "features": distance, "loss": error + self.feature_weight * distance}
+        return {"reconstruction": error, "features": distance, "loss": error + distance}
 
     def motion_of(self, features: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
         """Motion (B, T, 3V) of the codes nearest to features."""
@@ -335,44 +329,23 @@ class CodeTalker(AutoregressiveModel):
         """Frame by frame; nothing is random."""
         self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
-        generate = self.literal if self.loop == "literal" else self.cached
-        values, fed_back = generate(style, memory, int(frames.max()), progress or iter)
-        motion = torch.stack(fed_back, 1) if self.output == "fed_back" else self.prior.decode_clips(values, frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
-
-    def cached(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
-        """Codes (B, T, width) and the frames that were fed back, with what does not change kept.
-
-        The predictor's keys, values and codes of earlier frames stay as they are. The prior attends to all frames and
-        normalises over them, so its output for earlier ones changes with every frame: it decodes all codes again,
-        but in its last layer and map the newest frame alone.
-        """
         state, token = self.network.decoder.start(memory), style[:, None]
         values: list[Tensor] = []
-        fed_back: list[Tensor] = []
-        for place in shown(range(count)):
+        # The predictor's keys, values and codes of earlier frames stay as they are. The prior attends to all frames and
+        # normalises over them, so its output for earlier ones changes with every frame: it decodes all codes again, but
+        # in its last layer and map the newest frame alone. The frames that are fed back are not those of the result.
+        for place in (progress or iter)(range(int(frames.max()))):
+            if place:
+                token = self.following(self.prior.decode_last(torch.cat(values, 1)), place - 1, style)
             values.append(self.prior.quantise(self.network.out(state.step(token))).values)
-            if place + 1 < count or self.output == "fed_back":
-                fed_back.append(self.prior.decode_last(torch.cat(values, 1)))
-                token = self.following(fed_back[-1], place, style)
-        return torch.cat(values, 1), fed_back
-
-    def literal(self, style: Tensor, memory: Tensor, count: int, shown: Progress) -> tuple[Tensor, list[Tensor]]:
-        """The same with everything computed again for each frame, as the published code does."""
-        tokens, values = style[:, None], memory.new_zeros(len(memory), 0, self.prior.width)
-        fed_back: list[Tensor] = []
-        for place in shown(range(count)):
-            values = self.prior.quantise(self.network.out(self.network.decoder(tokens, memory))).values
-            if place + 1 < count or self.output == "fed_back":
-                fed_back.append(self.prior.decode(values)[:, -1])
-                tokens = torch.cat([tokens, self.following(fed_back[-1], place, style)], 1)
-        return values, fed_back
+        motion = self.prior.decode_clips(torch.cat(values, 1), frames)
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
 
     def following(self, motion: Float[Tensor, "batch coordinates"], place: int, style: Tensor) -> Tensor:
         """The token of the frame after ``place``."""
         # The published code decodes the first frame twice over, since PyTorch's normalisation refuses a single frame.
         # Ours takes one; the result is the same.
-        if place == 0 and self.first_frame == "still":
+        if place == 0 and self.corrected:
             motion = torch.zeros_like(motion)
         return (self.network.motion_in(motion) + style)[:, None]
 
@@ -391,11 +364,7 @@ class CodeTalker(AutoregressiveModel):
         condition: str | None = None,
         frames: int | None = None,
     ) -> Batch:
-        """As every model.
-
-        Raises:
-            FaceDiffError: also if there is no predictor.
-        """
+        """As every model; a prior alone is refused."""
         if not self.animates:
             raise FaceDiffError(
                 "this checkpoint is CodeTalker's prior alone, which reconstructs motion and takes no speech; train the "
@@ -425,14 +394,6 @@ class CodeTalker(AutoregressiveModel):
         super().test_step(batch, batch_idx, dataloader_idx)
 
 
-def no_prior() -> FaceDiffError:
-    """The error for a predictor without a trained prior."""
-    return FaceDiffError(
-        f"--model.prior: is missing, and CodeTalker's predictor learns to speak a trained prior's codes; train one "
-        f"with --model.stage=prior ({RECIPE}) and give its checkpoint"
-    )
-
-
 class NoSpeech(AudioEncoder):
     """Stands in for the audio encoder of a model that takes no speech.
 
@@ -444,11 +405,7 @@ class NoSpeech(AudioEncoder):
         super().__init__()
 
     def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
-        """Refuse speech.
-
-        Raises:
-            FaceDiffError: always.
-        """
+        """Refuse speech."""
         raise FaceDiffError("CodeTalker's prior alone takes no speech; use the checkpoint of its predictor")
 
 
@@ -479,22 +436,3 @@ class Predictor(SpokenDecoder):
     ) -> Float[Tensor, "batch frames width"]:
         """Features of every frame from motion (B, T, 3V) of the frame before it, zero before the first."""
         return self.out(self.after_motion(style, memory, motion))
-
-
-def check_sizes(dim: int, heads: int, kernel: int, tokens: int, token_dim: int | None, token_maps: bool) -> None:  # noqa: FBT001
-    """Refuse sizes of a prior that do not go together.
-
-    Raises:
-        ArgumentError: naming them.
-    """
-    if dim % heads or dim % 2:
-        raise ArgumentError({"prior_dim": dim, "prior_heads": heads}, "prior_dim must be even, and a multiple of heads")
-    if kernel % 2 == 0:
-        raise ArgumentError({"kernel": kernel}, "expected an odd number of frames")
-    if token_dim is None and dim % tokens:
-        raise ArgumentError({"prior_dim": dim, "tokens": tokens}, "prior_dim must be a multiple of tokens")
-    if not token_maps and token_dim is not None and tokens * token_dim != dim:
-        raise ArgumentError(
-            {"tokens": tokens, "token_dim": token_dim, "prior_dim": dim},
-            "without token_maps, all tokens of a frame together must have prior_dim channels",
-        )

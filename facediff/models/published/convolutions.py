@@ -58,7 +58,3 @@ class ConvolutionStack(nn.Module):
         for layer in self.layers:
             x = layer(x, spread)
         return x
-
-
-AUTHORS_NAMES = (("residual_layer.0.", "widen."),)
-"""What the authors call parts of such a layer, and what they are called here."""

@@ -4,9 +4,8 @@ Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head 
 2024.
 
 Diffusion over windows of FLAME's parameters, each of which continues the one before it; the style comes from a clip.
-From top to bottom: the model, training, sampling, streams. The network and the process stand in
-``diffposetalk_network.py``, the authors' checkpoints are read in ``diffposetalk_checkpoints.py``; docs/methods.md says
-what of the published code is an option.
+From top to bottom: the model, training, sampling, streams, the authors' files. The network and the process stand in
+``diffposetalk_network.py``; docs/methods.md says what of the published code is an option.
 """
 
 from __future__ import annotations
@@ -14,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -29,24 +29,31 @@ from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width
-from facediff.models.published.clip_style import style_contrast
+from facediff.models.published.cards import AuthorFiles, Facts
+from facediff.models.published.clip_style import read_table, style_contrast
 from facediff.models.published.diffposetalk_network import (
     Condition,
     CosineProcess,
-    Draw,
     Guidance,
     PoseDenoiser,
     Threshold,
     clamped,
     guided,
 )
-from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
+from facediff.models.published.diffusion import PosteriorSampler, SeededNoise
+from facediff.models.published.import_options import ImportOptions
+from facediff.models.published.parametric import ParametricModel, PieceStream, statistics_of, window_at
+from facediff.models.samplers import NoiseSource
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.spaces.layouts import layout
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.ranges import Range
 
-Weight = Annotated[float, Range(0, 1e9)]
+WEIGHTS = {"velocity": 5.0, "smoothness": 0.5, "head": 0.05, "head_velocity": 5.0, "style": 0.1}
+"""Of the squared errors of first differences, of the head once more and of its first differences; of the prediction's
+squared second differences; and of the contrast of styles (NT-Xent), from which alone the style encoder learns."""
 
 
 @registry.model.register("DiffPoseTalk")
@@ -62,29 +69,22 @@ class DiffPoseTalk(ParametricModel):
         window_frames: frames that are generated in one pass.
         context: frames before it that the network sees.
         diffusion_steps: noising steps, all of which sampling takes.
-        indicator: tell the network which frames fill up the last window.
-        memory_width: frames that lie fewer than so many frames from a moment of speech attend to it; 0 for all.
         head: generate the head's rotation; else the head stays at rest.
         shape_dim: coefficients of a person's shape that the network is conditioned on; 0 for none.
-        padding: what the last window's speech is filled up with: ``zero``, or the last sample (``replicate``).
-        speech_context: encode the speech of all windows in one pass; else of each window by itself.
         conditions: what training drops and sampling may be guided by, ``audio`` before ``style``.
         guidance: how guided predictions are combined: ``incremental``, or ``independent``.
-        guidance_form: ``published`` takes the second difference of independent guidance from the prediction that the
-            first has changed already; ``corrected`` from the one without conditions.
         audio_scale: scale of the guidance by speech.
         style_scale: scale of the guidance by style.
+        options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
+
+    Attributes:
         threshold: clamp every prediction to this quantile of its magnitudes, itself between the second and the third
             number; not at all if None.
-        velocity_weight: weight of the squared error of first differences.
-        smoothness_weight: weight of the prediction's squared second differences.
-        head_weight: weight of the head's squared error, on top of the other channels'.
-        head_velocity_weight: weight of that of its first differences.
-        style_weight: weight of the contrast of styles (NT-Xent), from which alone the style encoder learns.
-        temperature: of that contrast.
-        options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
+        speech_context: encode the speech of all windows in one pass; else of each window by itself.
     """
 
+    threshold: Threshold | None = None
+    speech_context: bool = True
     samples: ClassVar[bool] = True
     hears_whole_clips: ClassVar[bool] = False  # but windows that are cut anew in each step
     chosen: ClassVar[tuple[str, ...]] = (*ParametricModel.chosen, "scales", "guiding")
@@ -103,24 +103,12 @@ class DiffPoseTalk(ParametricModel):
         window_frames: Annotated[int, Range(2, 10_000)] = 100,
         context: Annotated[int, Range(1, 10_000)] = 10,
         diffusion_steps: Annotated[int, Range(1, 10_000)] = 500,
-        indicator: bool = True,
-        memory_width: Annotated[int, Range(0, 10_000)] = 1,
         head: bool = True,
         shape_dim: Annotated[int, Range(0, 1000)] = 0,
-        padding: Literal["zero", "replicate"] = "zero",
-        speech_context: bool = True,
         conditions: Sequence[Condition] = ("audio", "style"),
         guidance: Guidance = "incremental",
-        guidance_form: Literal["published", "corrected"] = "published",
         audio_scale: Annotated[float, Range(0, 100)] = 1.15,
         style_scale: Annotated[float, Range(0, 100)] = 3.0,
-        threshold: Annotated[Sequence[Annotated[float, Range(0, 1e6)]], Range(items=(3, 3))] | None = None,
-        velocity_weight: Weight = 5.0,
-        smoothness_weight: Weight = 0.5,
-        head_weight: Weight = 0.05,
-        head_velocity_weight: Weight = 5.0,
-        style_weight: Weight = 0.1,
-        temperature: Annotated[float, Range(0, 100, above=True)] = 0.1,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(shape_dim=shape_dim, head=head, **options)
@@ -130,24 +118,10 @@ class DiffPoseTalk(ParametricModel):
             raise ArgumentError(
                 {"context": context, "window_frames": window_frames}, "a window must hold the context of the next"
             )
-        if threshold is not None and not (len(threshold) == 3 and 0 <= threshold[0] <= 1):
-            raise ArgumentError(
-                {"threshold": list(threshold)}, "expected a quantile and two bounds, such as 0.99, 1, 4"
-            )
         self.window_frames, self.context = window_frames, context
-        self.padding, self.speech_context = padding, speech_context
         self.guiding: tuple[Condition, ...] = tuple(name for name in ("audio", "style") if name in conditions)
-        self.guidance, self.literal_guidance = guidance, guidance_form == "published"
+        self.guidance: Guidance = guidance
         self.scales: dict[str, float] = {"audio": audio_scale, "style": style_scale}
-        self.threshold: Threshold | None = None if threshold is None else (threshold[0], threshold[1], threshold[2])
-        self.weights = {
-            "velocity": velocity_weight,
-            "smoothness": smoothness_weight,
-            "head": head_weight,
-            "head_velocity": head_velocity_weight,
-            "style": style_weight,
-        }
-        self.temperature = temperature
         channels = len(self.modelled)
         self.audio_map = nn.Linear(self.audio_width, dim)
         self.start_audio = nn.Parameter(torch.randn(1, context, dim))
@@ -166,10 +140,54 @@ class DiffPoseTalk(ParametricModel):
             window=window_frames,
             context=context,
             steps=diffusion_steps,
-            indicator=indicator,
-            memory_width=memory_width,
             dropout=dropout,
         )
+
+    @classmethod
+    def author_facts(cls, files: AuthorFiles, options: ImportOptions) -> Facts:
+        """Speakers by their shapes, and the statistics of the training motion."""
+        return faces_of(files, options)
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """Sizes, statistics, and what the files say that their networks were trained with.
+
+        Raises:
+            OptionError: if they are of a variant.
+        """
+        said, style_dim = files.arguments.get("start_motion_feat", {}), files.size("null_style_feat", 2)
+        if str(said.get("target", "sample")) != "sample" or str(said.get("pad_mode", "zero")) != "zero":
+            raise OptionError.naming(
+                f"{files.source}: predicts {said.get('target')} from speech filled up by {said.get('pad_mode')}; "
+                f"expected a model of clean motion (sample, zero)"
+            )
+        first = next((name for name in files.tensors if name.endswith("motion_proj.weight")), "")
+        context = files.size("start_motion_feat", 1)
+        options: dict[str, Any] = {
+            "style_layers": files.count(first.replace("motion_proj.weight", "transformer.layers.")),
+            "style_rows": read_table(files, "PE.pe", style_dim),
+            "window_frames": files.size("denoising_net.PE", 1) - context - 1,
+            "diffusion_steps": files.size("diffusion_sched.alphas", 0) - 1,
+            "head": files.size("start_motion_feat", 2) >= 54,
+            "shape_dim": files.size("denoising_net.person_proj.weight", 1) - style_dim,
+        }
+        for theirs, ours, where in (
+            ("n_heads", "num_heads", said),
+            ("n_heads", "style_heads", files.arguments.get(first, {})),
+            ("cfg_mode", "guidance", said),
+        ):
+            if where.get(theirs) is not None:
+                options[ours] = where[theirs]
+        if isinstance(guiding := said.get("guiding_conditions"), str):
+            options["conditions"] = [name for name in ("audio", "style") if name in guiding.split(",")]
+        files.tensors |= facts.details
+        return options
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """As every model, without the tables of the noise process, which checkpoints of 1.x hold."""
+        for name in ("alphas", "signal", "deviations"):
+            checkpoint["state_dict"].pop(f"process.{name}", None)
+        super().on_load_checkpoint(checkpoint)
 
     def has_sampler(self, name: str | None) -> bool:
         """No registered one: its windows are denoised in the authors' way."""
@@ -210,7 +228,7 @@ class DiffPoseTalk(ParametricModel):
         size, frames = self.window_frames, batch.frame_lengths
         usual = self.encode_style(batch.reference, batch.reference_mask)
         own: Tensor = self.style_encoder(motion, batch.mask)
-        terms = {"style": style_contrast(usual, own, self.temperature)}
+        terms = {"style": style_contrast(usual, own)}
         features = self.hear(batch, frames)
         first = self._randint(max(1, int(frames.max()) - size + 1), len(batch), generator) % frames.clamp_min(1)
         unheard, unknown = self.dropped(len(batch), generator)
@@ -224,10 +242,10 @@ class DiffPoseTalk(ParametricModel):
             if number and not bool(valid.any()):
                 break
             silent = torch.where(unheard[:, None, None], self.no_audio, heard)
-            step = self._randint(self.process.steps, len(batch), generator) + 1
+            step = self._randint(self.process.steps, len(batch), generator)
             noise = torch.randn(clean.shape, device=self.device, generator=generator)
-            noisy = self.process.noised(clean, step, noise)
-            predicted = self.network(noisy, silent, person, before, step, valid.to(clean))
+            noisy = self.process.add_noise(clean, noise, step)
+            predicted = self.network(noisy, silent, person, before, step + 1, valid.to(clean))
             # The frames before a window are predicted too; those before the first one have no truth.
             known = torch.cat([before[0], clean], 1) if number else clean
             counted = F.pad(valid, (self.context, 0), value=True) if number else valid
@@ -236,7 +254,7 @@ class DiffPoseTalk(ParametricModel):
             before, first = (clean[:, -self.context :], heard[:, -self.context :]), first + size
         terms |= {name: torch.stack([error[name] for error in errors]).mean() for name in errors[0]}
         terms["loss"] = terms["reconstruction"] + sum(
-            (weight * terms[name] for name, weight in self.weights.items()), start=torch.zeros((), device=self.device)
+            (weight * terms[name] for name, weight in WEIGHTS.items()), start=torch.zeros((), device=self.device)
         )
         return terms
 
@@ -319,14 +337,9 @@ class DiffPoseTalk(ParametricModel):
         motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)
         return F.pad(motion, (0, 0, 0, 0, 0, max(0, int(frames.max()) - motion.shape[1])))[:, : int(frames.max())]
 
-    def noise_of(self, seed: int) -> Draw:
+    def noise_of(self, seed: int) -> SeededNoise:
         """The noise of a seed, whatever the clip."""
-        stream = torch.Generator(self.device).manual_seed(seed)
-
-        def draw(like: Tensor) -> Tensor:
-            return torch.randn(like.shape, device=like.device, dtype=like.dtype, generator=stream)
-
-        return draw
+        return SeededNoise([self.window_frames], [seed], self.device)
 
     @property
     def window_samples(self) -> int:
@@ -354,7 +367,7 @@ class DiffPoseTalk(ParametricModel):
         audio: Float[Tensor, " samples"],
         shape: Float[Tensor, "1 shape_dim"],
         style: Float[Tensor, "1 style_dim"] | None,
-        draw: Draw,
+        draw: NoiseSource,
         progress: Progress | None = None,
     ) -> Float[Tensor, "frames channels"]:
         """The reverse process of all windows of a recording.
@@ -375,7 +388,7 @@ class DiffPoseTalk(ParametricModel):
         windows = max(1, math.ceil(self.frames_of(len(audio)) / size))
         missing = self.window_samples * windows - len(audio)
         if missing > 0:
-            audio = F.pad(audio, (0, missing), value=float(audio[-1]) if self.padding == "replicate" else 0.0)
+            audio = F.pad(audio, (0, missing))
         filled = max(0, math.ceil(missing / unit))
         features = self.hear_wave(audio, size * windows) if self.speech_context else None
         start = draw(audio.new_empty(1, size, len(self.modelled)))
@@ -403,7 +416,7 @@ class DiffPoseTalk(ParametricModel):
         before: tuple[Tensor, Tensor],
         start: Float[Tensor, "1 window channels"],
         real: Float[Tensor, "1 window"],
-        draw: Draw,
+        draw: NoiseSource,
     ) -> Float[Tensor, "1 window channels"]:
         """The reverse process of one window, guided by those conditions that :attr:`guiding` names."""
         style = self.no_style[0] if style is None else style
@@ -419,17 +432,15 @@ class DiffPoseTalk(ParametricModel):
         person = torch.cat([torch.cat([shape, one], 1) for one in styles])
         wide = (before[0].expand(count, -1, -1), before[1].expand(count, -1, -1))
         scales = [self.scales[name] for name in self.guiding]
-        noisy = start
-        for step in range(self.process.steps, 0, -1):
-            noise = draw(noisy) if step > 1 else None
-            steps = torch.full((count,), step, device=noisy.device)
+
+        def denoise(noisy: Tensor, step: int) -> Tensor:
+            steps = torch.full((count,), step + 1, device=noisy.device)  # the network counts clean motion as 0
             predicted = self.network(noisy.expand(count, -1, -1), audio, person, wide, steps, real.expand(count, -1))
             if self.threshold is not None:
                 predicted = clamped(predicted, self.window_frames, self.threshold)
-            branches = predicted[:, self.context :].split(1)
-            clean = guided(branches, scales, self.guidance, literal=self.literal_guidance)
-            noisy = self.process.before(noisy, clean, step, noise)
-        return noisy
+            return guided(predicted[:, self.context :].split(1), scales, self.guidance)
+
+        return PosteriorSampler(self.process).run(denoise, start, noise=draw)
 
 
 class WindowStream(PieceStream):
@@ -527,3 +538,53 @@ def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
         mode = "reflect" if side // 2 < padded.shape[1] else "replicate"
         padded = F.pad(padded, (side // 2, side // 2), mode=mode)
     return F.pad(padded, (side % 2, side % 2), mode="replicate")[0]
+
+
+# The authors' files.
+
+STATISTICS = tuple(f"{key}_{name}" for key in ("exp", "pose", "shape") for name in ("mean", "std"))
+
+
+def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
+    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised.
+
+    Raises:
+        FaceDiffError: if a file cannot be read, or does not fit.
+    """
+    count = files.size("denoising_net.person_proj.weight", 1) - files.size("null_style_feat", 2)
+    statistics, given = options.statistics, options.templates
+    if statistics is None:
+        raise OptionError.naming(
+            f"{{statistics}}: {files.source} lacks the statistics of its training motion; give its authors' "
+            f"stats_train.npz"
+        )
+    if not isinstance(statistics, Mapping):
+        statistics = read_arrays(Path(statistics), STATISTICS, remedy="expected stats_train.npz of DiffPoseTalk")
+    motion, deviation = statistics_of(statistics, ("exp", "pose"))
+    mean_shape, shape_deviation = statistics_of(statistics, ("shape",))
+    if given is None:
+        shapes: dict[str, Any] = {"speaker": np.zeros(count)}
+    elif isinstance(given, Mapping):
+        shapes = dict(given)
+    else:
+        path = Path(given)
+        shapes = {path.stem: open_array(path) if path.suffix == ".npy" else read_arrays(path, ("shape",))["shape"]}
+    rows = {str(name): np.asarray(value, np.float32).reshape(-1)[:count] for name, value in shapes.items()}
+    if len(motion) != 56 or len(mean_shape) != count or any(len(row) != count for row in rows.values()):
+        raise OptionError.naming(
+            f"{{statistics}} and {{templates}}: have {len(motion)} numbers of motion and {len(mean_shape)} of shape, "
+            f"and a speaker {min(map(len, rows.values()))}; expected 56 (exp 50, pose 6) and {count}"
+        )
+    details = {
+        "motion_mean": motion,
+        "motion_std": deviation,
+        "shapes": (torch.from_numpy(np.stack([*rows.values()])) - mean_shape) / shape_deviation,
+    }
+    return Facts(
+        "HDTF_TFHP",
+        25.0,
+        list(rows),
+        dict.fromkeys(rows, torch.zeros(56, 1)),
+        layout(files.card.layout),
+        details=details,
+    )

@@ -8,6 +8,7 @@ checkpoints. docs/methods.md says what of the published code is an option here.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -23,28 +24,30 @@ from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, SamplingLoop, Spoken, results_of
+from facediff.models.graphs import (
+    BATCH,
+    FRAMES,
+    Graph,
+    Graphs,
+    ModelPart,
+    SamplingLoop,
+    Spoken,
+    results_of,
+    update_table,
+)
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
-from facediff.models.published.autoregressive import (
-    Period,
-    ProjectedKeysValues,
-    SpokenLayer,
-    decoder_sizes,
-    periodic_positions,
-    read_period,
-)
+from facediff.models.published.autoregressive import Period, ProjectedKeysValues, SpokenLayer
 from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, still_map, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
-    NoiseSource,
     conditions_of,
     features_graph,
     space_of,
 )
-from facediff.models.published.faceformer import LAYER_NAMES
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.published.positions import periodic_positions
+from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 from facediff.models.squared_errors import squared_errors
 from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
@@ -65,7 +68,6 @@ class DiffSpeaker(DiffusionModel):
         num_layers: its layers.
         num_heads: its attention heads.
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
-        time_dim: sinusoids of the step; as many as the channels of speech if None.
         dropout: in the Transformer and on its positions, in training.
         period: frames after which positions and the attention's bias repeat; those of a second if None.
         scheduler: ``published`` is DDIM as diffusers 0.11 had it, which takes the predicted clean motion for the
@@ -75,13 +77,8 @@ class DiffSpeaker(DiffusionModel):
             published; nothing but rounding differs.
         smooth: take the mean of each frame, the one before and the one after it; at 30 frames a second (VOCASET) if
             None, as published.
-        loss_mean: over which numbers the loss is a mean: all of a ``padded`` batch, as published, so that a clip weighs
-            less the longer the others are; or those of ``frames`` alone.
-        unknown_speaker: whose row an unknown speaker gets: that of the ``first`` identity, as published, or the
-            ``mean`` of all.
         long_speech: what is done with more than 3000 frames, for which the published tables have no rows: ``refuse``
             them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
-        alignment: speech is interpolated at every frame rate.
         weight_decay: AdamW's, as PyTorch has it.
         options: those of :class:`DiffusionModel`, and of every model.
     """
@@ -89,6 +86,7 @@ class DiffSpeaker(DiffusionModel):
     chosen: ClassVar[tuple[str, ...]] = (*DiffusionModel.chosen, "scheduler", "sampling_steps")
     samplers: ClassVar[tuple[str, ...]] = ("ddim",)
     table_frames: ClassVar[int | None] = 3000
+    interpolates: ClassVar[bool] = True
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         TRAINED_NETWORK, source="facebook/hubert-base-ls960", epsilon=1e-7
     )
@@ -100,37 +98,29 @@ class DiffSpeaker(DiffusionModel):
         num_layers: Layers = 1,
         num_heads: Heads = 4,
         feed_forward_dim: Width | None = None,
-        time_dim: Width | None = None,
         dropout: Share = 0.1,
         period: Period | None = None,
         scheduler: Scheduler = "published",
         sampling_steps: Annotated[int, Range(1, TRAINING_STEPS)] = 50,
         sampling_space: SamplingSpace = "folded",
         smooth: bool | None = None,
-        loss_mean: Literal["padded", "frames"] = "padded",
-        unknown_speaker: Literal["first", "mean"] = "first",
         long_speech: LongSpeech = "refuse",
-        alignment: Literal["interpolated"] = "interpolated",
         weight_decay: Decay = 0.01,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(alignment=alignment, weight_decay=weight_decay, **options)
+        super().__init__(weight_decay=weight_decay, **options)
         self.dim = dim or (1024 if self.frame_rate == 25.0 else 512)
         if self.dim % num_heads or self.dim % 2:
             raise ArgumentError({"dim": self.dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
-        time_dim = time_dim or self.audio_width
-        if time_dim % 2:
-            raise ArgumentError({"time_dim": time_dim}, "it must be even, half sines and half cosines")
         self.scheduler: Scheduler = scheduler
         self.sampling_steps = sampling_steps
         self.sampling_space: SamplingSpace = sampling_space
         self.smooth = self.frame_rate == 30.0 if smooth is None else smooth
-        self.loss_mean, self.unknown_speaker = loss_mean, unknown_speaker
         self.plan_long_speech(long_speech)
-        # The share of the clean motion's variance that is left after each step, in single precision as published.
         # Scaled-linear variances from 0.00085 to 0.012, the latent-diffusion schedule that the authors' configuration
-        # names.
-        self.signal = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, TRAINING_STEPS) ** 2, 0)
+        # names, in single precision as published.
+        variances = torch.linspace(0.00085**0.5, 0.012**0.5, TRAINING_STEPS, device="cpu") ** 2
+        self.process = NoiseProcess(variances=variances)
         self.network = DiffSpeakerNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
@@ -139,7 +129,6 @@ class DiffSpeaker(DiffusionModel):
             num_layers=num_layers,
             num_heads=num_heads,
             hidden_dim=feed_forward_dim or 2 * self.dim,
-            time_dim=time_dim,
             dropout=dropout,
             period=period or max(1, round(self.frame_rate)),
             n_identities=len(self.identities),
@@ -151,9 +140,6 @@ class DiffSpeaker(DiffusionModel):
         Args:
             name: ``ddim`` for DDIM as its paper has it; the present scheduler if None.
             steps: denoising steps; the present number if None.
-
-        Raises:
-            FaceDiffError: if there is no such sampler, or so many steps are impossible.
         """
         if name is not None and name not in self.samplers:
             raise OptionError.naming(
@@ -176,10 +162,7 @@ class DiffSpeaker(DiffusionModel):
         return [int(frames) for frames in batch.frame_lengths]
 
     def unknown_weights(self) -> Float[Tensor, " identities"]:
-        """Of the first identity, or of all, as ``unknown_speaker`` says."""
-        if self.unknown_speaker == "mean":
-            return super().unknown_weights()
-        # The published test takes the row of identity 0 for a subject that was not trained on.
+        """Of identity 0, which the published test takes for a subject that was not trained on."""
         return torch.eye(len(self.identities))[0]
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
@@ -209,21 +192,15 @@ class DiffSpeaker(DiffusionModel):
         self.check_length(frames, batch.names)
         mask = frame_mask(frames, batch.motion.shape[1])[..., None]
         clean = (batch.motion * self.scale).flatten(2) * mask
-        signal = self.signal.to(clean)[step].view(-1, 1, 1)
-        noisy = signal.sqrt() * clean + (1 - signal).sqrt() * noise * mask
+        noisy = self.process.add_noise(clean, noise * mask, step)
         predicted = self.network.motion_out(
             self.network(self.network.motion_in(noisy), step, self.conditions(batch, frames))
         )
-        if self.loss_mean == "frames":
-            position, velocity = squared_errors(predicted, clean, frames)
-            entries, pairs = frames.sum(), (frames - 1).sum()
-        else:
-            # Published: the mean over all entries, padding included, in which errors are zero. A short clip next to a
-            # long one counts less; loss_mean=frames removes that.
-            position, velocity = squared_errors(predicted * mask, clean, torch.full_like(frames, clean.shape[1]))
-            entries, pairs = torch.as_tensor(mask.numel()), torch.as_tensor(mask[:, 1:].numel())
-        position = position / (entries * clean.shape[2])
-        velocity = velocity / (pairs * clean.shape[2]).clamp_min(1)
+        # Published: the mean over all entries, padding included, in which errors are zero. A short clip next to a long
+        # one counts less.
+        position, velocity = squared_errors(predicted * mask, clean, torch.full_like(frames, clean.shape[1]))
+        position = position / clean.numel()
+        velocity = velocity / max(1, clean[:, 1:].numel())
         return {"reconstruction": position, "velocity": velocity, "loss": position + velocity}
 
     # Sampling.
@@ -237,58 +214,87 @@ class DiffSpeaker(DiffusionModel):
         """Speech, one step of the reverse process, the last map with the smoothing."""
         return diffspeaker_graphs(self)
 
+    @property
+    def sampler(self) -> SpeakerSampler:
+        """The present one."""
+        return SpeakerSampler(self.process, self.sampling_steps, literal=self.scheduler == "published")
+
     def sample(
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
         """The reverse process from noise that is drawn once."""
         self.check_length(frames, batch.names)
-        network, conditions = self.network, self.conditions(batch, frames)
-        start = noise(batch.template.new_empty(len(batch), int(frames.max()), self.dims * self.n_vertices))
-        space = self.state_space()
-        state = space.project(start)
-        # Noisy motion is always U h + weight · b + left · start, of which h, a sum of features, has the network's
-        # width; so the vertices are not needed before the end.
-        features, weight, left = torch.zeros((), device=state.device), 0.0, 1.0
-        steps = step_shares(self.signal, self.sampling_steps, self.scheduler)
-        for number in progress(range(len(steps))) if progress is not None else range(len(steps)):
-            step, of_clean, of_noisy = steps[number]
-            hidden = network(space.embed(state), torch.full((len(batch),), step, device=state.device), conditions)
-            state = of_clean * space.clean(hidden) + of_noisy * state
-            features, weight, left = (
-                of_clean * hidden + of_noisy * features,
-                of_clean + of_noisy * weight,
-                of_noisy * left,
-            )
-        if self.sampling_space == "folded":
-            weights = network.motion_out
-            state = F.linear(features, weights.weight) + weight * weights.bias + left * start
-        motion = state.view(*state.shape[:2], self.n_vertices, self.dims) / self.scale
+        conditions = self.conditions(batch, frames)
+        drawn = noise(batch.template.new_empty(len(batch), int(frames.max()), self.dims * self.n_vertices))
+
+        def denoise(state: Tensor, step: int) -> Tensor:
+            return self.predict(state, torch.full((len(batch),), step, device=state.device), conditions)[0]
+
+        state = self.sampler.run(denoise, self.first_state(drawn), progress=progress)
+        motion = self.motion_of(state, drawn)
         return smoothed(motion, frames) if self.smooth else motion
 
+    # In the folded space, noisy motion is a sum of maps of what the network gave, of a bias and of the first noise,
+    # each with a factor that the sampler makes, so that the vertices are not needed before the end. A frame of the
+    # state is: noisy motion as the network sees it, the sum of the network's features, the bias's factor, the first
+    # noise's factor.
 
-def step_shares(signal: Float[Tensor, " steps"], count: int, scheduler: Scheduler) -> list[tuple[int, float, float]]:
-    """The steps of the sampler, and what predicted clean and noisy motion contribute to the motion of the next one.
+    def first_state(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
+        """Noise alone: of features and bias there is nothing yet."""
+        state = self.state_space().project(noise)
+        if self.sampling_space == "vertices":
+            return state
+        ones = torch.ones_like(state[..., :1])
+        return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
 
-    DDIM (Song et al. 2021, eq. 12, with η = 0) goes from noisy motion x to √ᾱ' x̂₀ + √(1 − ᾱ') ε̂, where the predicted
-    noise is ε̂ = (x − √ᾱ x̂₀)/√(1 − ᾱ). diffusers 0.11 took x̂₀ for ε̂ where a network predicts x̂₀, and so the authors'
-    networks were tested; x then contributes nothing.
+    def predict(
+        self, state: Float[Tensor, "batch frames state"], step: Int[Tensor, " batch"], conditions: SpeakerConditions
+    ) -> tuple[Tensor, Tensor]:
+        """Clean motion as a state, and the features that it is a map of."""
+        space = self.state_space()
+        hidden = self.network(space.embed(state[..., : space.width]), step, conditions)
+        if self.sampling_space == "vertices":
+            return space.clean(hidden), hidden
+        ones = torch.ones_like(hidden[..., :1])
+        return torch.cat([space.clean(hidden), hidden, ones, torch.zeros_like(ones)], -1), hidden
+
+    def motion_of(self, state: Float[Tensor, "batch frames state"], noise: Tensor | None) -> BatchMotion:
+        """Offsets at the end of sampling; ``noise`` is what it started from, if anything is left of it."""
+        if self.sampling_space == "folded":
+            features, last = state[..., self.dim : -2], self.network.motion_out
+            coordinates = F.linear(features, last.weight) + state[..., -2:-1] * last.bias
+            state = coordinates if noise is None else coordinates + state[..., -1:] * noise
+        return state.view(*state.shape[:2], self.n_vertices, self.dims) / self.scale
+
+
+class SpeakerSampler(Sampler):
+    """DDIM (Song et al. 2021, eq. 12, with η = 0) over evenly spaced steps with the published offset of 1.
+
+    It goes from noisy motion x to √ᾱ' x̂₀ + √(1 − ᾱ') ε̂, where the predicted noise is ε̂ = (x − √ᾱ x̂₀)/√(1 − ᾱ). It ends
+    at the first step of the process and not at clean motion.
 
     Args:
-        signal: ᾱ of every step of the process, in single precision as published.
-        count: steps of the sampler.
-        scheduler: see :class:`DiffSpeaker`.
+        process: the noise process.
+        steps: denoising steps.
+        literal: as diffusers 0.11 had it, which took x̂₀ for ε̂ where a network predicts x̂₀; so the authors' networks
+            were tested.
     """
-    stride = len(signal) // count
-    shares = []
-    for place in reversed(range(count)):
-        step = min(place * stride + 1, len(signal) - 1)  # the published offset of 1
-        now, after = float(signal[step]), float(signal[max(step - stride, 0)])
-        noise = math.sqrt(1 - after)
-        if scheduler == "published":
-            shares.append((step, math.sqrt(after) + noise, 0.0))
-        else:
-            shares.append((step, math.sqrt(after) - noise * math.sqrt(now / (1 - now)), noise / math.sqrt(1 - now)))
-    return shares
+
+    linear: ClassVar[bool] = True
+
+    def __init__(self, process: NoiseProcess, steps: int, *, literal: bool) -> None:
+        super().__init__(process, steps)
+        self.stride, self.literal = process.steps // steps, literal
+        self.timesteps = [min(place * self.stride + 1, process.steps - 1) for place in reversed(range(steps))]
+
+    def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
+        """One step; nothing is drawn."""
+        step, signal = self.timesteps[i], self.process.signal
+        now, after = float(signal[step]), float(signal[max(step - self.stride, 0)])
+        if self.literal:
+            return (math.sqrt(after) + math.sqrt(1 - after)) * predictions[-1]
+        of_noisy = math.sqrt(1 - after) / math.sqrt(1 - now)
+        return (math.sqrt(after) - of_noisy * math.sqrt(now)) * predictions[-1] + of_noisy * noisy
 
 
 def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
@@ -373,7 +379,6 @@ class DiffSpeakerNetwork(nn.Module):
         num_layers: layers.
         num_heads: attention heads.
         hidden_dim: channels of the feed-forward layers.
-        time_dim: sinusoids of the step; even.
         dropout: everywhere, and on the positions.
         period: frames after which positions and bias repeat.
         n_identities: rows of the table of speakers.
@@ -389,19 +394,19 @@ class DiffSpeakerNetwork(nn.Module):
         num_layers: int,
         num_heads: int,
         hidden_dim: int,
-        time_dim: int,
         dropout: float,
         period: int,
         n_identities: int,
     ) -> None:
         super().__init__()
-        self.dim, self.num_heads, self.time_dim, self.period = dim, num_heads, time_dim, period
+        self.dim, self.num_heads, self.period = dim, num_heads, period
+        self.time_dim = audio_width  # sinusoids of the step; even
         self.audio_map = nn.Linear(audio_width, dim)
         self.motion_in = nn.Linear(dims * n_vertices, dim)
         # Each layer has tokens of its own.
         self.style = SpeakerTable(n_identities, num_layers * dim, "embedding")
         self.time = nn.Sequential(
-            nn.Linear(time_dim, num_layers * dim), nn.SiLU(), nn.Linear(num_layers * dim, num_layers * dim)
+            nn.Linear(audio_width, num_layers * dim), nn.SiLU(), nn.Linear(num_layers * dim, num_layers * dim)
         )
         self.layers = nn.ModuleList(AdaptedLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
         self.motion_out = still_map(dim, dims * n_vertices)
@@ -470,12 +475,7 @@ def mutual_bias(
 
 
 class SpeakerStep(ModelPart[DiffSpeaker]):
-    """Noisy motion to clean motion at one step.
-
-    In the folded space, the result is a sum of maps of what the network gave, of a bias and of the first noise, each
-    with a factor that the sampler makes. So a frame of the state is: noisy motion as the network sees it, the sum of
-    the network's features, the bias's factor, the first noise's factor.
-    """
+    """Noisy motion to clean motion at one step."""
 
     def forward(
         self,
@@ -485,23 +485,16 @@ class SpeakerStep(ModelPart[DiffSpeaker]):
         step: Int[Tensor, " batch"],
     ) -> tuple[Tensor, Tensor]:
         """The prediction, and the features that it is a map of."""
-        model, network, space = self.model, self.model.network, self.model.state_space()
-        conditions = network.conditions(features, model.weights_of(identity), None)
-        hidden = network(space.embed(state[..., : space.width]), step, conditions)
-        if model.sampling_space == "vertices":
-            return space.clean(hidden), hidden
-        ones = torch.ones_like(hidden[..., :1])
-        return torch.cat([space.clean(hidden), hidden, ones, torch.zeros_like(ones)], -1), hidden
+        conditions = self.model.network.conditions(features, self.model.weights_of(identity), None)
+        return self.model.predict(state, step, conditions)
 
 
 class SpeakerStart(ModelPart[DiffSpeaker]):
     """Unit noise on the vertices to the folded state that sampling starts from."""
 
     def forward(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
-        """Noise alone: of features and bias there is nothing yet."""
-        state = self.model.state_space().project(noise)
-        ones = torch.ones_like(state[..., :1])
-        return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
+        """The first state."""
+        return self.model.first_state(noise)
 
 
 class SpeakerMotion(ModelPart[DiffSpeaker]):
@@ -512,15 +505,9 @@ class SpeakerMotion(ModelPart[DiffSpeaker]):
         sample: Float[Tensor, "batch frames state"],
         noise: Float[Tensor, "batch frames coordinates"] | None = None,
     ) -> Float[Tensor, "batch frames points dims"]:
-        """In the unit of the corpus; ``noise`` is what sampling started from, if anything is left of it."""
-        model, last = self.model, self.model.network.motion_out
-        coordinates = sample
-        if model.sampling_space == "folded":
-            features = sample[..., model.dim : -2]
-            coordinates = nn.functional.linear(features, last.weight) + sample[..., -2:-1] * last.bias
-            coordinates = coordinates if noise is None else coordinates + sample[..., -1:] * noise
-        motion = coordinates.view(*coordinates.shape[:2], model.n_vertices, model.dims) / model.scale
-        return smoothed_whole(motion) if model.smooth else motion
+        """In the unit of the corpus."""
+        motion = self.model.motion_of(sample, noise)
+        return smoothed_whole(motion) if self.model.smooth else motion
 
 
 def smoothed_whole(motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames points dims"]:
@@ -549,9 +536,8 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
         {**{name: CONDITIONS[name] for name in inputs}, "state": FRAMES, "step": BATCH},
         ("prediction", "kept"),
     )
-    steps = step_shares(model.signal, model.sampling_steps, model.scheduler)
-    last = {"sample": state}
-    if folded and all(of_noisy for _, _, of_noisy in steps):
+    sampler, last = model.sampler, {"sample": state}
+    if folded and not sampler.literal:
         last["noise"] = noise
     parts = [speech, step, Graph("motion", SpeakerMotion(model), last, dict.fromkeys(last, FRAMES), ("offsets",))]
     if folded:
@@ -562,62 +548,11 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
         drawn=coordinates,
         kept=dim,
         sampler=f"{model.scheduler} DDIM" if model.scheduler == "published" else "ddim",
-        steps=[number for number, _, _ in steps],
-        table=[[of_noisy, of_clean, 0.0, 0.0, 0.0] for _, of_clean, of_noisy in steps],
+        steps=sampler.timesteps,
+        table=update_table(sampler),
         last_step=-1,
         decoded="sample",
         noise=None,
         noise_of="seed",
     )
     return whole_model(model, parts, loop)
-
-
-# The authors' checkpoints.
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """DiffSpeaker's tensors under the names of this file, and its options."""
-    dim, _ = weights.shape("denoiser.audio_feature_map.weight")
-    _, time_dim = weights.shape("denoiser.time_embedding.linear_1.weight")
-    period = round(facts.frame_rate)
-    if "denoiser.PPE.pe" in weights:
-        period = read_period(weights, "denoiser.PPE.pe", facts)
-    encoder = weights.backbone(
-        "audio_encoder.",
-        kind="wav2vec2",  # the published code makes this network of HuBERT's weights too
-        facts=facts,
-        **DiffSpeaker.encoder_settings(),
-    )
-    for old, new in (
-        ("audio_feature_map", "audio_map"),
-        ("vertice_map", "motion_in"),
-        ("motion_decoder", "motion_out"),
-        ("obj_vector", "style"),
-        ("time_embedding.linear_1", "time.0"),
-        ("time_embedding.linear_2", "time.2"),
-    ):
-        weights.move_all(f"denoiser.{old}.", f"network.{new}.")
-    decoder = "denoiser.transformer_decoder."
-    weights.move_all(f"{decoder}layers.", "network.layers.", LAYER_NAMES)
-    weights.ignore("_losses.", "sums of the training's losses")
-    return {
-        "audio_encoder": encoder,
-        **decoder_sizes(weights, decoder, dim),
-        "time_dim": time_dim,
-        "period": period,
-        "smooth": facts.dataset == "vocaset",
-    }
-
-
-register(
-    Recogniser(
-        method="DiffSpeaker",
-        marks=("denoiser.motion_decoder.weight", "denoiser.vertice_map.weight", "denoiser.obj_vector.weight"),
-        unless=(),
-        convert=convert,
-        vertices=lambda weights: weights.shape("denoiser.motion_decoder.weight")[0] // 3,
-        count=lambda weights: weights.shape("denoiser.obj_vector.weight")[0],
-        licence="unknown: no statement on code or weights, whose data is for research",
-        licence_source="github.com/theEricMa/DiffSpeaker",
-    )
-)

@@ -1,4 +1,4 @@
-"""What the published diffusion methods share: their noise, and where their reverse process runs.
+"""What the published diffusion methods share: their noise, their sampler, and where their reverse process runs.
 
 FaceDiffuser and DiffSpeaker take noisy vertices in by one linear map and give clean ones by another, so that the
 reverse process may run on the vertices, as published, or in the width of the first map; see
@@ -7,8 +7,9 @@ reverse process may run on the vertices, as published, or in the width of the fi
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
 import torch
@@ -21,9 +22,7 @@ from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpac
 from facediff.models.graphs import BATCH, FRAMES, Axes, Graph, Speech, Spoken, speech_graph
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.published.base import PublishedModel, zeros
-
-NoiseSource = Callable[[Tensor], Tensor]
-"""New unit Gaussian noise like a tensor, zero on padding."""
+from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 
 
 class DiffusionModel(PublishedModel):
@@ -44,11 +43,7 @@ class DiffusionModel(PublishedModel):
         return name in self.samplers
 
     def choose_expressivity(self, expressivity: object) -> None:
-        """Samples as they are (1); the method knows no mean around which they lie.
-
-        Raises:
-            FaceDiffError: if it is anything else.
-        """
+        """Samples as they are (1); the method knows no mean around which they lie, so that all else is refused."""
         if isinstance(expressivity, Tensor) or expressivity != 1:
             raise FaceDiffError(f"expressivity: {type(self).__name__} predicts no mean of its samples; omit the option")
 
@@ -76,38 +71,34 @@ class DiffusionModel(PublishedModel):
         """
 
 
-# The methods as graphs, without PyTorch; see facediff.models.graphs.
-
-CONDITIONS: dict[str, Axes] = {"features": FRAMES, "identity": BATCH, "template": BATCH}
+# The reverse process.
 
 
-def conditions_of(features: Tensor, model: PublishedModel) -> dict[str, Tensor]:
-    """Example values of what every step is given."""
-    batch = features.shape[0]
-    return {
-        "features": features,
-        "identity": zeros(batch),
-        "template": torch.zeros(batch, model.n_vertices, model.dims),
-    }
+class PosteriorSampler(Sampler):
+    """Ancestral sampling over all steps, by the process's own variances (Ho et al. 2020, eq. 7), without clipping.
 
-
-def features_graph(model: DiffusionModel, network: LinearEnds, steps: int) -> Graph:
-    """Speech to features in the network's width.
+    It is ``ddpm`` over all steps but for rounding: where hardly any noise is left, a variance that is computed back
+    from ᾱ has lost its digits.
 
     Args:
-        model: whose audio encoder is used.
-        network: the model's.
-        steps: of the audio encoder for each frame.
+        process: the noise process to reverse.
+        skipped: noisiest steps that are left out.
     """
 
-    def hear(heard: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
-        features: Tensor = network.audio_map(model.hear(heard, frames))
-        return features
+    linear: ClassVar[bool] = True
 
-    return speech_graph(model, hear, lambda frames: steps * frames)
+    def __init__(self, process: NoiseProcess, skipped: int = 0) -> None:
+        super().__init__(process, process.steps)
+        self.steps -= skipped
+        self.timesteps, self.signal = self.timesteps[skipped:], self.signal[skipped:]
 
-
-# Noise, and where the reverse process runs.
+    def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
+        """The mean of q(xₙ₋₁ | xₙ, x̂₀), and noise but for the last step, where nothing but the prediction is left."""
+        if i == self.steps - 1:
+            return predictions[-1]
+        beta, now, then = float(self.process.variances[self.timesteps[i]]), self.signal[i], self.signal[i + 1]
+        of_clean, of_noisy = beta * math.sqrt(then) / (1 - now), (1 - then) * math.sqrt(1 - beta) / (1 - now)
+        return of_clean * predictions[-1] + of_noisy * noisy + math.sqrt(beta * (1 - then) / (1 - now)) * noise(noisy)
 
 
 class SeededNoise:
@@ -166,3 +157,34 @@ def space_of(
     weights = (first.weight, last.weight, last.bias)
     products = network.of_weights.get(weights, fresh_noise, lambda: fold(*weights, noise=fresh_noise))
     return FoldedSpace(first, products, rest)
+
+
+# The methods as graphs, without PyTorch; see facediff.models.graphs.
+
+CONDITIONS: dict[str, Axes] = {"features": FRAMES, "identity": BATCH, "template": BATCH}
+
+
+def conditions_of(features: Tensor, model: PublishedModel) -> dict[str, Tensor]:
+    """Example values of what every step is given."""
+    batch = features.shape[0]
+    return {
+        "features": features,
+        "identity": zeros(batch),
+        "template": torch.zeros(batch, model.n_vertices, model.dims),
+    }
+
+
+def features_graph(model: DiffusionModel, network: LinearEnds, steps: int) -> Graph:
+    """Speech to features in the network's width.
+
+    Args:
+        model: whose audio encoder is used.
+        network: the model's.
+        steps: of the audio encoder for each frame.
+    """
+
+    def hear(heard: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
+        features: Tensor = network.audio_map(model.hear(heard, frames))
+        return features
+
+    return speech_graph(model, hear, lambda frames: steps * frames)

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,15 +26,17 @@ from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
-from facediff.models.published.autoregressive import DecoderLayer, Period, decoder_sizes, periodic_bias
+from facediff.models.published.autoregressive import DecoderLayer
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean, still_map
-from facediff.models.published.faceformer import LAYER_NAMES
 from facediff.models.published.lam_finishing import read_steps
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
+from facediff.models.published.positions import periodic_bias
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
 from facediff.spaces import Space
 from facediff.speech.windows import STEP_RATE
 from facediff.utils.ranges import Range
+
+if TYPE_CHECKING:
+    from facediff.models.published.cards import AuthorFiles, Facts
 
 EMOTION_RATE = 30
 """Steps a second of the emotion network's Transformer, whatever the motion's frame rate is."""
@@ -60,7 +61,6 @@ class EmoTalk(DirectModel):
 
     Args:
         dim: channels of the decoder: those of the content, the emotion, its strength and the person together.
-        content_dim: channels of what is said.
         emotion_dim: channels of how it is said.
         level_dim: channels of the emotion's strength.
         person_dim: channels of the person.
@@ -68,7 +68,6 @@ class EmoTalk(DirectModel):
         num_heads: its attention heads.
         feed_forward_dim: channels between the two maps of its feed-forward layers; ``dim`` if None.
         dropout: in the decoder.
-        period: frames that count alike in its attention; those of a second if None.
         levels: how many strengths of emotion there are.
         level: the strength that motion is generated with; the authors' demonstration takes 1.
         emotion_source: the network that encodes how it is said, a wav2vec 2.0: a name on the Hugging Face hub or a
@@ -90,7 +89,6 @@ class EmoTalk(DirectModel):
         self,
         *,
         dim: Width = 832,
-        content_dim: Width | None = None,
         emotion_dim: Width = 256,
         level_dim: Width = 32,
         person_dim: Width = 32,
@@ -98,7 +96,6 @@ class EmoTalk(DirectModel):
         num_heads: Heads = 4,
         feed_forward_dim: Width | None = None,
         dropout: Share = 0.1,
-        period: Period | None = None,
         levels: Annotated[int, Range(1, 1000)] = 2,
         level: Annotated[int, Range(0, 999)] = 1,
         emotion_source: str = "r-f/wav2vec-english-speech-emotion-recognition",
@@ -107,11 +104,10 @@ class EmoTalk(DirectModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
-        content_dim = dim - emotion_dim - level_dim - person_dim if content_dim is None else content_dim
-        if dim % num_heads or content_dim < 1 or content_dim + emotion_dim + level_dim + person_dim != dim:
+        if dim % num_heads or dim <= emotion_dim + level_dim + person_dim:
             raise ArgumentError(
                 {"dim": dim, "num_heads": num_heads},
-                "dim must be a multiple of num_heads, and the sum of what content, emotion, level and person have",
+                "dim must be a multiple of num_heads, and more than emotion, level and person have together",
             )
         if not level < levels:
             raise ArgumentError({"level": level}, f"there are {levels} levels, counted from 0")
@@ -124,16 +120,21 @@ class EmoTalk(DirectModel):
             n_identities=len(self.identities),
             levels=levels,
             dim=dim,
-            content_dim=content_dim,
-            emotion_dim=emotion_dim,
-            level_dim=level_dim,
-            person_dim=person_dim,
+            parts=(emotion_dim, level_dim, person_dim),
             num_layers=num_layers,
             num_heads=num_heads,
             hidden_dim=feed_forward_dim or dim,
             dropout=dropout,
-            period=period or max(1, round(self.frame_rate)),
+            period=max(1, round(self.frame_rate)),
         )
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The emotion network's configuration, and rows of the tables with the bias of the published maps."""
+        for name in ("obj_vector_level", "obj_vector_person"):
+            files.tensors[f"{name}.weight"] = files[f"{name}.weight"] + files[f"{name}.bias"][:, None]
+            del files.tensors[f"{name}.bias"]
+        return {"emotion_config": files.speech_network("emotion_encoder", asked["audio_config"])}
 
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, with the emotion network's configuration in place of its source."""
@@ -185,9 +186,10 @@ class EmoTalk(DirectModel):
             motion[row, :count, :, 0] = torch.from_numpy(values).to(motion)
         return motion
 
-    def after_network(self) -> dict[str, str]:
+    @property
+    def unexported(self) -> str:
         """What finishes the weights, if anything."""
-        return {"finish": "+".join(sorted(self.finish))} if self.finish else {}
+        return f"finish={'+'.join(sorted(self.finish))}" if self.finish else ""
 
 
 class EmoTalkNetwork(nn.Module):
@@ -199,10 +201,7 @@ class EmoTalkNetwork(nn.Module):
         n_identities: rows of the table of persons.
         levels: rows of the table of levels.
         dim: channels of the decoder.
-        content_dim: its channels of content.
-        emotion_dim: its channels of emotion.
-        level_dim: its channels of the level.
-        person_dim: its channels of the person.
+        parts: its channels of emotion, its level and the person; the others are of the content.
         num_layers: its layers.
         num_heads: its attention heads.
         hidden_dim: channels of its feed-forward layers.
@@ -218,10 +217,7 @@ class EmoTalkNetwork(nn.Module):
         n_identities: int,
         levels: int,
         dim: int,
-        content_dim: int,
-        emotion_dim: int,
-        level_dim: int,
-        person_dim: int,
+        parts: tuple[int, int, int],
         num_layers: int,
         num_heads: int,
         hidden_dim: int,
@@ -230,7 +226,8 @@ class EmoTalkNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.widths, self.num_heads, self.period = widths, num_heads, period
-        self.content_map = nn.Linear(widths[0], content_dim)
+        emotion_dim, level_dim, person_dim = parts
+        self.content_map = nn.Linear(widths[0], dim - sum(parts))
         self.memory_map = nn.Linear(widths[1], dim)
         self.emotion_map = nn.Linear(dim, emotion_dim)
         self.level = SpeakerTable(levels, level_dim)
@@ -285,67 +282,3 @@ def finished(
             result[start : start + length, lids] = BLINKS[drawn.randint(1, 4) - 1][:, None]
             start += drawn.randint(60, 180)
     return result.astype(np.float32)
-
-
-# The authors' checkpoint.
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """The tensors under the names of this file, and the model's options."""
-    content, emotion = "audio_encoder_cont.", "audio_encoder_emo.wav2vec2."
-    for prefix in (content, emotion, "audio_encoder_emo."):
-        weights.ignore(f"{prefix}lm_head.", "the speech recogniser's letters")
-    weights.ignore("audio_encoder_emo.classifier.", "the names of emotions, which only training needs")
-    own = EmoTalk.encoder_settings()
-    encoders: list[partial[Wav2Vec2Encoder]] = [
-        weights.backbone(prefix, kind="wav2vec2", facts=with_own_config(facts, name), into=name, **own)
-        for name, prefix in (("audio_encoder", content), ("emotion_encoder", emotion))
-    ]
-    for old, new in (
-        ("audio_feature_map_cont", "content_map"),
-        ("audio_feature_map_emo", "memory_map"),
-        ("audio_feature_map_emo2", "emotion_map"),
-        ("bs_map_r", "motion_out"),
-    ):
-        weights.move_all(f"{old}.", f"network.{new}.")
-    sizes = {}
-    for old, new in (("obj_vector_level", "level"), ("obj_vector_person", "style")):
-        # The published maps of one-hot rows have a bias, which every row gets here.
-        rows = weights.get(f"{old}.weight").T + weights.get(f"{old}.bias")
-        weights.renamed[f"network.{new}.weight"] = rows.contiguous()
-        sizes[new] = rows.shape[1]
-    weights.move_all("transformer_decoder.layers.", "network.layers.", LAYER_NAMES)
-    dim, _ = weights.shape("audio_feature_map_emo.weight")
-    return {
-        "audio_encoder": encoders[0],
-        "emotion_config": encoders[1].keywords["config"],
-        **decoder_sizes(weights, "transformer_decoder.", dim),
-        "content_dim": weights.shape("audio_feature_map_cont.weight")[0],
-        "emotion_dim": weights.shape("audio_feature_map_emo2.weight")[0],
-        "level_dim": sizes["level"],
-        "person_dim": sizes["style"],
-        "levels": weights.shape("obj_vector_level.weight")[1],
-    }
-
-
-def with_own_config(facts: CheckpointFacts, name: str) -> CheckpointFacts:
-    """The facts with the configuration of one of the two speech networks, where they are given by name."""
-    own = (facts.audio_config or {}).get(name)
-    return replace(facts, audio_config=own) if isinstance(own, Mapping) else facts
-
-
-register(
-    Recogniser(
-        method="EmoTalk",
-        marks=("audio_feature_map_cont.weight", "audio_feature_map_emo2.weight", "obj_vector_level.weight"),
-        unless=(),
-        convert=convert,
-        vertices=lambda weights: weights.shape("bs_map_r.weight")[0],
-        count=lambda weights: weights.shape("obj_vector_person.weight")[1],
-        layout="arkit",
-        frame_rate=30.0,
-        licence="CC-BY-NC-4.0",
-        commercial="forbidden",
-        licence_source="github.com/psyai-net/EmoTalk_release",
-    )
-)

@@ -18,23 +18,32 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError, OptionError
+from facediff.errors import ArgumentError, OptionError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
-from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, SamplingLoop, Spoken, results_of
+from facediff.models.graphs import (
+    BATCH,
+    FRAMES,
+    Graph,
+    Graphs,
+    ModelPart,
+    SamplingLoop,
+    Spoken,
+    results_of,
+    update_table,
+)
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states, frame_mask
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, still_map, whole_model, zeros
 from facediff.models.published.diffusion import (
     CONDITIONS,
     DiffusionModel,
-    NoiseSource,
+    PosteriorSampler,
     conditions_of,
     features_graph,
     space_of,
 )
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
-from facediff.models.samplers import cosine_betas
+from facediff.models.samplers import NoiseProcess, NoiseSource, cosine_betas
 from facediff.speech.windows import FrameClock, Rule
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
@@ -53,7 +62,6 @@ class FaceDiffuser(DiffusionModel):
         skip_steps: sampling starts so many steps later, from noised zeros.
         noised: what is noised: ``absolute`` vertices as published, which the noise must first bring to the face's place
             and size, or ``offsets`` from the template, whose noise is of the motion alone.
-        encode_speech: ``once`` a clip, or in ``every_step`` as the published code does, with the same result.
         sampling_space: where sampling runs: on the ``vertices``, whose noise is that of the published code for a seed,
             or ``folded`` into the first map's width, with the same distribution of motion at a cost per step that does
             not depend on the vertices.
@@ -74,7 +82,6 @@ class FaceDiffuser(DiffusionModel):
         diffusion_steps: Annotated[int, Range(1, 100_000)] | None = None,
         skip_steps: Annotated[int, Range(0, 99_999)] = 0,
         noised: Literal["absolute", "offsets"] = "absolute",
-        encode_speech: Literal["once", "every_step"] = "once",
         sampling_space: SamplingSpace = "vertices",
         **options: Any,  # noqa: ANN401
     ) -> None:
@@ -83,9 +90,8 @@ class FaceDiffuser(DiffusionModel):
         self.steps = diffusion_steps or (500 if self.pairs else 1000)
         if skip_steps >= self.steps:
             raise ArgumentError({"skip_steps": skip_steps, "diffusion_steps": self.steps}, "no step would be left")
-        self.skip_steps, self.noised = skip_steps, noised
-        self.encode_speech, self.sampling_space = encode_speech, sampling_space
-        self.posterior = Posterior(self.steps)
+        self.skip_steps, self.noised, self.sampling_space = skip_steps, noised, sampling_space
+        self.process = NoiseProcess(variances=torch.tensor(cosine_betas(self.steps), dtype=torch.float64, device="cpu"))
         self.network = FaceDiffuserNetwork(
             audio_width=2 * self.audio_width,
             n_vertices=self.n_vertices,
@@ -98,11 +104,7 @@ class FaceDiffuser(DiffusionModel):
         )
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
-        """There is one way to sample, over all steps.
-
-        Raises:
-            FaceDiffError: always.
-        """
+        """There is one way to sample, over all steps."""
         raise OptionError.naming(
             f"FaceDiffuser samples by the reverse process over all of its {self.steps} steps: omit {{sampler}} and "
             f"{{steps}}, or make the model with skip_steps or sampling_space=folded"
@@ -154,7 +156,7 @@ class FaceDiffuser(DiffusionModel):
         # Published: absolute vertices are noised, the template included. The same template is added to the network's
         # output, which therefore learns offsets in either case.
         clean = (batch.motion * self.scale).flatten(2)[:, :longest] + rest
-        noisy = self.posterior.add_noise(clean, noise[:, :longest], step)
+        noisy = self.process.add_noise(clean, noise[:, :longest], step)
         network = self.network
         audio = network.audio_map(self.hear(batch, frames))
         hidden = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
@@ -182,67 +184,30 @@ class FaceDiffuser(DiffusionModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
     ) -> BatchMotion:
         """The reverse process over all steps: the first noisy motion, then new noise in each step."""
-        network, posterior, rest = self.network, self.posterior, self.rest(batch.template)
-        style, space = network.style(self.identity_weights(batch)), self.state_space(rest)
-        speech = network.audio_map(self.hear(batch, frames))
-        last = self.steps - self.skip_steps - 1
-        state = space.noise(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
-        if self.skip_steps:
-            state = state * posterior.noise_share(last)
-        hidden = speech
-        for step in progress(range(last, -1, -1)) if progress is not None else range(last, -1, -1):
-            # The published code runs HuBERT again in each of up to 1000 steps. In evaluation it gives the same result;
-            # the option is there to measure what that costs.
-            if self.encode_speech == "every_step" and step < last:
-                speech = network.audio_map(self.hear(batch, frames))
+        network = self.network
+        style, space = network.style(self.identity_weights(batch)), self.state_space(self.rest(batch.template))
+        # The published code runs HuBERT again in each of up to 1000 steps, with the same result.
+        hidden = speech = network.audio_map(self.hear(batch, frames))
+
+        def denoise(state: Tensor, step: int) -> Tensor:
+            nonlocal hidden
             steps = torch.full((len(batch),), step, device=state.device)
             hidden = network(space.embed(state), steps, speech, style)
-            if step:
-                # The posterior q(xₙ₋₁ | xₙ, x̂₀) (Ho et al. 2020, eq. 7) without clipping x̂₀, since vertices have no
-                # range as pixels have.
-                of_clean, of_noisy, of_noise = posterior.shares(step)
-                state = of_clean * space.clean(hidden) + of_noisy * state
-                state = state + of_noise * space.noise(noise(state))
-        # At the last step nothing but the prediction of clean motion is left.
-        motion = (network.motion_out(hidden) + rest - (batch.template * self.scale).flatten(1)[:, None]) / self.scale
-        if self.noised == "offsets":
-            motion = network.motion_out(hidden) / self.scale
+            return space.clean(hidden)
+
+        start = space.noise(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
+        sampler = PosteriorSampler(self.process, self.skip_steps)
+        if self.skip_steps:  # of noised zeros
+            start = start * self.noise_share
+        sampler.run(denoise, start, noise=lambda like: space.noise(noise(like)), progress=progress)
+        # The last step gives the prediction itself, whose features are the only ones that are mapped to vertices.
+        motion = network.motion_out(hidden) / self.scale
         return motion.view(*motion.shape[:2], self.n_vertices, self.dims)
 
-
-class Posterior:
-    """The cosine noise process, and the mean and deviation of its reverse, in float64 as published.
-
-    Args:
-        steps: noising steps.
-
-    Attributes:
-        betas: the noise variance of each step.
-        signal: the share of the clean motion's variance that is left after each step.
-    """
-
-    def __init__(self, steps: int) -> None:
-        self.betas = torch.tensor(cosine_betas(steps), dtype=torch.float64)
-        self.signal = torch.cumprod(1.0 - self.betas, 0)
-        # At step 0 nothing is noised before, hence ᾱ of 1.
-        before = torch.cat([self.signal.new_ones(1), self.signal[:-1]])
-        # At step 0 these are 1, 0 and 0: the last prediction itself.
-        self._clean = self.betas * before.sqrt() / (1.0 - self.signal)
-        self._noisy = (1.0 - before) * (1.0 - self.betas).sqrt() / (1.0 - self.signal)
-        self._deviation = (self.betas * (1.0 - before) / (1.0 - self.signal)).sqrt()
-
-    def shares(self, step: int) -> tuple[float, float, float]:
-        """What clean motion, noisy motion and noise contribute to the motion of the step before."""
-        return float(self._clean[step]), float(self._noisy[step]), float(self._deviation[step])
-
-    def noise_share(self, step: int) -> float:
-        """What noise contributes to the noisy motion of a step."""
-        return math.sqrt(1.0 - float(self.signal[step]))
-
-    def add_noise(self, clean: Tensor, noise: Tensor, step: Int[Tensor, " batch"]) -> Tensor:
-        """√ᾱ · clean + √(1 − ᾱ) · noise."""
-        signal = self.signal.to(clean.device)[step].view(-1, 1, 1)
-        return signal.sqrt().to(clean) * clean + (1.0 - signal).sqrt().to(clean) * noise
+    @property
+    def noise_share(self) -> float:
+        """What noise contributes to the noisy motion that sampling starts with."""
+        return math.sqrt(1.0 - float(self.process.signal[self.steps - self.skip_steps - 1]))
 
 
 class FaceDiffuserNetwork(nn.Module):
@@ -327,14 +292,10 @@ class DiffuserStep(ModelPart[FaceDiffuser]):
 class DiffuserStart(ModelPart[FaceDiffuser]):
     """Unit noise to the motion that sampling starts from where its first steps are skipped."""
 
-    def __init__(self, model: FaceDiffuser, step: int) -> None:
-        super().__init__(model)
-        self.share = model.posterior.noise_share(step)
-
     def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
         """Noised zeros."""
         space = self.model.state_space(torch.zeros(1, 1, self.model.dims * self.model.n_vertices))
-        return space.noise(noise) * self.share
+        return space.noise(noise) * self.model.noise_share
 
 
 class LastMap(ModelPart[FaceDiffuser]):
@@ -359,15 +320,10 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
         ("prediction", "kept"),
     )
     last = Graph("motion", LastMap(model), {"sample": features}, {"sample": FRAMES}, ("offsets",))
-    visited = list(range(model.steps - model.skip_steps - 1, -1, -1))
-    table = []
-    for number in visited:
-        of_clean, of_noisy, of_noise = model.posterior.shares(number) if number else (1.0, 0.0, 0.0)
-        table.append([of_noisy, of_clean, 0.0, 0.0, of_noise])
-    parts = [speech, step, last]
+    sampler, parts = PosteriorSampler(model.process, model.skip_steps), [speech, step, last]
     if model.skip_steps:
         noise = {"noise": torch.zeros(batch, frames, space.width)}
-        parts.append(Graph("start", DiffuserStart(model, visited[0]), noise, {"noise": FRAMES}, ("state",)))
+        parts.append(Graph("start", DiffuserStart(model), noise, {"noise": FRAMES}, ("state",)))
     results_of(step)  # what follows from the weights alone is computed here, not in the graph
     root = None
     if model.sampling_space == "folded":
@@ -378,61 +334,11 @@ def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
         drawn=space.width,
         kept=dim,
         sampler="ddpm",
-        steps=visited,
-        table=table,
+        steps=sampler.timesteps,
+        table=update_table(sampler),
         last_step=-1,
         decoded="kept",
         noise=root,
         noise_of="seed",
     )
     return whole_model(model, parts, loop)
-
-
-# The authors' checkpoints.
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """FaceDiffuser's tensors under the names of this file, and its options."""
-    dim, _ = weights.shape("cond_projection.weight")
-    _, steps = weights.shape("time_mlp.0.weight")
-    _, width = weights.shape("gru.weight_hh_l0")
-    if width != dim:
-        raise FaceDiffError(
-            f"{weights.source}: its recurrent layers have {width} channels and its conditions {dim}; expected the "
-            f"same, as in every checkpoint of FaceDiffuser for faces"
-        )
-    layers = {name.split("encoder.layers.")[1].split(".")[0] for name in weights.names("audio_encoder.encoder.layers.")}
-    settings = {**FaceDiffuser.encoder_settings(), "frozen_layers": min(2, len(layers))}
-    encoder = weights.backbone("audio_encoder.", kind="hubert", facts=facts, **settings)
-    for old, new in (
-        ("cond_projection", "audio_map"),
-        ("input_projection.0", "motion_in"),
-        ("input_projection.1", "smooth"),
-        ("time_mlp.0", "step"),
-        ("norm_cond", "norm"),
-        ("gru", "gru"),
-        ("final_layer", "motion_out"),
-    ):
-        weights.move_all(f"{old}.", f"network.{new}.")
-    weights.renamed["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
-    return {
-        "audio_encoder": encoder,
-        "dim": dim,
-        "diffusion_steps": steps,
-        "num_layers": len(weights.names("gru.weight_hh_l")),
-    }
-
-
-register(
-    Recogniser(
-        method="FaceDiffuser",
-        marks=("gru.weight_ih_l0", "input_projection.0.weight", "obj_vector.weight", "final_layer.weight"),
-        unless=("transformer_decoder.",),
-        convert=convert,
-        vertices=lambda weights: weights.shape("final_layer.weight")[0] // 3,
-        count=lambda weights: weights.shape("obj_vector.weight")[1],
-        licence="CC-BY-NC-4.0",
-        commercial="forbidden",
-        licence_source="github.com/uuembodiedsocialai/FaceDiffuser",
-    )
-)

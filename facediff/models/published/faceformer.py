@@ -15,14 +15,8 @@ from torch import Tensor
 from facediff import registry
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.published.autoregressive import (
-    AutoregressiveNetwork,
-    OffsetModel,
-    decoder_sizes,
-    read_period,
-)
+from facediff.models.published.autoregressive import AutoregressiveNetwork, OffsetModel
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.squared_errors import mean_squared_error
 
 
@@ -56,45 +50,3 @@ class FaceFormer(OffsetModel):
         """The mean squared error of all coordinates."""
         error = mean_squared_error(*self.predicted_and_true(batch))
         return {"reconstruction": error, "loss": error}
-
-
-# The authors' checkpoints.
-
-LAYER_NAMES = (
-    ("self_attn.in_proj_", "self_attention.project."),
-    ("self_attn.out_proj", "self_attention.out"),
-    ("multihead_attn.in_proj_", "cross_attention.project."),
-    ("multihead_attn.out_proj", "cross_attention.out"),
-    ("linear1", "first"),
-    ("linear2", "second"),
-    ("norm1", "norms.0"),
-    ("norm2", "norms.1"),
-    ("norm3", "norms.2"),
-)
-"""What a decoder layer's tensors are called by PyTorch, and here."""
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """FaceFormer's tensors under the names of this file, and its options."""
-    dim, _ = weights.shape("audio_feature_map.weight")
-    period = read_period(weights, "PPE.pe", facts)
-    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", facts=facts, **FaceFormer.encoder_settings())
-    for old, new in (("audio_feature_map", "audio_map"), ("vertice_map", "motion_in"), ("vertice_map_r", "motion_out")):
-        weights.move_all(f"{old}.", f"network.{new}.")
-    weights.renamed["network.style.weight"] = weights.get("obj_vector.weight").T.contiguous()
-    weights.move_all("transformer_decoder.layers.", "network.decoder.layers.", LAYER_NAMES)
-    return {"audio_encoder": encoder, **decoder_sizes(weights, "transformer_decoder.", dim), "period": period}
-
-
-register(
-    Recogniser(
-        method="FaceFormer",
-        marks=("obj_vector.weight", "vertice_map_r.weight", "PPE.pe", "audio_feature_map.weight"),
-        unless=("gru.", "style_encoder.", "lip_map.", "feat_map."),
-        convert=convert,
-        vertices=lambda weights: weights.shape("vertice_map_r.weight")[0] // 3,
-        count=lambda weights: weights.shape("obj_vector.weight")[1],
-        licence="unknown: no statement on the weights, whose code is under MIT and whose data is for research",
-        licence_source="github.com/EvelynFan/FaceFormer",
-    )
-)

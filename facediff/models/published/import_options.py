@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,19 +15,16 @@ from facediff.utils.ranges import Range
 ALIASES = {"encoder_config": "audio_config", "num_attention_heads": "num_heads", "heads": "num_heads"}
 """Names of a file of hyper-parameters that stand for an option of another name."""
 
-HPARAMS: dict[str, Callable[[Any], bool]] = {
-    "dataset": lambda value: isinstance(value, str),
-    "identities": lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value),
-    "audio_config": lambda value: isinstance(value, dict),
-    "data_root": lambda value: isinstance(value, str),
-    "template_row": lambda value: type(value) is int and value >= 0,
+HPARAMS: dict[str, type] = {
+    "dataset": str,
+    "identities": list,
+    "audio_config": dict,
+    "data_root": str,
+    "template_row": int,
 }
-"""Options that such a file may hold, and whether a value fits; others are left to the checkpoint."""
+"""Options that such a file may hold, and their types; others are left to the checkpoint."""
 
-MODEL_HPARAMS = (
-    *("do_normalize", "epsilon", "num_heads", "codec_heads", "style_heads"),
-    *("chunks", "finish", "long_windows", "normalize_windows"),
-)
+MODEL_HPARAMS = ("do_normalize", "epsilon", "num_heads", "codec_heads", "style_heads", "chunks", "finish")
 """Options of models and audio encoders that such a file may hold."""
 
 
@@ -77,11 +74,7 @@ class ImportOptions:
         return cls(**chosen, model_options={name: value for name, value in options.items() if name not in own})
 
     def with_hparams(self) -> tuple[ImportOptions, list[str]]:
-        """These options, with those of the file where they are not given, and the names that are no option here.
-
-        Raises:
-            FaceDiffError: if the file cannot be read, or holds no options by name.
-        """
+        """These options, with those of the file where they are not given, and the names that are no option here."""
         if self.hparams is None:
             return self, []
         content: Any = self.hparams
@@ -94,23 +87,28 @@ class ImportOptions:
                 content["data_root"] = str(path.parent / content["data_root"])
         own = {ALIASES.get(name, name): value for name, value in content.items()}
         chosen: dict[str, Any] = {}
-        for name, check in HPARAMS.items():
-            if name in own and getattr(self, name) is None and check(own[name]):
+        for name, kind in HPARAMS.items():
+            if getattr(self, name) is None and isinstance(own.get(name), kind):
                 chosen[name] = Path(own[name]) if name == "data_root" else own[name]
         flags = {name: own[name] for name in MODEL_HPARAMS if name in own}
         left = sorted(own.keys() - HPARAMS.keys() - set(MODEL_HPARAMS))
         return replace(self, **chosen, model_options={**flags, **self.model_options}), left
 
     def all_model_options(self) -> dict[str, Any]:
-        """Options of the model and its audio encoder by name; ``ignore`` is a list where it is repeated.
+        """Options of the model and its audio encoder by name; ``ignore`` is a list, since it may be repeated.
 
         Raises:
-            FaceDiffError: if an option has no name or no value.
+            OptionError: if an option has no name or no value.
         """
         options = dict(self.model_options)
+        ignored = options.pop("ignore", [])
+        options["ignore"] = [ignored] if isinstance(ignored, str) else list(ignored)
         for text in self.option or []:
             name, equals, value = text.partition("=")
             if not equals or not name:
                 raise OptionError.naming(f"{{option}} {text}: expected a name and a value, such as num_heads=4")
-            options[name] = [*options.get(name, []), value] if name == "ignore" else value
+            if name == "ignore":
+                options["ignore"].append(value)
+            else:
+                options[name] = value
         return options

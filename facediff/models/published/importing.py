@@ -1,54 +1,43 @@
 """Checkpoints of the methods' own projects, as models of facediff.
 
-A project's file holds tensors by name and little else. Which method it is follows from the names, all sizes from the
-shapes; what no file holds (whose rows the identities are, the neutral faces, the data set where its size is unusual) is
-asked for. Each method has a :class:`Recogniser` next to its model, which says what becomes of every tensor: it is used,
-or reported as not needed. Nothing of a file is run.
+A project's file holds tensors by name and little else. Which method it is follows from the names
+(:mod:`facediff.models.published.cards`); what no file holds (whose rows the identities are, the neutral faces, the data
+set where its size is unusual) is asked for. Every tensor is used, or reported as not needed. Nothing of a file is run.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-import yaml
 from torch import Tensor
 
 from facediff import registry
 from facediff.data import Assets
 from facediff.data.batch import ASSETS_KEY
-from facediff.data.corpus import read_templates
+from facediff.data.corpus import as_template, read_templates
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.hyperparameters import component_class
 from facediff.metrics import Region
-from facediff.models.checkpoint_content import IMPORTED, check_weights
+from facediff.models.checkpoint_content import IMPORTED
+from facediff.models.published.cards import AuthorFiles, Card, Facts, cards
 from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.recognition import (
-    RECOGNISERS,
-    AuthorsWeights,
-    CheckpointFacts,
-    DatasetFacts,
-    FaceFacts,
-    Recogniser,
-    dataset_facts,
-)
 from facediff.spaces.layouts import layout
-from facediff.utils import hints
-from facediff.utils.arrays import read_arrays
 from facediff.utils.hints import is_name, options_of
 from facediff.utils.licences import Licence, merged, network_licences
-from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.plain_files import load_json
 from facediff.utils.torch_files import read_authors_checkpoint
 
 if TYPE_CHECKING:
     from facediff.models.base import AnimationModel
+    from facediff.models.published.base import PublishedModel
 
 
 @dataclass(frozen=True)
@@ -74,7 +63,7 @@ def import_checkpoint(paths: str | Path | Sequence[str | Path], **options: Any) 
     """An author's checkpoint of one of the published methods as a model.
 
     Args:
-        paths: the file, or the files of a method with several stages; of TensorFlow's checkpoints and
+        paths: the file, or the files of a method with several stages or networks; of TensorFlow's checkpoints and
             graphs those (``.npz``) of ``tools/convert_tensorflow.py``.
         options: fields of :class:`~facediff.models.published.import_options.ImportOptions`, such as ``templates``; and
             options of the model or its audio encoder, such as ``num_heads=4`` or ``long_speech="extend"``.
@@ -91,533 +80,381 @@ def import_checkpoint(paths: str | Path | Sequence[str | Path], **options: Any) 
 
 def import_files(paths: str | Path | Sequence[str | Path], options: ImportOptions) -> Imported:
     """As :func:`import_checkpoint`, with a report of what became of the files."""
-    files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
-    graphs = [path for path in files if is_graph(path)]
-    weights = read_weights([path for path in files if path not in graphs])
-    method = recognise(weights)
-    refuse_idle(options, method)
-    options, unused = options.with_hparams()
-    facts, own = facts_and_faces(weights, method, options, graphs)
-    converted = convert(weights, method, facts, options)
-    if left := weights.left():
-        raise OptionError.naming(
-            f"{weights.source}: holds tensors that {method.method} has no use for ({listed(left)}); is it a variant "
-            f"of the method? If they may be left out, give {{option}} ignore={left[0]}"
+    found = convert(paths, options)
+    if not found.difference.fits:
+        raise FaceDiffError(f"{found.files.source}: does not fit {found.files.card.method}: {found.difference}")
+    model, own = found.model, found.model.state_dict()
+    model.load_state_dict(own | {name: value.to(own[name].dtype) for name, value in found.weights.items()})
+    model.adopt(assets_of(found.facts, options))
+    label(model, found.files.card, found.facts)
+    return Imported(model.eval(), found.facts.dataset, len(found.weights), found.files.ignored, found.facts.notes)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What differs between the weights of a model and an author's.
+
+    Attributes:
+        missing: weights that the files lack, by the model's names.
+        unexpected: tensors that the model has no place for.
+        misshapen: tensors of another shape or sort, and what was expected.
+        not_finite: tensors with NaN or infinity.
+    """
+
+    missing: list[str] = field(default_factory=list)
+    unexpected: list[str] = field(default_factory=list)
+    misshapen: list[str] = field(default_factory=list)
+    not_finite: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, model: AnimationModel, weights: Mapping[str, Tensor]) -> Difference:
+        """Compare, as ``load_state_dict`` does."""
+        own = {name: value for name, value in model.state_dict().items() if name != "geometry"}  # of training alone
+        both = own.keys() & weights.keys()
+        return cls(
+            missing=[f"{name} {tuple(own[name].shape)}" for name in own if name not in weights],
+            unexpected=[f"{name} {tuple(weights[name].shape)}" for name in weights if name not in own],
+            misshapen=[
+                f"{name} {tuple(weights[name].shape)}, expected {tuple(own[name].shape)} {own[name].dtype}"
+                for name in sorted(both)
+                if weights[name].shape != own[name].shape
+                or weights[name].is_floating_point() != own[name].is_floating_point()
+            ],
+            not_finite=[name for name in sorted(both) if not bool(weights[name].isfinite().all())],
         )
-    assets, notes = read_assets(facts, options) if own is None else own_assets(own, options)
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is none."""
+        return not any(vars(self).values())
+
+    def __str__(self) -> str:
+        """The first of each kind, and what to do."""
+        found = [
+            f"{kind.replace('_', ' ')}: {names[0]} ({len(names)} in all)" for kind, names in vars(self).items() if names
+        ]
+        return (
+            f"{'; '.join(found)}. Print all by --doctor; sizes that no tensor tells are given as --option NAME=VALUE, "
+            f"tensors to leave out as --option ignore=PREFIX"
+        )
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """The model that files ask for, without their weights, and the weights by the model's names."""
+
+    files: AuthorFiles
+    facts: Facts
+    model: AnimationModel
+    weights: dict[str, Tensor]
+
+    @property
+    def difference(self) -> Difference:
+        """What does not fit."""
+        return Difference.of(self.model, self.weights)
+
+
+def convert(paths: str | Path | Sequence[str | Path], options: ImportOptions) -> Conversion:
+    """Read files, and make the model that they ask for."""
+    files = read_files([Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths])
+    card = files.card
+    for name in ("dataset", "identities", "templates", "regions", "mesh", "statistics", "data_root", "template_row"):
+        if getattr(options, name) is not None and name not in card.reads:
+            raise OptionError.naming(
+                f"{{{name}}}: {card.method} does not read this option, which would have no effect; omit it"
+            )
+    options, unused = options.with_hparams()
+    method: type[PublishedModel] = registry.model.get(card.method)
+    asked = options.all_model_options()
+    for prefix in asked.pop("ignore", []):
+        files.ignore(prefix, "left out as asked")
+    facts = method.author_facts(files, options) or facts_of(files, options, asked)
+    if card.frame_rate:
+        asked.pop("frame_rate", None)
+    stated = read_config(options.audio_config)
+    given = method.read_author(files, facts, {**asked, "audio_config": stated})
+    given |= {name: value for name, value in files.sizes().items() if name not in given}
+    for prefix, why in card.ignored.items():
+        files.ignore(prefix, why)
+    files.check_positions(facts.frame_rate, facts.dataset)
+    if card.encoders:
+        given["audio_encoder"] = files.encoder(stated, method.encoder_settings())
+    weights = files.renamed()
+    model = method(**facts.sizes(), **with_options(card.method, given, asked))
     if unused:
-        notes.append(f"hparams: not needed, or read from the tensors: {', '.join(unused)}")
-    model = build(weights, method, facts, with_options(method.method, converted, facts.model_options))
-    model.adopt(assets)
-    label(model, method, facts.dataset, () if own is None else own.licences)
-    return Imported(model.eval(), facts.dataset, len(weights.renamed), weights.ignored, [*weights.notes, *notes])
+        facts.notes.append(f"hparams: not needed, or read from the tensors: {', '.join(unused)}")
+    return Conversion(files, facts, model, weights)
 
 
-def convert(
-    weights: AuthorsWeights, method: Recogniser, facts: CheckpointFacts, options: ImportOptions
-) -> dict[str, Any]:
-    """The model's options; every tensor is used, or left out as the user asks, or left."""
-    ignore = options.all_model_options().get("ignore", ())
-    converted = method.convert(weights, facts)
-    for prefix in [ignore] if isinstance(ignore, str) else ignore:
-        weights.ignore(prefix, "left out as asked")
-    return converted
+# Files.
 
 
-NO_EFFECT = "does not read this option, which would have no effect; omit it"
-
-
-def refuse_idle(options: ImportOptions, method: Recogniser) -> None:
-    """Refuse options that a method does not read; a file of hyper-parameters may hold them, being for many methods.
+def read_files(paths: Sequence[Path]) -> AuthorFiles:
+    """The tensors of all files together, and the card of their method.
 
     Raises:
-        FaceDiffError: naming the first one.
+        FaceDiffError: if a file cannot be read, two of them hold the same tensor, or they are of no known method.
     """
-    of_vertices = ("dataset", "identities", "templates", "regions", "mesh")
-    if method.faces is not None:
-        read = method.reads
-    elif method.layout:
-        read = ("identities", "mesh") if layout(method.layout).kind == "flame" else ("identities",)
-    else:
-        read = of_vertices
-    for name in (*of_vertices, "statistics", "data_root", "template_row"):
-        if getattr(options, name) is not None and name not in read:
-            raise OptionError.naming(f"{{{name}}}: {method.method} {NO_EFFECT}")
-
-
-def facts_and_faces(
-    weights: AuthorsWeights, method: Recogniser, options: ImportOptions, graphs: Sequence[Path]
-) -> tuple[CheckpointFacts, FaceFacts | None]:
-    """What is known of a checkpoint, and the faces of a method that has its own.
-
-    Raises:
-        FaceDiffError: if something does not follow from the tensors and the options, or contradicts them.
-    """
-    if method.faces is None:
-        return facts_of(weights, method, options, graphs), None
-    the_graph(graphs, None, method)
-    own = method.faces(weights, options)
-    return own_facts(own, method, options), own
-
-
-def the_graph(files: Sequence[Path], option: object, method: Recogniser) -> Path | None:
-    """The frozen graph that a method needs, which is a further file, or that of an option.
-
-    Raises:
-        FaceDiffError: if there are several, or the method needs none.
-    """
-    graphs = [*files, *([] if option is None else [Path(str(option))])]
-    if graphs and not method.graph:
-        raise FaceDiffError(f"{graphs[0]}: is a graph of TensorFlow, which {method.method} does not need; omit it")
-    if len(set(graphs)) > 1:
-        raise FaceDiffError(f"{graphs[1]}: is the second graph that is given; expected one")
-    return graphs[0] if graphs else None
-
-
-def is_graph(path: Path) -> bool:
-    """Whether a file of arrays by name holds DeepSpeech's graph: its first layer is called ``h1``."""
-    return path.suffix == ".npz" and any(name.rpartition("/")[2] == "h1" for name in read_arrays(path))
-
-
-def read_weights(files: Sequence[Path]) -> AuthorsWeights:
-    """The tensors of all files together.
-
-    Raises:
-        FaceDiffError: if a file cannot be read, or two of them hold the same tensor.
-    """
-    if not files:
-        raise FaceDiffError("import-checkpoint: no checkpoint was given; expected that of a published method")
-    together: dict[str, Tensor] = {}
+    tensors: dict[str, Tensor] = {}
     arguments: dict[str, Mapping[str, Any]] = {}
-    for path in files:
-        state, options = read_authors_checkpoint(path)
-        if "facediff_format" in state:
+    for path in paths:
+        state, said = read_authors_checkpoint(path)
+        if "facediff_format" in state or ASSETS_KEY in state:
             raise FaceDiffError(f"{path}: is a checkpoint of facediff already; use it as it is")
-        if twice := sorted(together.keys() & state.keys()):
+        if twice := sorted(tensors.keys() & state.keys()):
             raise FaceDiffError(
                 f"{path}: holds {twice[0]}, which another file holds as well; give one checkpoint, or the stages of "
                 f"one method"
             )
-        together |= state
-        if options:
-            arguments |= dict.fromkeys(state, options)
-    return AuthorsWeights(together, ", ".join(map(str, files)), arguments)
-
-
-def recognise(weights: AuthorsWeights) -> Recogniser:
-    """The method that tensors belong to.
-
-    Raises:
-        FaceDiffError: if it is none that is known.
-    """
+        tensors |= state
+        arguments |= dict.fromkeys(state, said)
+    source = ", ".join(map(str, paths))
     registry.model.load()
-    fitting = [entry for entry in RECOGNISERS if entry.knows(weights)]
-    if len(fitting) == 1:
-        return fitting[0]
-    if ASSETS_KEY in weights or any(name.startswith("audio_encoder.network.") for name in weights.tensors):
-        raise FaceDiffError(f"{weights.source}: is a checkpoint of facediff already; use it as it is")
+    for card in cards():
+        for prefix in (*card.prefixes, ""):
+            named = {name.removeprefix(prefix): value for name, value in tensors.items()}
+            if card.fits(named):
+                return AuthorFiles(named, source, card, arguments)
+    nearest = max(cards(), key=lambda card: sum(name in tensors for name in card.required) / len(card.required))
     raise FaceDiffError(
-        f"{weights.source}: is of no method that can be imported (it holds {listed(list(weights.tensors))}); expected "
-        f"a checkpoint of {', '.join(dict.fromkeys(entry.method for entry in RECOGNISERS))}"
+        f"{source}: is of no method that can be imported: {', '.join(dict.fromkeys(card.method for card in cards()))}; "
+        f"it holds {', '.join(list(tensors)[:3])} …, and {nearest.method}'s have {', '.join(nearest.required)}"
     )
 
 
-def facts_of(
-    weights: AuthorsWeights, method: Recogniser, options: ImportOptions, graphs: Sequence[Path]
-) -> CheckpointFacts:
-    """Data set, frame rate and identities: by the shapes, or as the user says.
+# What no file says.
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What the projects take for granted of a data set.
+
+    Attributes:
+        n_vertices: vertices of its faces.
+        frame_rate: frames a second that the methods animate.
+        identities: training identities in the order of every project's tables.
+        unit: unit of length.
+    """
+
+    n_vertices: int
+    frame_rate: float
+    identities: tuple[str, ...]
+    unit: str
+
+
+def datasets() -> dict[str, Dataset]:
+    """The data sets of the released checkpoints."""
+    from facediff.data.biwi import Biwi
+    from facediff.data.vocaset import Vocaset
+
+    return {
+        "vocaset": Dataset(5023, 30.0, tuple(Vocaset.identities), "m"),
+        "biwi": Dataset(23370, 25.0, tuple(Biwi.identities), Biwi.unit),
+        "multiface": Dataset(6172, 30.0, ("2", "3", "6", "7", "9", "10", "11", "12", "13"), "0.122"),
+    }
+
+
+def facts_of(files: AuthorFiles, options: ImportOptions, asked: Mapping[str, Any]) -> Facts:
+    """Data set, frame rate, identities and neutral faces: by the sizes of the tensors, or as the user says.
 
     Raises:
         FaceDiffError: if they contradict each other, or do not follow.
     """
-    if method.layout:
-        the_graph(graphs, None, method)
-        return parametric_facts(weights, method, options)
-    datasets, count, vertices = dataset_facts(), method.count(weights), method.vertices(weights)
-    name: str | None = options.dataset
-    if name is not None and name not in datasets:
-        raise OptionError.naming(f"{{dataset}} {name}: there is no such data set: {choices(name, datasets)}")
-    by_size = next((dataset for dataset, facts in datasets.items() if facts.n_vertices == vertices), None)
-    if name is not None and by_size is not None and name != by_size:
+    card, numbers = files.card, files.size(*files.card.coordinates)
+    count = files.size(*card.speakers) if card.speakers else 0
+    rate = read_value(asked.get("frame_rate", card.frame_rate)) if card.frame_rate else 0.0
+    if not isinstance(rate, int | float):
+        raise OptionError.naming(f"{{option}} frame_rate={rate}: expected frames a second, such as {card.frame_rate:g}")
+    if card.layout:
+        space = layout(card.layout)
+        if numbers != len(space.channels):
+            raise FaceDiffError(
+                f"{files.source}: gives {numbers} channels, and {card.method} has {len(space.channels)} ({card.layout})"
+            )
+        names = identities_of(options.identities, count, [str(number) for number in range(max(1, count))])
+        return Facts(card.method, float(rate), names, dict.fromkeys(names, torch.zeros(numbers, 1)), space)
+    known, points = datasets(), numbers // 3
+    by_size = next((name for name, data in known.items() if data.n_vertices == points), None)
+    dataset = options.dataset or by_size
+    if dataset is None or dataset not in known or by_size not in (None, dataset):
         raise OptionError.naming(
-            f"{{dataset}} {name}: {weights.source} is of {by_size}, by its {vertices} vertices; omit the option"
+            f"{{dataset}}: {files.source} has {points} vertices, those of {by_size or 'no known data set'}; give the "
+            f"data set that it was trained on, {'|'.join(known)}, which says at how many frames a second"
         )
-    name = name or by_size
-    if name is None:
-        raise OptionError.naming(
-            f"{weights.source}: its {vertices} vertices are those of no known data set; give {{dataset}} "
-            f"{'|'.join(datasets)}, which says at how many frames a second it was trained"
-        )
-    identities = list(datasets[name].identities if options.identities is None else options.identities)
-    if count and len(identities) != count:
-        where = "--identities: " if options.identities is not None else f"{weights.source}: "
-        raise OptionError.naming(
-            f"{where}the checkpoint has {count} training identities, and "
-            f"{len(identities)} {'are given' if options.identities is not None else f'is what {name} usually has'}; "
-            f"give {{identities}} with {count} names in the order of the training command"
-        )
-    check_names(identities)
-    asked = options.all_model_options()
-    return CheckpointFacts(
-        dataset=name,
-        frame_rate=rate_of(datasets[name], method, asked.get("frame_rate")),
-        identities=identities,
-        n_vertices=vertices,
-        audio_config=read_config(options.audio_config),
-        model_options={key: value for key, value in asked.items() if key not in ("ignore", method.graph)},
-        graph=the_graph(graphs, asked.get(method.graph), method),
-    )
+    data = known[dataset]
+    names = identities_of(options.identities, count, list(data.identities))
+    templates = templates_of(options.templates, points)
+    unit = data.unit if points == data.n_vertices else "m"
+    return Facts(dataset, float(rate or data.frame_rate), names, templates, unit=unit)
 
 
-def parametric_facts(weights: AuthorsWeights, method: Recogniser, options: ImportOptions) -> CheckpointFacts:
-    """The facts of a method that animates channels: its layout says what they are.
+def identities_of(given: Sequence[str] | None, count: int, usual: list[str]) -> list[str]:
+    """The training identities.
 
     Raises:
-        FaceDiffError: if the tensors have another number of channels or identities, or a file of hyper-parameters names
-            a data set.
+        OptionError: if they are not as many as the checkpoint has, or no different names.
     """
-    if options.dataset is not None:
-        raise OptionError.naming(f"{{dataset}}: {method.method} {NO_EFFECT}")
-    space, channels, count = layout(method.layout), method.vertices(weights), method.count(weights)
-    if channels != len(space.channels):
-        raise FaceDiffError(
-            f"{weights.source}: gives {channels} channels, and {method.method} has {len(space.channels)} "
-            f"({method.layout}); expected a checkpoint as its authors distribute it"
-        )
-    identities = [str(number) for number in range(max(1, count))]
-    if options.identities is not None:
-        identities = list(options.identities)
-        if count and len(identities) != count:
-            raise OptionError.naming(f"{{identities}}: are {len(identities)}, and the checkpoint has {count}")
-        check_names(identities)
-    asked = options.all_model_options()
-    return CheckpointFacts(
-        dataset=method.method,
-        frame_rate=rate_of(DatasetFacts(channels, method.frame_rate or 0.0, (), "m"), method, asked.get("frame_rate")),
-        identities=identities,
-        n_vertices=channels,
-        space=space,
-        audio_config=read_config(options.audio_config),
-        model_options={key: value for key, value in asked.items() if key != "ignore"},
-    )
-
-
-def check_names(identities: Sequence[str]) -> None:
-    """Refuse names of identities that are none, or occur twice."""
-    if not all(map(is_name, identities)) or len(set(identities)) < len(identities):
+    names = usual if given is None else list(given)
+    if (count and len(names) != count) or len(set(names)) < len(names) or not all(map(is_name, names)):
         raise OptionError.naming(
-            f"{{identities}}: {quoted(identities)}; expected different names without path separators"
+            f"{{identities}}: {len(names)} names are {'usual' if given is None else 'given'}; expected "
+            f"{count or len(names)} different ones without path separators, in the order of the training command"
         )
+    return names
 
 
-def own_facts(faces: FaceFacts, method: Recogniser, options: ImportOptions) -> CheckpointFacts:
-    """What is known of the checkpoint of a method with faces of its own."""
-    asked = options.all_model_options()
-    return CheckpointFacts(
-        dataset=faces.corpus,
-        frame_rate=faces.frame_rate,
-        identities=faces.identities,
-        n_vertices=faces.n_points,
-        audio_config=read_config(options.audio_config),
-        model_options={key: value for key, value in asked.items() if key != "ignore"},
-        space=faces.space,
-        details=faces.details,
-    )
-
-
-def own_assets(faces: FaceFacts, options: ImportOptions) -> tuple[Assets, list[str]]:
-    """Assets of such a method, and notes on them.
+def templates_of(given: Path | Mapping[str, Any] | None, points: int) -> dict[str, Tensor]:
+    """The neutral faces by speaker.
 
     Raises:
-        FaceDiffError: if a mesh does not fit its vertices, or is given for channels of another kind than FLAME's.
+        FaceDiffError: if there are none, or they have another number of vertices.
     """
-    if options.mesh is not None and not faces.space.is_vertices and faces.space.kind != "flame":
-        raise OptionError.naming(f"{{mesh}}: {faces.corpus} animates channels without a mesh; omit it")
-    everything = torch.arange(faces.n_points)
-    named = {name: torch.tensor(faces.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
-    regions = {name: indices if len(indices) else everything for name, indices in named.items()}
+    if given is None:
+        raise OptionError.naming(
+            "{templates}: no checkpoint holds the neutral faces; give the data set's templates.pkl, as the projects "
+            "take it"
+        )
+    if not isinstance(given, Mapping):
+        faces = read_templates(Path(given), points)
+    else:
+        faces = {
+            str(name): torch.from_numpy(as_template("templates", name, face, points)) for name, face in given.items()
+        }
+    if not faces:
+        raise OptionError.naming("{templates}: holds no faces; give the data set's templates.pkl")
+    return faces
+
+
+def assets_of(facts: Facts, options: ImportOptions) -> Assets:
+    """Faces and regions, with notes on what is missing.
+
+    Raises:
+        FaceDiffError: if a file cannot be read, or has another number of vertices.
+    """
+    points = len(next(iter(facts.templates.values())))
+    indices = {name: torch.arange(points) for name in ("lips", "upper_face")}
+    triangles = None
+    if facts.space.is_vertices:
+        if options.regions is not None:
+            for name, file in (("lips", "lve.txt"), ("upper_face", "fdd.txt")):
+                indices[name] = torch.tensor(Region.from_file(Path(options.regions) / file, n_vertices=points).indices)
+        elif not facts.details:
+            facts.notes.append(
+                "no --regions: until it is tested on a corpus, its lips and upper face stand for all vertices, so "
+                "scores by region mean nothing"
+            )
+        triangles = read_triangles(options.mesh, points)
+        if triangles is None:
+            facts.notes.append("no --mesh: its faces have no triangles, so they can be written but not drawn")
+    else:
+        channels = {name: facts.space.region(name) for name in indices}
+        indices |= {name: torch.tensor(places, dtype=torch.long) for name, places in channels.items() if len(places)}
     assets = Assets(
-        corpus=faces.corpus,
+        corpus=facts.dataset,
         synthetic=False,
-        unit=faces.unit,
-        frame_rate=faces.frame_rate,
-        identities=faces.identities,
-        templates=faces.templates,
-        faces=read_triangles(options.mesh, faces.n_points) if faces.space.is_vertices else None,
-        colours=None,
-        regions=regions,
-        space=faces.space,
+        unit=facts.unit,
+        frame_rate=facts.frame_rate,
+        identities=facts.identities,
+        templates=facts.templates,
+        faces=triangles,
+        regions=indices,
+        space=facts.space,
     )
-    return with_flame(assets, options.mesh), list(faces.notes)
+    if options.mesh is not None and facts.space.kind == "flame":
+        from facediff.data.batch import Rig
+        from facediff.mesh.flame import Flame
+        from facediff.spaces.rigs import flame_rig
+
+        rig = flame_rig(Flame.read(Path(options.mesh)), jaw=True)
+        return replace(assets, rig=Rig.of(rig, assets))
+    if options.mesh is not None and not facts.space.is_vertices:
+        raise OptionError.naming(f"{{mesh}}: {facts.dataset} animates channels without a mesh; omit it")
+    return assets
 
 
-def with_flame(assets: Assets, mesh: Path | None) -> Assets:
-    """Assets in FLAME's parameters with the user's FLAME model as rig, so that they can be drawn.
-
-    Raises:
-        FaceDiffError: if the file is no FLAME model.
-    """
-    if mesh is None or assets.space.kind != "flame":
-        return assets
-    from facediff.data.batch import Rig
-    from facediff.mesh.flame import Flame
-    from facediff.spaces.rigs import flame_rig
-
-    return replace(assets, rig=Rig.of(flame_rig(Flame.read(Path(mesh)), jaw=True), assets))
-
-
-def read_triangles(mesh: Path | None, count: int) -> Tensor | None:
+def read_triangles(mesh: Path | None, points: int) -> Tensor | None:
     """The triangles of a mesh, if there is one.
 
     Raises:
-        FaceDiffError: if it has another number of vertices.
+        OptionError: if it has another number of vertices.
     """
     from facediff.mesh import read_mesh
 
     if mesh is None:
         return None
     drawn = read_mesh(Path(mesh))
-    if len(drawn.vertices) != count:
-        raise OptionError.naming(f"{{mesh}} {mesh}: has {len(drawn.vertices)} vertices, the checkpoint {count}")
+    if len(drawn.vertices) != points:
+        raise OptionError.naming(f"{{mesh}} {mesh}: has {len(drawn.vertices)} vertices, the checkpoint {points}")
     return torch.as_tensor(drawn.faces).long()
 
 
-def rate_of(dataset: DatasetFacts, method: Recogniser, option: object) -> float:
-    """Frames a second: those of the data set or of the method, or as the user says where the method lets choose.
-
-    Raises:
-        FaceDiffError: if they are no positive number.
-    """
-    rate = read_value(option) if method.frame_rate is not None else None
-    if rate is None:
-        return method.frame_rate or dataset.frame_rate
-    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate <= FRAME_RATES[1]:
-        raise OptionError.naming(
-            f"{{option}} frame_rate={quoted(rate)}: expected frames a second, such as {method.frame_rate or 0:g}"
-        )
-    return float(rate)
+# Options.
 
 
 def read_config(config: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     """The configuration of an audio encoder.
 
     Raises:
-        FaceDiffError: if the file cannot be read, or holds no options by name.
+        OptionError: if the file holds no options by name.
     """
     if config is None or isinstance(config, Mapping):
         return config
-    path, remedy = Path(config), "expected the config.json of the audio encoder"
-    content = load_json(path, name=f"--audio-config {path}", remedy=remedy)
+    content = load_json(Path(config), name=f"--audio-config {config}", remedy="expected the config.json of the network")
     if not isinstance(content, dict):
-        raise OptionError.naming(f"{{audio_config}} {path}: holds no options by name; {remedy}")
+        raise OptionError.naming(f"{{audio_config}} {config}: holds no options by name; expected config.json")
     return content
 
 
-def with_options(method: str, converted: dict[str, Any], chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """A model's options with those that the user gives, which may be its audio encoder's as well.
-
-    Raises:
-        FaceDiffError: if there is no such option, or a value does not fit it.
-    """
-    own = options_of(registry.model.get(method))
-    encoders = options_of(component_class(converted["audio_encoder"])) if "audio_encoder" in converted else {}
-    for name in ("n_vertices", "identities", "frame_rate", "space", "audio_encoder"):
-        own.pop(name, None)
-    for name in ("dim", "config", "source"):
-        encoders.pop(name, None)
-    for name, text in chosen.items():
-        if name == "frame_rate" and chooses_rate(method):
-            continue
-        if name not in own and name not in encoders:
-            raise OptionError.naming(
-                f"{{option}} {name}: {method} has no such option: {choices(name, [*own, *encoders])}"
-            )
-        value = read_value(text)
-        hint = (own if name in own else encoders)[name].annotation
-        if not hints.fits(hint, value, stored=True):
-            raise OptionError.naming(f"{{option}} {name}={text}: expected {hints.describe(hint)}")
-        value = hints.convert(hint, value)
-        if name in own:
-            converted = {**converted, name: value}
-        else:
-            converted = {**converted, "audio_encoder": partial(converted["audio_encoder"], **{name: value})}
-    return converted
-
-
-def chooses_rate(method: str) -> bool:
-    """Whether the option ``frame_rate`` belongs to a method; :func:`rate_of` reads it."""
-    return any(entry.method == method and entry.frame_rate is not None for entry in RECOGNISERS)
-
-
-SCIENTIFIC = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
-"""Numbers such as 1e-7, which YAML takes for text unless they have a point."""
-
-
 def read_value(text: object) -> object:
-    """A value from the command line: a number, true, false, null, a list of such, or the text itself.
+    """A value of the command line: a number, true, false, null, a list of such, or the text itself.
 
     >>> read_value("1e-7"), read_value("[1, 2]"), read_value("extend")
     (1e-07, [1, 2], 'extend')
     """
-    if not isinstance(text, str):
-        return text
-    if SCIENTIFIC.fullmatch(text):
-        return float(text)
     try:
-        value: object = yaml.safe_load(text)
-    except yaml.YAMLError:
+        return json.loads(text) if isinstance(text, str) else text
+    except ValueError:
         return text
-    plain = int | float | bool | None
-    listed = isinstance(value, list) and all(isinstance(item, plain) for item in value)
-    return value if listed or isinstance(value, plain) else text
 
 
-def read_assets(facts: CheckpointFacts, options: ImportOptions) -> tuple[Assets, list[str]]:
-    """Faces and regions of the data set, and notes on what is missing.
+def with_options(method: str, given: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
+    """A model's options: those of the files, then those that the user gives; some are its audio encoder's.
 
     Raises:
-        FaceDiffError: if there are no templates, or anything does not fit the number of vertices.
+        OptionError: if there is no such option.
     """
-    from facediff.data.corpus import as_template
-
-    if not facts.space.is_vertices:
-        return with_flame(parametric_assets(facts), options.mesh), []
-    templates, regions, mesh = options.templates, options.regions, options.mesh
-    count, notes = facts.n_vertices, []
-    if templates is None:
-        raise OptionError.naming(
-            "{templates}: no checkpoint holds the neutral faces; give the data set's templates.pkl, as the projects "
-            "take it"
-        )
-    if isinstance(templates, Mapping):
-        faces = {
-            name: torch.from_numpy(as_template("templates", name, value, count)) for name, value in templates.items()
-        }
-    else:
-        faces = read_templates(Path(templates), count)
-    if not faces:
-        raise OptionError.naming(f"{{templates}} {templates}: holds no faces; give the data set's templates.pkl")
-    everything = torch.arange(count)
-    indices = {"lips": everything, "upper_face": everything}
-    if regions is None:
-        notes.append(
-            "no --regions: until it is tested on a corpus, its lips and upper face stand for all vertices, so scores "
-            "by region mean nothing"
-        )
-    else:
-        for name, file in (("lips", "lve.txt"), ("upper_face", "fdd.txt")):
-            indices[name] = read_region(Path(regions) / file, count)
-    triangles = read_triangles(mesh, count)
-    if triangles is None:
-        notes.append("no --mesh: its faces have no triangles, so they can be written but not drawn")
-    unit = dataset_facts()[facts.dataset].unit
-    if count != dataset_facts()[facts.dataset].n_vertices:
-        unit = "m"
-    assets = Assets(
-        corpus=facts.dataset,
-        synthetic=False,
-        unit=unit,
-        frame_rate=facts.frame_rate,
-        identities=facts.identities,
-        templates=faces,
-        faces=triangles,
-        colours=None,
-        regions=indices,
-    )
-    return assets, notes
-
-
-def parametric_assets(facts: CheckpointFacts) -> Assets:
-    """Faces at rest, whose channels are all 0, and the regions by the channels' names."""
-    rest = torch.zeros(facts.n_vertices, 1)
-    named = {name: torch.tensor(facts.space.region(name), dtype=torch.long) for name in ("lips", "upper_face")}
-    regions = {name: channels if len(channels) else torch.arange(len(rest)) for name, channels in named.items()}
-    return Assets(
-        corpus=facts.dataset,
-        synthetic=False,
-        unit="m",
-        frame_rate=facts.frame_rate,
-        identities=facts.identities,
-        templates=dict.fromkeys(facts.identities, rest),
-        faces=None,
-        regions=regions,
-        space=facts.space,
-    )
-
-
-def read_region(path: Path, n_vertices: int) -> Tensor:
-    """Indices of a region's vertices.
-
-    Raises:
-        FaceDiffError: if the file cannot be read, or names vertices that do not exist.
-    """
-    try:
-        region = Region.from_file(path, n_vertices=n_vertices)
-    except ValueError as error:
-        raise OptionError.naming(f"{{regions}} {path.parent}: {error}") from error
-    return torch.tensor(region.indices)
-
-
-def build(
-    weights: AuthorsWeights, method: Recogniser, facts: CheckpointFacts, options: dict[str, Any]
-) -> AnimationModel:
-    """The model with the authors' weights.
-
-    Raises:
-        FaceDiffError: if a tensor is missing or of another shape.
-    """
-    model: AnimationModel = registry.model.get(method.method)(
-        **facts.sizes(),
-        **options,
-    )
-    own = model.state_dict()
-    own.pop("geometry", None)  # what channels count in training, which no author's file holds
-    for name, value in own.items():
-        if name not in weights.renamed:
-            raise FaceDiffError(
-                f"{weights.source}: lacks the tensor {weights.authors_name(name)}; give the checkpoint of the whole "
-                f"model, as its authors distribute it"
+    own = options_of(registry.model.get(method)).keys() - {"n_vertices", "identities", "frame_rate", "space"}
+    encoder = given.get("audio_encoder")
+    encoders = options_of(component_class(encoder)).keys() - {"dim", "config", "source"} if encoder else set()
+    options: dict[str, Any] = {}
+    for name, text in {**given, **asked}.items():
+        if name in own:
+            options[name] = read_value(text) if name in asked else text
+        elif name in encoders and encoder is not None:
+            encoder = partial(encoder, **{name: read_value(text)})
+        else:
+            raise OptionError.naming(
+                f"{{option}} {name}: {method} has no such option: {choices(name, [*own, *encoders])}"
             )
-        if weights.renamed[name].shape != value.shape:
-            raise FaceDiffError(
-                f"{weights.source}: its tensor {weights.authors_name(name)} has the shape "
-                f"{tuple(weights.renamed[name].shape)}, expected {tuple(value.shape)}; it does not fit the other "
-                f"tensors, or an option"
-            )
-    if extra := [weights.authors_name(name) for name in sorted(weights.renamed.keys() - own.keys())]:
-        raise FaceDiffError(
-            f"{weights.source}: {method.method} has no place for {listed(extra)}; it does not fit the other tensors"
-        )
-    check_weights(weights.source, weights.renamed, own)
-    renamed = {name: value.to(own[name].dtype) for name, value in weights.renamed.items()}
-    model.load_state_dict(model.state_dict() | renamed)
-    for name, value in model.state_dict().items():
-        if not value.isfinite().all():
-            raise FaceDiffError(
-                f"{weights.source}: its tensor {weights.authors_name(name)} holds NaN or infinity; the file is damaged"
-            )
-    return model
+    return options if encoder is None else {**options, "audio_encoder": encoder}
 
 
-def label(model: AnimationModel, method: Recogniser, dataset: str, data_licences: tuple[Licence, ...] = ()) -> None:
+# The model.
+
+
+def label(model: AnimationModel, card: Card, facts: Facts) -> None:
     """Keep the data set's class with the model, and the licences of weights, data set and pretrained network.
 
     By the class, ``facediff test`` knows what to read; where its folder is, no checkpoint knows.
     """
     corpora: list[Any] = [entry.implementation for entry in registry.corpus]
-    corpus = next((corpus for corpus in corpora if corpus.corpus_name == dataset), None)
-    data = corpus.corpus_licence() if corpus is not None else Licence(f"corpus {dataset}")
+    corpus = next((corpus for corpus in corpora if corpus.corpus_name == facts.dataset), None)
+    data = corpus.corpus_licence() if corpus is not None else Licence(f"corpus {facts.dataset}")
     if corpus is not None:
         model.data_source = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}"}
-    weights = Licence(f"weights of {method.method}", method.licence, method.commercial, method.licence_source)
-    model.provenance = {IMPORTED: method.method}
-    model.licences = merged([weights], data_licences or [data], network_licences(dict(model.hparams)))
-
-
-def listed(names: Sequence[str]) -> str:
-    """Some names for a message."""
-    shown = ", ".join(quoted(name).strip("'") for name in names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
+    weights = Licence(f"weights of {card.method}", card.licence, card.commercial, card.licence_source)
+    model.provenance = {IMPORTED: card.method}
+    model.licences = merged([weights], facts.licences or [data], network_licences(dict(model.hparams)))
 
 
 def save_model(model: AnimationModel, path: Path) -> None:
@@ -647,3 +484,38 @@ def save_model(model: AnimationModel, path: Path) -> None:
     trainer.strategy.connect(model)
     with atomic(path) as temporary:
         trainer.save_checkpoint(temporary, weights_only=True)
+
+
+# What differs, of files that cannot be imported.
+
+MOST = 40
+"""Tensors of one kind that are listed one by one."""
+
+
+def examine(paths: Sequence[Path], options: ImportOptions) -> Iterator[str]:
+    """Lines of a report on files and on what the import would make of them; an error ends it.
+
+    Args:
+        paths: as :func:`import_checkpoint` takes them.
+        options: the user's, by which the import would be tried.
+    """
+    for path in paths:
+        if path.is_file():
+            with path.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            yield f"{path}: {path.stat().st_size} bytes, sha256 {digest}"
+    try:
+        found = convert(paths, options)
+    except FaceDiffError as error:
+        yield f"stops at: {error}"
+        return
+    card, difference = found.files.card, found.difference
+    yield f"method: {card.method}; released: {', '.join(release['file'] for release in card.releases)}"
+    for kind, names in {
+        **vars(difference),
+        "not needed": [f"{n} ({w})" for n, w in found.files.ignored.items()],
+    }.items():
+        yield from (f"{kind.replace('_', ' ')}: {name}" for name in names[:MOST])
+        if len(names) > MOST:
+            yield f"{kind.replace('_', ' ')}: {len(names) - MOST} more"
+    yield f"{len(found.weights)} tensors: {'all fit' if difference.fits else 'they do not fit, see above'}"

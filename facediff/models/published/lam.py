@@ -8,9 +8,9 @@ checkpoint. docs/methods.md says what of the published code is an option here.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -25,17 +25,19 @@ from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress, with_speech
 from facediff.models.layers import Heads, Share, Width, exporting, frame_mask
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
-from facediff.models.published.convolutions import AUTHORS_NAMES, ConvolutionStack
+from facediff.models.published.convolutions import ConvolutionStack
 from facediff.models.published.lam_finishing import CONTEXT_FRAMES, Finish, Finishing
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, register
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import Space
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
+if TYPE_CHECKING:
+    from facediff.models.published.cards import AuthorFiles, Facts
+
 Chunks = Literal["none", "context", "silence"]
-"""How speech is cut: not at all, as of a file; or into chunks as of the published stream, each after the ``context`` of
-the speech before it as its authors meant, or after ``silence`` as the published code does."""
+"""How speech is cut: not at all, as of a file; or into chunks of a second as of the published stream, each after the
+``context`` of the speech before it as its authors meant, or after ``silence`` as the published code does."""
 
 
 @registry.model.register("LamAudio2Expression")
@@ -53,7 +55,6 @@ class LamAudio2Expression(DirectModel):
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: on the features of speech and in the Transformer.
         chunks: how speech is cut into the published stream's chunks.
-        chunk_seconds: length of a chunk.
         finish: what is done with the weights afterwards, as names joined by ``+``: ``mouth`` (damped in silence),
             ``smooth``, ``symmetric`` as published or ``halves`` as meant, and ``blinks``; see
             :mod:`facediff.models.published.lam_finishing`.
@@ -78,14 +79,13 @@ class LamAudio2Expression(DirectModel):
         feed_forward_dim: Width | None = None,
         dropout: Share = 0.1,
         chunks: Chunks = "none",
-        chunk_seconds: Annotated[float, Range(0.05, 2.1)] = 1.0,
         finish: str = "",
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
         if transformer_layers and dim % num_heads:
             raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of num_heads")
-        self.chunks, self.chunk = chunks, round(chunk_seconds * SAMPLE_RATE)
+        self.chunks: Chunks = chunks
         self.finishing = Finishing.of(finish, self.space, self.frame_rate)
         self.network = LamNetwork(
             audio_width=self.audio_width,
@@ -99,6 +99,13 @@ class LamAudio2Expression(DirectModel):
             hidden_dim=feed_forward_dim or 2 * dim,
             dropout=dropout,
         )
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The map of one-hot speakers is a convolution over one frame."""
+        name = "identity_encoder.id_mlp.weight"
+        files.tensors[name] = files[name].flatten(1)
+        return {}
 
     def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of the speech network, whose convolutions' output is resampled to the frames."""
@@ -134,16 +141,17 @@ class LamAudio2Expression(DirectModel):
                 own = super().generate_frames(clip, frames[row : row + 1], seeds=[seed])[0]
                 finished = finish.whole(own[..., 0].float().cpu().numpy(), speech.float().cpu().numpy())
             else:
-                parts = self.stream_chunks(clip, self.chunk, context=self.chunks == "context", finish=finish)
+                parts = self.stream_chunks(clip, SAMPLE_RATE, context=self.chunks == "context", finish=finish)
                 finished = np.concatenate(list(parts))[:count]
             motion[row, : len(finished)] = torch.from_numpy(finished).to(motion).view(-1, *motion.shape[2:])
         return motion
 
-    def after_network(self) -> dict[str, str]:
+    @property
+    def unexported(self) -> str:
         """How speech is cut and what finishes the weights, if anything."""
-        steps = "+".join(sorted(self.finishing.steps))
-        chosen = {"chunks": "" if self.chunks == "none" else self.chunks, "finish": steps}
-        return {name: value for name, value in chosen.items() if value}
+        chunks = f"chunks={self.chunks}" if self.chunks != "none" else ""
+        finish = f"finish={'+'.join(sorted(self.finishing.steps))}" if self.finishing.steps else ""
+        return " and ".join(filter(None, (chunks, finish)))
 
     def stream_chunks(
         self, clip: Batch, samples: int, *, context: bool, finish: Finish | None = None
@@ -250,66 +258,3 @@ class LamNetwork(nn.Module):
         values = self.motion_out(self.decoder(self.encode(features, weights, mask), mask))
         bounded = self.low + (self.high - self.low) * torch.sigmoid(values)
         return torch.where(self.bounded, bounded, values)
-
-
-# The authors' checkpoints.
-
-PREFIXES = ("module.backbone.", "backbone.", "module.", "")
-"""How the names of the tensors may begin, by how they were trained and saved."""
-
-
-USUAL = 153
-"""The speaker of the published demo of the larger variant; that of the one for streams takes the first."""
-
-
-def count_channels(weights: AuthorsWeights, *, prefix: str) -> int:
-    """Weights of a frame."""
-    return weights.shape(f"{prefix}output_proj.weight")[0]
-
-
-def count_speakers(weights: AuthorsWeights, *, prefix: str) -> int:
-    """Columns of the speakers' map."""
-    return weights.shape(f"{prefix}identity_encoder.id_mlp.weight", 3)[1]
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, prefix: str) -> dict[str, Any]:
-    """The tensors under the names of this file, and the model's options."""
-    encoder = weights.backbone(
-        f"{prefix}audio_encoder.", kind="wav2vec2", facts=facts, **LamAudio2Expression.encoder_settings()
-    )
-    identity = f"{prefix}identity_encoder."
-    weights.ignore(f"{identity}grus.", "a recurrent layer that the published code makes and never uses")
-    weights.move_all(f"{prefix}feature_projection.", "network.audio_map.")
-    rows = weights.get(f"{identity}id_mlp.weight")
-    weights.renamed["network.style.weight"] = rows[..., 0].T.contiguous()
-    weights.move(f"{identity}id_mlp.bias", "network.style_bias")
-    weights.move_all(f"{identity}first_net.conv_layers.", "network.encoder.layers.", AUTHORS_NAMES)
-    weights.move_all(f"{identity}transformer_encoder.layers.", "network.transformer.")
-    weights.move_all(f"{prefix}decoder.0.", "network.decoder.layers.", AUTHORS_NAMES)
-    weights.move_all(f"{prefix}output_proj.", "network.motion_out.")
-    if len(facts.identities) > USUAL:
-        weights.notes.append(f"the published demo of this variant animates identity {facts.identities[USUAL]}")
-    layers = {name.split(".")[2] for name in weights.renamed if name.startswith("network.transformer.")}
-    dim, _ = weights.shape(f"{prefix}feature_projection.weight")
-    sizes: dict[str, Any] = {"dim": dim, "identity_dim": rows.shape[0], "transformer_layers": len(layers)}
-    if layers:
-        sizes["feed_forward_dim"] = weights.shape(f"{identity}transformer_encoder.layers.0.linear1.weight")[0]
-    return {"audio_encoder": encoder, **sizes}
-
-
-for start in PREFIXES:
-    register(
-        Recogniser(
-            method="LamAudio2Expression",
-            marks=tuple(f"{start}{name}" for name in ("identity_encoder.id_mlp.weight", "output_proj.weight")),
-            unless=(),
-            convert=partial(convert, prefix=start),
-            vertices=partial(count_channels, prefix=start),
-            count=partial(count_speakers, prefix=start),
-            layout="arkit",
-            frame_rate=30.0,
-            licence="Apache-2.0",
-            commercial="allowed",
-            licence_source="github.com/aigc3d/LAM_Audio2Expression",
-        )
-    )

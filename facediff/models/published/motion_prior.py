@@ -7,21 +7,15 @@ clip and normalise over them, so clips of different lengths never go through the
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.models.published.autoregressive import periodic_positions
+from facediff.models.published.positions import periodic_positions
 from facediff.models.speech_networks import by_lengths
-
-PriorPositions = Literal["constant", "frames"]
-"""What is added to every frame: the position of frame 0, or each frame's own."""
-
-PriorScale = Literal["width", "heads"]
-"""Whose root the attention's scores are divided by: the width of the layer, or that of one head."""
 
 
 class PriorBlock(nn.Module):
@@ -31,15 +25,15 @@ class PriorBlock(nn.Module):
         dim: channels.
         num_heads: attention heads.
         hidden_dim: channels of the feed-forward layer.
-        scale: see :data:`PriorScale`.
+        corrected: divide scores by the root of a head's width, and not of the whole layer's.
     """
 
-    def __init__(self, dim: int, num_heads: int, hidden_dim: int, scale: PriorScale) -> None:
+    def __init__(self, dim: int, num_heads: int, hidden_dim: int, *, corrected: bool) -> None:
         super().__init__()
         self.num_heads = num_heads
         # Published: h^−0.5 of the whole width 1024, where a head has 128 channels. The scores are √8 times smaller than
         # usual and the attention flatter; the released weights were trained with it.
-        self.scale = (dim if scale == "width" else dim // num_heads) ** -0.5
+        self.scale = (dim // num_heads if corrected else dim) ** -0.5
         self.attention_norm, self.hidden_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.project = nn.Linear(dim, 3 * dim, bias=False)
         self.out = nn.Linear(dim, dim)
@@ -72,10 +66,8 @@ class Half(nn.Module):
         num_layers: Transformer layers.
         num_heads: their attention heads.
         hidden_dim: channels of their feed-forward layers.
-        kernel: frames that the convolution sees; odd.
         leak: slope below zero of the activation.
-        scale: see :data:`PriorScale`.
-        positions: see :data:`PriorPositions`.
+        corrected: scores by the root of a head's width, and to each frame its own position.
     """
 
     def __init__(
@@ -85,17 +77,17 @@ class Half(nn.Module):
         num_layers: int,
         num_heads: int,
         hidden_dim: int,
-        kernel: int,
         leak: float,
-        scale: PriorScale,
-        positions: PriorPositions,
+        corrected: bool,
     ) -> None:
         super().__init__()
-        self.leak, self.positions = leak, positions
+        self.leak, self.corrected = leak, corrected
         # Replicated edges, as published: zeros would pull a clip's first and last frames towards the face at rest.
-        self.smooth = nn.Conv1d(dim, dim, kernel, padding=kernel // 2, padding_mode="replicate")
+        self.smooth = nn.Conv1d(dim, dim, 5, padding=2, padding_mode="replicate")
         self.embed = nn.Linear(dim, dim)
-        self.blocks = nn.ModuleList(PriorBlock(dim, num_heads, hidden_dim, scale) for _ in range(num_layers))
+        self.blocks = nn.ModuleList(
+            PriorBlock(dim, num_heads, hidden_dim, corrected=corrected) for _ in range(num_layers)
+        )
 
     def forward(
         self, x: Float[Tensor, "batch frames dim"], newest: int | None = None
@@ -107,8 +99,8 @@ class Half(nn.Module):
         # a single frame as well: zeros come of it, as they do of two equal frames.
         x = self.embed(F.layer_norm(smooth, (frames,)).transpose(1, 2))
         # The published table is indexed by the batch's size, 1 at inference, so that every frame gets row 0. The
-        # released weights need this; options ask for true positions.
-        count = 1 if self.positions == "constant" else frames
+        # released weights need this.
+        count = frames if self.corrected else 1
         x = x + periodic_positions(count, dim, count, device=x.device)
         for block in self.blocks[:-1]:
             x = block(x)

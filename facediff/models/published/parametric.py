@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError, OptionError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.checkpoint_content import PersonStyles
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import SpeechStream, Style
 from facediff.models.layers import Heads, Layers, Width
-from facediff.models.published.base import NO_STYLE, Alignment, PublishedModel
-from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder, StylePositions
+from facediff.models.published.base import NO_STYLE, PublishedModel
+from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder
 from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
@@ -31,18 +31,17 @@ hardly moves would otherwise be blown up to noise."""
 class ParametricModel(PublishedModel):
     """Base of the published methods that generate parameters, in windows of their own and of speech of any length.
 
+    Class attributes:
+        jaw_opens: whether a jaw's axis-angle is generated about x alone, the others being their mean.
+
     Args:
         head: generate the head's rotation, where the space has one; else it stays at rest.
-        jaw: of a jaw's axis-angle: ``all``, or its ``x`` alone, the others being their mean.
         shape_dim: coefficients of a person's shape that the network is conditioned on.
-        alignment: speech is interpolated to the frames.
         unseen_identity: as in :class:`facediff.models.AnimationModel`; the methods know a speaker by a style clip.
         style_dim: channels of the style.
         style_layers: layers of the style encoder.
         style_heads: its attention heads.
         style_rows: rows of its table of positions.
-        style_positions: ``published`` gives all frames of a style clip the same position, so that their order has no
-            influence; ``frames`` gives each its own.
         options: those of :class:`~facediff.models.published.base.PublishedModel`.
 
     Attributes:
@@ -50,6 +49,8 @@ class ParametricModel(PublishedModel):
             which initial weights depend.
     """
 
+    interpolates: ClassVar[bool] = True
+    jaw_opens: ClassVar[bool] = True
     style_encoder: ClipStyleEncoder
 
     motion_mean: Tensor
@@ -60,18 +61,15 @@ class ParametricModel(PublishedModel):
         self,
         *,
         head: bool = True,
-        jaw: Literal["x", "all"] = "x",
         shape_dim: Annotated[int, Range(0, 1000)] = 0,
-        alignment: Alignment = "interpolated",
         unseen_identity: IdentityPolicy = "style_only",
         style_dim: Width = 128,
         style_layers: Layers = 4,
         style_heads: Heads = 4,
         style_rows: Annotated[int, Range(2, 100_000)] = TABLE_ROWS,
-        style_positions: StylePositions = "published",
         **options: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(alignment=alignment, unseen_identity=unseen_identity, **options)
+        super().__init__(unseen_identity=unseen_identity, **options)
         if style_dim % style_heads or style_dim % 2:
             raise ArgumentError({"style_dim": style_dim}, "it must be even, and a multiple of its attention heads")
         self.plan_long_speech("extend")  # the methods cut speech into windows by themselves
@@ -79,7 +77,7 @@ class ParametricModel(PublishedModel):
         turned = () if self.space.is_vertices else self.space.rotations
         still = {place for turn in turned if turn.joint == "head" and not head for place in turn.channels}
         for turn in turned:
-            if turn.joint == "jaw" and turn.form == "axis_angle" and jaw == "x":
+            if turn.joint == "jaw" and turn.form == "axis_angle" and self.jaw_opens:
                 still |= {*turn.channels[1:]}
         self.modelled = tuple(place for place in range(numbers) if place not in still)
         turning = self.space.head if not self.space.is_vertices else ()
@@ -94,7 +92,6 @@ class ParametricModel(PublishedModel):
             num_heads=style_heads,
             feed_forward_dim=4 * style_dim,
             rows=style_rows,
-            positions=style_positions,
         )
         self.register_buffer("motion_mean", torch.zeros(numbers))
         self.register_buffer("motion_std", torch.ones(numbers))
@@ -164,11 +161,6 @@ def window_at(
 
 def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Tensor, Tensor]:
     """Mean and deviation of some arrays of a file of statistics (``exp_mean``, ``exp_std`` …), one after the other."""
-    for name in (f"{key}_{part}" for key in keys for part in ("mean", "std")):
-        if not isinstance(content.get(name), Tensor) and np.asarray(content.get(name)).dtype.kind not in "fiu":
-            raise OptionError.naming(
-                f"{{statistics}}: has no numbers {name}; expected the file of the method's authors"
-            )
     mean, deviation = (
         torch.cat([torch.as_tensor(content[f"{key}_{name}"]).float().flatten() for key in keys])
         for name in ("mean", "std")

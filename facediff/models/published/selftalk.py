@@ -8,7 +8,7 @@ reader, the authors' checkpoints. docs/methods.md says what of the published cod
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -34,12 +34,14 @@ from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion
 from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
 from facediff.models.published.base import TRAINED_NETWORK, DirectModel, masked_mean, still_map
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, backbone_config, register
+from facediff.models.published.cards import ENCODER_NAMES, renamed
 from facediff.models.squared_errors import squared_errors
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel
+
+    from facediff.models.published.cards import AuthorFiles, Facts
 
 LipReading = Literal["text", "none"]
 """What a lip reader learns from in training: a frozen recogniser's ``text``; with ``none`` there is no lip reader."""
@@ -60,7 +62,6 @@ class SelfTalk(DirectModel):
             Inference needs neither.
         lip_vertices: vertices that the lip reader sees, in its map's order, repeats kept; the corpus's lips if None.
         lip_layers: encoder layers of the lip reader, and as many decoder layers.
-        lip_heads: its attention heads.
         lip_feed_forward_dim: channels between the two maps of its feed-forward layers.
         text_source: the recogniser, a wav2vec 2.0 with a CTC head: a name on the Hugging Face hub or a directory. The
             lip reader has its width and its letters.
@@ -90,7 +91,6 @@ class SelfTalk(DirectModel):
         lip_reader: LipReading = "text",
         lip_vertices: Annotated[list[int], Range(0, 2_000_000, items=(1, 1_000_000))] | None = None,
         lip_layers: Layers = 6,
-        lip_heads: Heads = 8,
         lip_feed_forward_dim: Width = 2048,
         text_source: str = "jonatasgrosman/wav2vec2-large-xlsr-53-english",
         text_config: dict[str, Any] | None = None,
@@ -122,16 +122,11 @@ class SelfTalk(DirectModel):
         self.reader: LipReader | None = None
         self._reader_options: dict[str, Any] = {
             "num_layers": lip_layers,
-            "num_heads": lip_heads,
             "hidden_dim": lip_feed_forward_dim,
             "dropout": dropout,
         }
         if lip_reader == "text":
             self.text = TextNetwork(text_source, text_config)
-            if self.text.width % lip_heads:
-                raise ArgumentError(
-                    {"lip_heads": lip_heads}, f"the recogniser's {self.text.width} channels must be a multiple of them"
-                )
             if lip_vertices is not None:
                 self.reader = self._make_reader(self.text, lip_vertices)
 
@@ -139,6 +134,31 @@ class SelfTalk(DirectModel):
         """Save the arguments as every model does, with the recogniser's configuration in place of its source."""
         config = {} if self.text is None else self.text.network.config.to_dict()
         super().keep_hyperparameters({**arguments, "text_config": config})
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The lip reader and its recogniser, which only training needs, are left out unless they are asked for.
+
+        Raises:
+            OptionError: if the vertices that the lip reader sees are not given; no file holds them.
+        """
+        if asked.get("lip_reader") != "text":
+            for prefix in ("text_encoder.", "lip_map.", "transformer.", "lm_head."):
+                files.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")
+            return {"lip_reader": "none"}
+        if asked.get("lip_vertices") is None:
+            raise OptionError.naming(
+                f"{{option}} lip_reader=text: no file holds the {files.size('lip_map.weight', 1) // 3} vertices that "
+                f"the lip reader sees; give them in the authors' order as {{option}} lip_vertices=[0,1,...]"
+            )
+        for name in files.beginning("text_encoder."):
+            files.tensors[renamed(name, (("^text_encoder", "text.network"), *ENCODER_NAMES))] = files.tensors.pop(name)
+        config = files.backbone("text.network.wav2vec2.", "wav2vec2", asked["audio_config"] or {})
+        return {
+            "lip_layers": files.count("transformer.encoder.layers."),
+            "lip_feed_forward_dim": files.size("transformer.encoder.layers.0.linear1.weight", 0),
+            "text_config": config | {"vocab_size": files.size("text.network.lm_head.weight", 0)},
+        }
 
     def make_parts(self, assets: Assets) -> None:
         """Make the lip reader for the corpus's lips, if it was given no vertices of its own."""
@@ -150,8 +170,6 @@ class SelfTalk(DirectModel):
 
     def _make_reader(self, text: TextNetwork, vertices: Sequence[int]) -> LipReader:
         """A lip reader of these vertices, with the recogniser's width and letters."""
-        if max(vertices) >= self.n_vertices:
-            raise ArgumentError({"lip_vertices": max(vertices)}, f"the faces have {self.n_vertices} vertices")
         return LipReader(vertices, self.dims, dim=text.width, letters=text.letters, **self._reader_options)
 
     @property
@@ -211,8 +229,7 @@ class SelfTalk(DirectModel):
             motion: offsets from the template, in the corpus's unit.
             frames: valid frames of each clip; all if None.
 
-        Raises:
-            FaceDiffError: if the model was made or imported without its lip reader.
+        A model that was made or imported without its lip reader is refused.
         """
         if self.reader is None:
             raise OptionError.naming(
@@ -295,11 +312,11 @@ class LipReader(nn.Module):
         dim: channels, those of the recogniser that it learns from.
         letters: how many there are.
         num_layers: encoder layers, and as many decoder layers.
-        num_heads: attention heads.
         hidden_dim: channels of the feed-forward layers.
         dropout: everywhere.
     """
 
+    HEADS = 8
     columns: Tensor
 
     def __init__(
@@ -310,7 +327,6 @@ class LipReader(nn.Module):
         dim: int,
         letters: int,
         num_layers: int,
-        num_heads: int,
         hidden_dim: int,
         dropout: float,
     ) -> None:
@@ -318,11 +334,11 @@ class LipReader(nn.Module):
         places = dims * torch.tensor(list(vertices))[:, None] + torch.arange(dims)
         self.register_buffer("columns", places.flatten(), persistent=False)
         self.lip_map = nn.Linear(dims * len(vertices), dim)
-        layer = nn.TransformerEncoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
+        layer = nn.TransformerEncoderLayer(dim, self.HEADS, hidden_dim, dropout, batch_first=True)
         # Nested tensors, PyTorch's default here, warn that they are a prototype.
         encoder = nn.TransformerEncoder(layer, num_layers, nn.LayerNorm(dim), enable_nested_tensor=False)
         self.transformer = nn.Transformer(
-            dim, num_heads, num_layers, num_layers, hidden_dim, dropout, custom_encoder=encoder, batch_first=True
+            dim, self.HEADS, num_layers, num_layers, hidden_dim, dropout, custom_encoder=encoder, batch_first=True
         )
         self.lm_head = nn.Linear(dim, letters)
 
@@ -406,90 +422,3 @@ def ctc(
     targets = nn.utils.rnn.pad_sequence(transcripts, batch_first=True)
     logits = letters.float().log_softmax(-1).transpose(0, 1)
     return F.ctc_loss(logits, targets, steps, lengths, blank)
-
-
-# The authors' checkpoints.
-
-LIP_PARTS = ("text_encoder.", "lip_map.", "transformer.", "lm_head.")
-"""How the names of the lip reader's tensors begin, and of those of the recogniser that it learns from."""
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """SelfTalk's tensors under the names of this file, and its options."""
-    encoder = weights.backbone("audio_encoder.", kind="wav2vec2", facts=facts, **SelfTalk.encoder_settings())
-    dim, width = weights.shape("audio_feature_map.weight")
-    channels, _ = weights.shape("audio_encoder.feature_projection.projection.weight")
-    if "alignment" not in facts.model_options and (width == 2 * channels) != (facts.frame_rate == 25.0):
-        heard = "pairs of steps of speech, as at 25" if width == 2 * channels else "single steps of speech, as at 30"
-        raise OptionError.naming(
-            f"{{dataset}} {facts.dataset}: {weights.source} takes {heard} frames a second, and {facts.dataset} has "
-            f"{facts.frame_rate:g}; give the data set that it was trained on"
-        )
-    hidden, _ = weights.shape("transformer_decoder.layers.0.linear1.weight")
-    weights.move_all("audio_feature_map.", "network.audio_map.")
-    weights.move_all("transformer_decoder.", "network.decoder.")
-    weights.move_all("vertice_map_r.", "network.motion_out.")
-    options: dict[str, Any] = {
-        "audio_encoder": encoder,
-        "dim": dim,
-        "num_layers": count_layers(weights, "transformer_decoder.layers."),
-        "feed_forward_dim": hidden,
-        "lip_reader": "none",
-    }
-    if facts.model_options.get("lip_reader") != "text":
-        for prefix in LIP_PARTS:
-            weights.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")
-        return options
-    return {**options, **convert_reader(weights, facts)}
-
-
-def convert_reader(weights: AuthorsWeights, facts: CheckpointFacts) -> dict[str, Any]:
-    """The lip reader's tensors and the recogniser's, and their options.
-
-    Raises:
-        FaceDiffError: if the vertices that the lip reader sees are not given; no file holds them.
-    """
-    _, columns = weights.shape("lip_map.weight")
-    lip_vertices = facts.model_options.get("lip_vertices")
-    if lip_vertices is None and columns != 3 * facts.n_vertices:
-        raise OptionError.naming(
-            f"{{option}} lip_reader=text: no file holds the {columns // 3} vertices that the lip reader sees; give "
-            f"them in the authors' order as {{option}} lip_vertices=[0,1,...], or omit the option, which animation "
-            f"does not need"
-        )
-    prefix = "text_encoder.wav2vec2."
-    config = backbone_config(weights, prefix, "wav2vec2", facts.audio_config)
-    if f"{prefix}masked_spec_embed" not in weights:
-        config.update(mask_time_prob=0.0, mask_feature_prob=0.0)
-    old = ("weight_g", "parametrizations.weight.original0"), ("weight_v", "parametrizations.weight.original1")
-    weights.move_all("text_encoder.", "text.network.", old)
-    config["vocab_size"], _ = weights.shape("text_encoder.lm_head.weight")
-    hidden, _ = weights.shape("transformer.encoder.layers.0.linear1.weight")
-    for part in LIP_PARTS[1:]:
-        weights.move_all(part, f"reader.{part}")
-    return {
-        "lip_vertices": list(range(facts.n_vertices)) if lip_vertices is None else lip_vertices,
-        "lip_layers": count_layers(weights, "transformer.encoder.layers."),
-        "lip_feed_forward_dim": hidden,
-        "text_config": config,
-    }
-
-
-def count_layers(weights: AuthorsWeights, prefix: str) -> int:
-    """How many layers there are below such names."""
-    return len({name.removeprefix(prefix).split(".")[0] for name in weights.names(prefix)})
-
-
-register(
-    Recogniser(
-        method="SelfTalk",
-        marks=("lip_map.weight", "vertice_map_r.weight", "audio_feature_map.weight"),
-        unless=("PPE.", "obj_vector.", "style_encoder.", "gru."),
-        convert=convert,
-        vertices=lambda weights: weights.shape("vertice_map_r.weight")[0] // 3,
-        count=lambda weights: 0,
-        licence="CC-BY-NC-4.0",
-        commercial="forbidden",
-        licence_source="github.com/psyai-net/SelfTalk_release",
-    )
-)

@@ -1,20 +1,21 @@
 """UniTalker (Fan, Li, Lin, Xiao, Yang: "UniTalker: Scaling up Audio-Driven 3D Facial Animation", 2024).
 
 One network with a head for each kind of face that its eight data sets have: vertices as principal components, weights
-of ARKit's shapes, coefficients of FLAME. Here a model has one head, that of its corpus. From top to bottom: the model
-and its networks; the authors' checkpoint is read in ``unitalker_checkpoints.py``. docs/methods.md says what of the
+of ARKit's shapes, coefficients of FLAME. Here a model has one head, that of its corpus. From top to bottom: the model,
+its network, the authors' files. docs/methods.md says what of the
 published code is an option here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -22,17 +23,23 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import ArgumentError
+from facediff.errors import ArgumentError, FaceDiffError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress, Style, with_speech
-from facediff.models.layers import Heads, Share, Weight, Width, exporting, frame_mask
+from facediff.models.layers import Heads, Share, Width, exporting, frame_mask
 from facediff.models.published.autoregressive import PeriodicDecoder
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean, still_map
+from facediff.models.published.cards import AuthorFiles, Facts
 from facediff.models.published.convolutions import ConvolutionStack
+from facediff.models.published.import_options import ImportOptions
 from facediff.models.speech_networks import Wav2Vec2Encoder
+from facediff.spaces import VERTICES, Space
+from facediff.spaces.layouts import find_layout, parametric
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.arrays import open_array, read_arrays
+from facediff.utils.licences import Licence
 from facediff.utils.ranges import Range
 
 COMMON = "common"
@@ -40,11 +47,17 @@ COMMON = "common"
 
 DecoderKind = Literal["conv", "transformer"]
 
-Published = Literal["published", "whole"]
-"""How speech beyond 25 s is animated: in the ``published`` windows of 25 s, which overlap by 5 s, or as a ``whole``."""
-
 WINDOW, OVERLAP = 25, 5
 """Seconds of a published window, and of its overlap with the next."""
+
+PERIOD = 30
+"""Frames after which the Transformer's positions and its attention's bias repeat, whatever the frame rate."""
+
+COMPONENT_WEIGHT, VALUE_WEIGHT = 0.01, 1e-4
+"""Of the squared error of principal components, and of a parametric space's values next to that of what they move."""
+
+COMMON_SHARE = 0.1
+"""Share of the clips that are shown with the common style in training."""
 
 
 @registry.model.register("UniTalker")
@@ -58,17 +71,10 @@ class UniTalker(DirectModel):
         style_dim: channels of a speaker's row, of ``conv``; those of a Transformer are ``dim``.
         decoder_type: ``conv``, as the released models, or ``transformer``.
         num_heads: attention heads of the Transformer.
-        period: frames after which its positions and its attention's bias repeat.
         dropout: on the features of speech, and in the Transformer.
         components: principal components of the training motion that the head of a corpus of vertices predicts; 0 for
             the vertices themselves, as of weights.
-        component_weight: of the squared error of these components.
-        value_weight: of the squared error of the values of a parametric space, next to that of what they move.
-        common_share: share of the clips that are shown as of nobody in training.
         frozen_epochs: epochs in the beginning in which the speech network is not trained.
-        long_windows: how speech beyond 25 s is animated.
-        normalize_windows: standardise each published window once more, after the standardisation of all speech, as the
-            published code does where its speech network asks for it.
         options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
@@ -85,26 +91,17 @@ class UniTalker(DirectModel):
         style_dim: Width = 64,
         decoder_type: DecoderKind = "conv",
         num_heads: Heads = 4,
-        period: Annotated[int, Range(1, 100_000)] = 30,
         dropout: Share = 0.1,
         components: Annotated[int, Range(0, 16_384)] | None = None,
-        component_weight: Weight = 0.01,
-        value_weight: Weight = 1e-4,
-        common_share: Share = 0.1,
         frozen_epochs: Annotated[int, Range(0, 10**6)] = 1,
-        long_windows: Published = "published",
-        normalize_windows: bool = True,
         unseen_identity: IdentityPolicy = "style_only",
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(unseen_identity=unseen_identity, **options)
         if decoder_type == "transformer" and (dim % num_heads or dim % 2):
             raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
-        self.component_weight, self.value_weight = component_weight, value_weight
-        self.common_share, self.frozen_epochs = common_share, frozen_epochs
-        self.long_windows, self.normalize_windows = long_windows, normalize_windows
-        if long_windows == "published":
-            self.windows = type(self.windows)(above=math.inf)
+        self.frozen_epochs = frozen_epochs
+        self.windows = type(self.windows)(above=math.inf)  # the method has windows of its own
         if components is None:
             components = 512 if self.space.is_vertices else 0
         self.network = UniTalkerNetwork(
@@ -115,7 +112,6 @@ class UniTalker(DirectModel):
             style_dim=dim if decoder_type == "transformer" else style_dim,
             decoder_type=decoder_type,
             num_heads=num_heads,
-            period=period,
             dropout=dropout,
             components=components,
         )
@@ -128,6 +124,33 @@ class UniTalker(DirectModel):
             mean, shapes = data.principal_motion(count)
             self.network.attach(mean * self.scale, shapes * self.scale)
         return principal
+
+    @classmethod
+    def author_facts(cls, files: AuthorFiles, options: ImportOptions) -> Facts:
+        """The chosen data set's faces."""
+        return faces_of(files, options)
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The rows of the table and the head of one data set, and its principal components."""
+        data, first, count = facts.details["data"], facts.details["first"], len(facts.identities)
+        table, head = files[TABLE], f"out_head_dict.{data['head']}."
+        files.tensors[TABLE] = torch.cat([table[first : first + count], table[-1:]])
+        for name in files.beginning("out_head_dict."):
+            if name.startswith(head):
+                files.tensors[f"network.head.{name.removeprefix(head)}"] = files.tensors.pop(name)
+            else:
+                files.ignore(name, f"a head for other faces than those of {facts.dataset}; import it with --dataset")
+        components = 0
+        if facts.space.is_vertices:
+            components = files.size("network.head.weight", 0)
+            mean, basis = components_of(facts.details["root"], data, components)
+            files.tensors |= {"network.mean": mean, "network.basis": basis}
+        kind: DecoderKind = "transformer" if "decoder.PPE.pe" in files.tensors else "conv"
+        style = {} if kind == "transformer" else {"style_dim": table.shape[1]}
+        # The published B model hears the waveform as it is, the L model what is standardised.
+        normalised = not any("rel_attn_embed" in name for name in files.tensors)
+        return {"components": components, "decoder_type": kind, "do_normalize": normalised, **style}
 
     # Speakers: one row more than identities.
 
@@ -170,8 +193,8 @@ class UniTalker(DirectModel):
             # Gradients of zero, and not none: every process must give every weight one.
             features = features.detach() + 0.0 * (features - features.detach())
         weights = self.identity_weights(batch)
-        if self.training and self.common_share:
-            drawn = torch.rand(len(weights), generator=generator, device=weights.device) < self.common_share
+        if self.training:
+            drawn = torch.rand(len(weights), generator=generator, device=weights.device) < COMMON_SHARE
             weights = torch.where(drawn[:, None], self.weights_of(torch.full_like(batch.identity, -1)), weights)
         mask = frame_mask(frames, features.shape[1])
         coded = self.network.head(self.network(features, weights, mask))
@@ -183,19 +206,19 @@ class UniTalker(DirectModel):
         loss = reconstruction
         if not self.space.is_vertices:
             losses["values"] = masked_mean(difference.square(), frames)
-            loss = loss + self.value_weight * losses["values"]
+            loss = loss + VALUE_WEIGHT * losses["values"]
         if self.network.components:
             own = self.network.coefficients(truth.flatten(2))
             losses["components"] = masked_mean((coded - own).square(), frames)
-            loss = loss + self.component_weight * losses["components"]
+            loss = loss + COMPONENT_WEIGHT * losses["components"]
         return {**losses, "loss": loss}
 
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """In one pass, or of long speech in the published windows."""
-        batch, whole = self.standardised(batch), self.long_windows == "whole" or exporting()
-        if whole or int(batch.audio_lengths.max()) <= WINDOW * SAMPLE_RATE:
+        batch = self.standardised(batch)
+        if exporting() or int(batch.audio_lengths.max()) <= WINDOW * SAMPLE_RATE:
             return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
         motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
         for row, count in enumerate(frames.tolist()):
@@ -209,10 +232,7 @@ class UniTalker(DirectModel):
         The second time changes little of a short clip, but a window of long speech then has a level of its own.
         """
         encoder = self.audio_encoder
-        own_level = (
-            not getattr(encoder, "do_normalize", False) or encoder.has_level or batch.cached_features is not None
-        )
-        if own_level or not self.normalize_windows:
+        if not getattr(encoder, "do_normalize", False) or encoder.has_level or batch.cached_features is not None:
             return batch
         audio = encoder.standardise(batch.audio, batch.audio_lengths, encoder.epsilon)  # type: ignore[arg-type]
         return replace(batch, audio=audio)
@@ -226,8 +246,7 @@ class UniTalker(DirectModel):
         for number in range(count):
             samples = speech[number * step : number * step + window]
             piece = with_speech(clip, samples, max(1, self.frames_of(len(samples))))
-            with self.level_of(speech):
-                now = super().generate_frames(piece, piece.frame_lengths, seeds=[0])[0]
+            now = super().generate_frames(piece, piece.frame_lengths, seeds=[0])[0]
             first = round(number * (WINDOW - OVERLAP) * self.frame_rate)
             before = motion[first : first + len(now)]
             # Both ends of the overlap are of one window alone, as published.
@@ -235,13 +254,6 @@ class UniTalker(DirectModel):
             mixed = (1 - share) * before + share * now[: len(before)]
             motion = torch.cat([motion[:first], mixed.to(now), now[len(before) :]])
         return motion
-
-    def level_of(self, speech: Float[Tensor, " samples"]) -> AbstractContextManager[None]:
-        """Within it, windows are standardised by the level of all speech, unless each has its own."""
-        encoder = self.audio_encoder
-        if self.normalize_windows or encoder.has_level:
-            return nullcontext()
-        return encoder.at_level(float(speech.mean()), float((speech.var(correction=0) + 1e-7).sqrt()))
 
 
 class UniTalkerNetwork(nn.Module):
@@ -255,7 +267,6 @@ class UniTalkerNetwork(nn.Module):
         style_dim: channels of a speaker's row.
         decoder_type: what stands between speech and head.
         num_heads: attention heads of a Transformer.
-        period: of its positions and its attention's bias.
         dropout: on the features, or in the Transformer.
         components: linear shapes that the head predicts the coefficients of; 0 for motion itself.
     """
@@ -270,7 +281,6 @@ class UniTalkerNetwork(nn.Module):
         style_dim: int,
         decoder_type: DecoderKind,
         num_heads: int,
-        period: int,
         dropout: float,
         components: int,
     ) -> None:
@@ -282,7 +292,7 @@ class UniTalkerNetwork(nn.Module):
         self.transformer = None
         if decoder_type == "transformer":
             self.transformer = PeriodicDecoder(
-                dim=dim, num_layers=1, num_heads=num_heads, hidden_dim=2 * dim, dropout=dropout, period=period, steps=1
+                dim=dim, num_layers=1, num_heads=num_heads, hidden_dim=2 * dim, dropout=dropout, period=PERIOD, steps=1
             )
         self.components = components
         self.head = still_map(dim, components or coordinates)
@@ -329,3 +339,114 @@ class UniTalkerNetwork(nn.Module):
         assert self.mean is not None  # noqa: S101
         assert self.basis is not None  # noqa: S101
         return (motion - self.mean) @ (self.basis / self.basis.square().sum(1, keepdim=True).clamp_min(1e-12)).T
+
+
+# The authors' files.
+
+TABLE, DEFAULT = "decoder.learnable_style_emb.weight", "D3"
+"""The table of speakers of all data sets, and the data set whose faces are animated by default."""
+
+
+def space_of(name: str) -> Space:
+    """What the numbers of a head mean; FLAME's 413 with the 300 of the shape, which the released model predicts too."""
+    if not name:
+        return VERTICES
+    layout = find_layout(name)
+    if not layout.identity:
+        return layout.space
+    turns: dict[int, Any] = {rotation.start: (rotation.joint, rotation.form) for rotation in layout.space.rotations}
+    inside = {channel for rotation in layout.space.rotations for channel in rotation.channels}
+    parts: list[Any] = [f"shape {layout.identity}"]
+    for place, channel in enumerate(layout.space.channels):
+        if place in turns:
+            parts.append(turns[place])
+        elif place not in inside:
+            parts.append(channel)
+    return parametric("flame", parts, version=layout.space.version)
+
+
+def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
+    """The chosen data set's frame rate, speakers and neutral face.
+
+    Raises:
+        FaceDiffError: if there is no such data set, or its files are missing or do not fit.
+    """
+    known, name = files.card.data, options.dataset or DEFAULT
+    if name not in known:
+        raise OptionError.naming(f"{{dataset}} {name}: UniTalker has no such data set: {choices(name, known)}")
+    data, rows = known[name], files.size(TABLE, 0)
+    # A checkpoint with another number of rows was trained on one data set alone.
+    alone = rows != sum(entry["speakers"] for entry in known.values()) + 1
+    count = rows - 1 if alone else data["speakers"]
+    if alone and options.identities is None:
+        raise OptionError.naming(
+            f"{files.source}: has {rows} rows of speakers, which are not those of all data sets together; give "
+            f"{{identities}} with {count} names, if it was trained on {name} alone"
+        )
+    names = list(options.identities or [f"{name}_{row}" for row in range(count)])
+    if len(names) != count:
+        raise OptionError.naming(f"{{identities}}: {len(names)} names are given, and {name} has {count} speakers")
+    root, notes = options.data_root, []
+    row = data.get("template_row", 0) if options.template_row is None else options.template_row
+    faces = np.zeros((row + 1, data["width"]), np.float32)
+    if root is not None:
+        faces = released_array(Path(root) / data["folder"] / "id_template.npy")
+    elif "layout" not in data or options.template_row is not None:
+        raise OptionError.naming(
+            f"{{data_root}}: {files.source} holds neither the neutral faces nor the principal components of its "
+            f"vertices; give the data release, with {data['folder']}/pca.npz and id_template.npy"
+        )
+    else:
+        notes.append("no --data-root: the published code adds the neutral values of id_template.npy, here they are 0")
+    if faces.ndim != 2 or faces.shape[1] != data["width"] or row >= len(faces):
+        raise OptionError.naming(f"{{template_row}} {row}: the neutral faces of {name} have the shape {faces.shape}")
+    space = space_of(data.get("layout", ""))
+    face = torch.from_numpy(faces[row].astype(np.float32) * np.float32(data.get("scale", 1.0))).view(-1, space.dims)
+    licence = Licence(f"corpus {data.get('of', f'UniTalker {name}')}")
+    if "of" in data:
+        licence = Licence(licence.of, "CC-BY-NC-4.0", "forbidden", files.card.licence_source)
+    return Facts(
+        f"UniTalker {name}",
+        data.get("frame_rate", 30.0),
+        names,
+        dict.fromkeys([COMMON, *names], face),
+        space,
+        licences=(licence,),
+        notes=notes,
+        details={
+            "data": data,
+            "first": 0 if alone else sum(entry["speakers"] for key, entry in known.items() if key < name),
+            "root": root,
+        },
+    )
+
+
+def released_array(path: Path) -> np.ndarray:
+    """An array of the data release.
+
+    Raises:
+        OptionError: if there is no such file.
+    """
+    if not path.is_file():
+        raise OptionError.naming(f"{{data_root}}: has no {path}; expected UniTalker's data release")
+    return np.asarray(open_array(path, kinds="f"))
+
+
+def components_of(root: Path, data: Mapping[str, Any], count: int) -> tuple[Tensor, Tensor]:
+    """Mean and principal components of a data set's vertices.
+
+    Raises:
+        FaceDiffError: if the file is missing, or holds others.
+    """
+    path = Path(root) / data["folder"] / "pca.npz"
+    if not path.is_file():
+        raise OptionError.naming(f"{{data_root}}: has no {path}; expected UniTalker's data release")
+    names = ("original_data_mean", "components_to_data")
+    archive = read_arrays(path, names, remedy="download it again")
+    mean, basis = (torch.from_numpy(np.asarray(archive[name], np.float32)) for name in names)
+    if mean.shape != (data["width"],) or basis.dim() != 2 or basis.shape[1] != data["width"] or len(basis) < count:
+        raise FaceDiffError(
+            f"{path}: its mean and components have the shapes {tuple(mean.shape)} and {tuple(basis.shape)}; expected "
+            f"{data['width']} numbers each, and {count} components"
+        )
+    return mean, basis[:count].contiguous()

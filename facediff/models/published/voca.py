@@ -8,9 +8,9 @@ docs/methods.md says what of the published code is an option here.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -19,24 +19,32 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import OptionError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
 from facediff.models.graphs import Spoken
 from facediff.models.layers import Width, exporting, frame_mask, sliding
 from facediff.models.published.base import DirectModel, SpeakerTable
-from facediff.models.published.recognition import AuthorsWeights, CheckpointFacts, Recogniser, dataset_facts, register
 from facediff.models.squared_errors import squared_errors
 from facediff.speech.windows import FrameClock
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
-from facediff.utils.torch_files import read_authors_checkpoint
+
+if TYPE_CHECKING:
+    from facediff.models.published.cards import AuthorFiles, Facts
 
 PUBLISHED_RATE = 60.0
 """Frames a second of VOCA's motion and of its windows' rows."""
 
 CHANNELS = (32, 32, 64, 64)
 """Channels of the published convolutions."""
+
+
+ENCODER, SCOPES = "SpeechEncoder/", ("SpeechEncoder/", "ExpressionLayer/")
+"""How the names of the authors' variables begin."""
+
+OPTIMISER = ("/Adam", "/Adam_1", "/Momentum", "/RMSProp", "/ExponentialMovingAverage", "global_step", "_power")
+"""How names of what the optimiser keeps end."""
 
 
 @registry.model.register("Voca")
@@ -48,8 +56,6 @@ class Voca(DirectModel):
         components: linear shapes.
         channels: of the convolutions, each of which halves the window.
         speech_window: rows of speech around each frame, half of them before it.
-        rows_per_frame: rows of speech from one frame to the next; as many as bring the rows closest to the published
-            60 a second if None: 1 at 60 frames a second, 2 at 30 and 25.
         velocity_weight: of the error of differences between frames, next to that of the frames.
         shapes: how the linear shapes start: as ``principal`` components of the training motion as published, or
             ``random``.
@@ -65,7 +71,6 @@ class Voca(DirectModel):
         components: Width = 50,
         channels: Annotated[Sequence[Width], Range(items=(1, 16))] = CHANNELS,
         speech_window: Annotated[int, Range(1, 1024)] = 16,
-        rows_per_frame: Annotated[int, Range(1, 1000)] | None = None,
         velocity_weight: Annotated[float, Range(0, 1e9)] = 10.0,
         shapes: Literal["principal", "random"] = "principal",
         **options: Any,  # noqa: ANN401
@@ -74,7 +79,8 @@ class Voca(DirectModel):
         # Frames do not see one another, so that cutting long speech into windows would only cost overlap.
         self.windows = type(self.windows)(above=math.inf)
         self.speech_window, self.velocity_weight, self.shapes = speech_window, velocity_weight, shapes
-        self.rows_per_frame = rows_per_frame or max(1, round(PUBLISHED_RATE / self.frame_rate))
+        # Rows of speech from one frame to the next, as close to the published 60 a second as whole numbers come.
+        self.rows_per_frame = max(1, round(PUBLISHED_RATE / self.frame_rate))
         self.network = VocaNetwork(
             audio_width=self.audio_width,
             n_vertices=self.n_vertices,
@@ -85,6 +91,47 @@ class Voca(DirectModel):
             dim=dim,
             components=components,
         )
+
+    @classmethod
+    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """TensorFlow's layouts, the speaker's rows of two layers, and DeepSpeech's graph.
+
+        Raises:
+            OptionError: if the frame rate does not divide the published one, or DeepSpeech is missing.
+        """
+        if PUBLISHED_RATE % facts.frame_rate:
+            raise OptionError.naming(
+                f"{{option}} frame_rate={facts.frame_rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected "
+                f"a rate that divides it, such as 30, which takes every second frame"
+            )
+        for name in list(files.tensors):
+            if name.endswith(OPTIMISER):
+                files.ignore(name, "of the optimiser")
+        graph = {name: files.tensors.pop(name) for name in list(files.tensors) if not name.startswith(SCOPES)}
+        if not graph:
+            raise OptionError.naming(
+                f"{files.source}: holds VOCA without DeepSpeech, whose logits are its input; give the graph of "
+                f"DeepSpeech 0.1.0, converted by tools/convert_tensorflow.py, as a further file"
+            )
+        state, sizes, left = network_of(graph, files.source)
+        files.ignored |= dict.fromkeys(left, "not of VOCA, nor of DeepSpeech's network")
+        count, dense, heard = len(facts.identities), files[f"{ENCODER}fc1/weights"], sizes["logits"]
+        tensors: dict[str, Tensor] = {f"audio_encoder.network.{name}": value for name, value in state.items()}
+        tensors["network.norm.num_batches_tracked"] = torch.tensor(0)
+        tensors["network.dense.weight"], tensors["network.late_style.weight"] = dense[:-count].T, dense[-count:]
+        channels: list[int] = []
+        while (name := f"{ENCODER}conv{len(channels) + 1}/weights") in files.tensors:
+            kernel, to = files.tensors.pop(name)[:, 0], f"network.convolutions.{len(channels)}."
+            if not channels:  # (taps, identities, channels) as one row for each identity
+                tensors["network.early_style.weight"] = kernel[:, heard:].transpose(0, 1).flatten(1)
+                kernel = kernel[:, :heard]
+            tensors[f"{to}weight"] = kernel.permute(2, 1, 0)
+            tensors[f"{to}bias"] = files.tensors.pop(f"{ENCODER}conv{len(channels) + 1}/biases")
+            channels.append(kernel.shape[2])
+        dim = files.size(f"{ENCODER}fc1/weights", 1)
+        del files.tensors[f"{ENCODER}fc1/weights"]
+        files.tensors |= tensors
+        return {"audio_encoder": partial(DeepSpeechEncoder, config=sizes), "channels": channels, "dim": dim}
 
     def personal_modules(self) -> list[nn.Module]:
         """The two tables of speakers."""
@@ -287,141 +334,3 @@ def padded_same(x: Float[Tensor, "*channels rows"], taps: int) -> Float[Tensor, 
     # shift all 16 rows by one.
     missing = max(0, (-(-rows // 2) - 1) * 2 + taps - rows)
     return F.pad(x, (missing // 2, missing - missing // 2))
-
-
-# The authors' checkpoint.
-
-SCOPES = ("VOCA/", "")
-"""How the names of the variables may begin."""
-
-ENCODER, SHAPES = "SpeechEncoder/", "ExpressionLayer/expression_offset/"
-"""How they go on."""
-
-OPTIMISER = ("/Adam", "/Adam_1", "/Momentum", "/RMSProp", "/ExponentialMovingAverage")
-"""How names of what the optimiser keeps end."""
-
-
-def convert(weights: AuthorsWeights, facts: CheckpointFacts, *, scope: str) -> dict[str, Any]:
-    """VOCA's variables under the names of this file, and its options."""
-    encoder, shapes = f"{scope}{ENCODER}", f"{scope}{SHAPES}"
-    for name in list(weights.tensors):
-        last = name.rpartition("/")[2]
-        if name.endswith(OPTIMISER) or last in ("global_step", "beta1_power", "beta2_power"):
-            weights.ignore(name, "of the optimiser")
-    rate = facts.frame_rate
-    if PUBLISHED_RATE % rate:
-        raise OptionError.naming(
-            f"{{option}} frame_rate={rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected a rate that "
-            f"divides it, such as 30, which takes every second frame"
-        )
-    usual = dataset_facts()[facts.dataset].frame_rate
-    if rate != usual:
-        remedy = f"; to test it there, import it with --option frame_rate={usual:g}" * (PUBLISHED_RATE % usual == 0)
-        weights.notes.append(
-            f"it animates at {rate:g} frames a second, and the corpus {facts.dataset} has {usual:g}{remedy}"
-        )
-    if facts.graph is None:
-        raise OptionError.naming(
-            f"{weights.source}: holds VOCA without DeepSpeech, whose logits are its input; give the graph "
-            f"output_graph.pb of DeepSpeech 0.1.0, converted by tools/convert_tensorflow.py, as a further file, or as "
-            f"{{option}} deepspeech=deepspeech.npz"
-        )
-    if facts.audio_config is not None:
-        raise OptionError.naming("{audio_config}: DeepSpeech's graph says all of its sizes by itself; omit the option")
-    state, sizes, left = network_of(read_authors_checkpoint(facts.graph)[0], str(facts.graph))
-    weights.renamed.update({f"audio_encoder.network.{name}": value for name, value in state.items()})
-    weights.ignored.update({f"{facts.graph.name}: {name}": "a constant of the graph" for name in left})
-    count, heard = len(facts.identities), sizes["logits"]
-    channels = convert_convolutions(weights, encoder, heard, count)
-    for old, new in (
-        ("gamma", "weight"),
-        ("beta", "bias"),
-        ("moving_mean", "running_mean"),
-        ("moving_variance", "running_var"),
-    ):
-        weights.move(f"{encoder}batch_norm/{old}", f"network.norm.{new}")
-    weights.renamed["network.norm.num_batches_tracked"] = torch.tensor(0)
-    dense = weights.get(f"{encoder}fc1/weights")
-    weights.renamed["network.dense.weight"] = dense[:-count].T
-    weights.renamed["network.late_style.weight"] = dense[-count:]
-    weights.move(f"{encoder}fc1/biases", "network.dense.bias")
-    for old, new in ((f"{encoder}fc2/", "coefficients"), (shapes, "expression")):
-        weights.shape(f"{old}weights")
-        weights.renamed[f"network.{new}.weight"] = weights.get(f"{old}weights").T
-        weights.move(f"{old}biases", f"network.{new}.bias")
-    return {
-        "audio_encoder": partial(DeepSpeechEncoder, config=sizes),
-        "dim": weights.shape(f"{encoder}fc1/weights")[1],
-        "components": weights.shape(f"{shapes}weights")[0],
-        "channels": channels,
-        "rows_per_frame": round(PUBLISHED_RATE / rate),
-    }
-
-
-def convert_convolutions(weights: AuthorsWeights, encoder: str, heard: int, count: int) -> list[int]:
-    """The convolutions, of which the first sees the speaker too, and their channels.
-
-    Raises:
-        FaceDiffError: if their shapes are others than expected.
-    """
-    channels: list[int] = []
-    into = heard + count
-    while (name := f"{encoder}conv{len(channels) + 1}/weights") in weights or not channels:
-        shape = weights.shape(name, 4)
-        if shape[:3] != (3, 1, into):
-            raise FaceDiffError(
-                f"{weights.source}: its tensor {name} has the shape {shape}, expected (3, 1, {into}, …); it does not "
-                f"fit the other tensors, or {heard} logits and {count} identities"
-            )
-        number, into = len(channels), shape[3]
-        kernel = weights.get(name)[:, 0]
-        if number == 0:
-            # (taps, identities, channels) as one row for each identity.
-            weights.renamed["network.early_style.weight"] = kernel[:, heard:].transpose(0, 1).flatten(1)
-            kernel = kernel[:, :heard]
-        weights.renamed[f"network.convolutions.{number}.weight"] = kernel.permute(2, 1, 0)
-        weights.move(f"{encoder}conv{number + 1}/biases", f"network.convolutions.{number}.bias")
-        channels.append(into)
-    return channels
-
-
-def count_identities(weights: AuthorsWeights, *, scope: str) -> int:
-    """Rows of the first dense layer beyond those of the last convolution, whose window is one row by then.
-
-    Raises:
-        FaceDiffError: if there are none.
-    """
-    last, dense = 1, f"{scope}{ENCODER}fc1/weights"
-    while f"{scope}{ENCODER}conv{last + 1}/weights" in weights:
-        last += 1
-    rows, _ = weights.shape(dense)
-    count = rows - weights.shape(f"{scope}{ENCODER}conv{last}/weights", 4)[3]
-    if count < 1:
-        raise FaceDiffError(
-            f"{weights.source}: its tensor {dense} has {rows} rows, which leave none for the speakers; it does not fit "
-            f"the other tensors"
-        )
-    return count
-
-
-def count_vertices(weights: AuthorsWeights, *, scope: str) -> int:
-    """Vertices by the linear shapes."""
-    return weights.shape(f"{scope}{SHAPES}weights")[1] // 3
-
-
-for prefix in SCOPES:
-    register(
-        Recogniser(
-            method="Voca",
-            marks=(f"{prefix}{ENCODER}conv1/weights", f"{prefix}{ENCODER}fc1/weights", f"{prefix}{SHAPES}weights"),
-            unless=(),
-            convert=partial(convert, scope=prefix),
-            vertices=partial(count_vertices, scope=prefix),
-            count=partial(count_identities, scope=prefix),
-            frame_rate=PUBLISHED_RATE,
-            graph="deepspeech",
-            licence="Max Planck licence for non-commercial scientific research",
-            commercial="forbidden",
-            licence_source="voca.is.tue.mpg.de",
-        )
-    )

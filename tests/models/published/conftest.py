@@ -48,7 +48,6 @@ METHODS: dict[str, dict[str, Any]] = {
         "dim": 16,
         "text_config": TEXT,
         "lip_layers": 1,
-        "lip_heads": 2,
         "lip_feed_forward_dim": 16,
         # So that the lip reader's terms count in whatever is tested.
         "consistency_weight": 1.0,

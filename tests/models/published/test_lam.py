@@ -242,5 +242,5 @@ def test_finishing_is_for_arkit(tmp_path: Path) -> None:
 def test_what_no_graph_does_is_named_before_anything_is_recorded(option: dict[str, str], tmp_path: Path) -> None:
     model = imported(author(tmp_path, 0)[1], **option)
     ((name, value),) = option.items()
-    with pytest.raises(FaceDiffError, match=rf"{name}={re.escape(value)} cannot be exported.* without {name}"):
+    with pytest.raises(FaceDiffError, match=rf"{name}={re.escape(value)} cannot be exported"):
         model.graphs()

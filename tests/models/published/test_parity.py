@@ -8,18 +8,17 @@ import pytest
 import torch
 
 from facediff.models import FaceDiffuser, FaceFormer
-from facediff.models.published.autoregressive import periodic_bias, periodic_positions
+from facediff.models.published.positions import periodic_bias, periodic_positions
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from tests.fakes import published
 from tests.fakes.published import IDENTITIES, RATES, VERTICES
 from tests.models.published.author import face, imported, speech_of
 
 
-@pytest.mark.parametrize("loop", ["cached", "literal"])
 @pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 40), ("vocaset", 205), ("biwi", 41), ("biwi", 58)])
-def test_faceformer(dataset: str, steps: int, loop: str, tmp_path: Path) -> None:
+def test_faceformer(dataset: str, steps: int, tmp_path: Path) -> None:
     state = published.faceformer_state(dataset)
-    model = imported(state, tmp_path, dataset, loop=loop)
+    model = imported(state, tmp_path, dataset)
     assert isinstance(model, FaceFormer)
     speech = speech_of(steps)
     assert model.audio_encoder.steps_of(len(speech)) == steps
@@ -38,11 +37,10 @@ def test_faceformer(dataset: str, steps: int, loop: str, tmp_path: Path) -> None
 FURTHER = [pytest.param(*case, marks=pytest.mark.slow) for case in (("vocaset", 40), ("biwi", 41))]
 
 
-@pytest.mark.parametrize("space", ["once", "every_step"])
 @pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 41), ("biwi", 58), *FURTHER])
-def test_facediffuser(dataset: str, steps: int, space: str, tmp_path: Path) -> None:
+def test_facediffuser(dataset: str, steps: int, tmp_path: Path) -> None:
     state = published.facediffuser_state(6)
-    model = imported(state, tmp_path, dataset, encode_speech=space)
+    model = imported(state, tmp_path, dataset)
     speech = speech_of(steps)
     for number, name in enumerate(IDENTITIES):
         made = model.animate(speech, identity=name, seed=number).vertices.flatten(1)

@@ -15,7 +15,7 @@ from facediff import registry
 from facediff.models.audio_encoders import MelEncoder
 from facediff.utils.hints import defaults
 
-STYLE_ENCODER = {"style_dim": 128, "style_layers": 4, "style_heads": 4, "style_positions": "published"}
+STYLE_ENCODER = {"style_dim": 128, "style_layers": 4, "style_heads": 4}
 PUBLISHED: dict[str, dict[str, Any]] = {
     "FaceFormer": {"num_layers": 1, "num_heads": 4},
     "CodeTalker": {
@@ -24,31 +24,25 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "prior_layers": 6,
         "prior_heads": 8,
         "prior_feed_forward_dim": 1536,
-        "kernel": 5,
         "codes": 256,
         "leak": 0.2,
-        "commitment": 0.25,
-        "quantisation_weight": 1.0,
-        "feature_weight": 1.0,
     },
     "FaceDiffuser": {"num_layers": 2, "dropout": 0.3},
     "DiffSpeaker": {"num_layers": 1, "num_heads": 4},
-    "SelfTalk": {"num_layers": 1, "num_heads": 4, "lip_layers": 6, "lip_heads": 8, "lip_feed_forward_dim": 2048},
+    "SelfTalk": {"num_layers": 1, "num_heads": 4, "lip_layers": 6, "lip_feed_forward_dim": 2048},
     "TalkingStyle": {"num_layers": 6, "num_heads": 4},
     "Voca": {"dim": 128, "components": 50, "channels": (32, 32, 64, 64)},
     "EmoTalk": {"dim": 832, "emotion_dim": 256, "level_dim": 32, "person_dim": 32, "num_layers": 1, "num_heads": 4}
     | {"levels": 2, "level": 1},
     "LamAudio2Expression": {"dim": 512, "identity_dim": 64, "num_heads": 8},
-    "UniTalker": {"dim": 256, "style_dim": 64, "num_heads": 4, "period": 30, "dropout": 0.1}
-    | {"component_weight": 0.01, "value_weight": 1e-4},
+    "UniTalker": {"dim": 256, "style_dim": 64, "num_heads": 4, "dropout": 0.1},
     "DiffPoseTalk": STYLE_ENCODER
     | {"dim": 512, "num_layers": 8, "num_heads": 8, "window_frames": 100, "context": 10, "diffusion_steps": 500}
-    | {"conditions": ("audio", "style"), "guidance": "incremental", "audio_scale": 1.15, "style_scale": 3.0}
-    | {"temperature": 0.1},
+    | {"conditions": ("audio", "style"), "guidance": "incremental", "audio_scale": 1.15, "style_scale": 3.0},
     "ARTalk": STYLE_ENCODER
     | {"dim": 768, "num_layers": 12, "num_heads": 12, "scales": (1, 5, 25, 50, 100), "code_dim": 32}
-    | {"codec_dim": 512, "codec_layers": 8, "codec_heads": 8, "style_scale": 1.1, "memory_chunks": 1}
-    | {"flipped_bits": 0.3, "dropped": 0.1, "smooth": True, "still_jaw": True},
+    | {"codec_dim": 512, "codec_layers": 8, "codec_heads": 8, "style_scale": 1.1}
+    | {"smooth": True, "still_jaw": True},
 }
 
 

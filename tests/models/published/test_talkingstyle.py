@@ -11,18 +11,15 @@ import torch
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import TalkingStyle
-from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.importing import import_files
 from tests.fakes import published
 from tests.fakes.published import IDENTITIES, VERTICES
-from tests.models.published.author import face, imported, sample_of, speech_of, templates
+from tests.models.published.author import face, imported, sample_of, speech_of
 
 
-@pytest.mark.parametrize("loop", ["cached", "literal"])
 @pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 40), ("vocaset", 41), ("biwi", 40), ("biwi", 41)])
-def test_it_gives_what_the_formulas_give(dataset: str, steps: int, loop: str, tmp_path: Path) -> None:
+def test_it_gives_what_the_formulas_give(dataset: str, steps: int, tmp_path: Path) -> None:
     state = published.talkingstyle_state(dataset)
-    model = imported(state, tmp_path, dataset, loop=loop)
+    model = imported(state, tmp_path, dataset)
     assert isinstance(model, TalkingStyle)
     assert len(model.network.decoder.layers) == 3
     speech = speech_of(steps)
@@ -41,15 +38,11 @@ def test_frames_are_counted_in_floating_point(dataset: str, steps: int, frames: 
     torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
 
 
-def test_the_attention_may_weigh_all_components(tmp_path: Path) -> None:
+def test_the_style_is_an_attention_of_each_component_to_itself(tmp_path: Path) -> None:
     state = published.talkingstyle_state("vocaset")
-    for over, free in (("one_key", False), ("components", True)):
-        model = imported(state, tmp_path, "vocaset", style_attention=over)
-        assert isinstance(model, TalkingStyle)
-        made = model.network.style(torch.eye(3))
-        expected = torch.stack([published.talkingstyle_style(state, i, components=free) for i in range(3)])
-        torch.testing.assert_close(made, expected, rtol=0, atol=1e-6)
-        assert model.network.style.query.weight.requires_grad == free
+    model = imported(state, tmp_path, "vocaset")
+    expected = torch.stack([published.talkingstyle_style(state, i) for i in range(3)])
+    torch.testing.assert_close(model.network.style(torch.eye(3)), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("mouth", ["flattened", "vertices"])
@@ -73,9 +66,9 @@ def test_the_loss(dataset: str, frames: int, mouth: str, tmp_path: Path) -> None
 def test_teacher_forcing_in_one_pass(tmp_path: Path) -> None:
     """Each token is the true motion of the frame before; the first is that of a face at rest, with the map's bias."""
     state = published.talkingstyle_state("vocaset")
-    model = imported(state, tmp_path, "vocaset", teacher_forcing=True, mouth_weight=0.0)
+    model = imported(state, tmp_path, "vocaset", teacher_forcing=True)
     truth = 0.1 * torch.randn(24, VERTICES, 3, generator=torch.Generator().manual_seed(1))
-    loss = model.losses(collate([sample_of(speech_of(40), truth, identity=0)]))["loss"]
+    loss = model.losses(collate([sample_of(speech_of(40), truth, identity=0)]))["reconstruction"]
     features = published.features_of(published.standardised(speech_of(40), 1e-7), state, "audio_encoder.")
     features, _ = published.resampled(features, "vocaset", 24)
     memory = published.linear(published.hidden_of(features, state, "audio_encoder."), state, "audio_feature_map")
@@ -90,17 +83,3 @@ def test_speech_beyond_the_table_is_refused(tmp_path: Path) -> None:
     model = imported(published.talkingstyle_state("vocaset"), tmp_path, "vocaset")
     with pytest.raises(FaceDiffError, match="600"):
         model.animate(torch.zeros(16_000 * 21), identity="A")
-
-
-def test_a_table_of_other_speakers_than_the_data_set_has_is_noted(tmp_path: Path) -> None:
-    """As that of mead.pth, which the published code cannot run."""
-    torch.save(published.talkingstyle_state("vocaset"), tmp_path / "mead.pth")
-    made = import_files(
-        tmp_path / "mead.pth",
-        ImportOptions(
-            dataset="vocaset", identities=IDENTITIES, templates=templates(), audio_config=published.AUDIO_CONFIG
-        ),
-    )
-    assert any("mead.pth" in note for note in made.notes)
-    assert set(made.ignored) == {"PPE.pe"}
-    assert {label.commercial for label in made.model.licences} >= {"unknown"}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import re
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -103,14 +101,6 @@ def test_a_style_mixes_vertices(shares: tuple[float, ...], tmp_path: Path) -> No
     torch.testing.assert_close(made.flatten(1), torch.from_numpy(sum(parts)).float(), rtol=0, atol=1e-5)
 
 
-def test_the_graph_may_come_first_or_as_an_option(tmp_path: Path) -> None:
-    model, graph = write_voca(tmp_path)
-    speech = speech_of(3000)
-    expected = imported([model, graph]).animate(speech, identity="C").vertices
-    assert torch.equal(imported([graph, model]).animate(speech, identity="C").vertices, expected)
-    assert torch.equal(imported(model, deepspeech=graph).animate(speech, identity="C").vertices, expected)
-
-
 def test_variables_may_have_no_scope(tmp_path: Path) -> None:
     state = {name.removeprefix("VOCA/"): value for name, value in voca.voca_state().items()}
     index = write_arrays(tmp_path / "bare.npz", state)
@@ -137,105 +127,13 @@ def test_the_command_and_its_checkpoint(
     ]
     assert main([*words, "--templates", "faces.pkl", "-o", "voca.ckpt"]) == 0
     printed = "".join(capsys.readouterr())
-    for expected in ("60 frames", "frame_rate=30", "global_step", "MPL-2.0", "forbidden"):
+    for expected in ("60 frames", "global_step", "MPL-2.0", "forbidden"):
         assert expected in printed
     for name in ("deepspeech.npz", "voca.npz"):
         (tmp_path / name).unlink()
     made = load_model(tmp_path / "voca.ckpt").animate(speech_of(3000), identity="A").vertices
     expected = voca.voca_reference(speech_of(3000).numpy(), 0, templates()["A"])
     torch.testing.assert_close(made.flatten(1), torch.from_numpy(expected).float(), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("options", [{"epsilon": 1e-5}, {"audio_config": {"hidden_size": 16}}, {"alignment": "both"}])
-def test_an_option_of_no_use_is_named(options: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=next(iter(options)).replace("_", "[-_]")):
-        imported(write_voca(tmp_path), **options)
-
-
-def drop(name: str) -> Callable[[voca.Arrays], object]:
-    return lambda state: state.pop(name)
-
-
-CHECKPOINTS: dict[str, tuple[Callable[[voca.Arrays], object], str]] = {
-    "no dense layer": (drop("VOCA/SpeechEncoder/fc2/weights"), "fc2"),
-    "no norm": (drop("VOCA/SpeechEncoder/batch_norm/moving_mean"), "moving_mean"),
-    "no such method": (drop("VOCA/SpeechEncoder/conv1/weights"), "Voca"),
-    "a variable more": (lambda s: s.update({"VOCA/more": np.ones(2, np.float32)}), "VOCA/more"),
-    "other logits": (
-        lambda s: s.update({"VOCA/SpeechEncoder/conv1/weights": np.ones((3, 1, 40, 6), np.float32)}),
-        "conv1",
-    ),
-    "no speakers": (
-        lambda s: s.update({"VOCA/SpeechEncoder/fc1/weights": np.ones((8, 10), np.float32)}),
-        "fc1",
-    ),
-    "another kernel": (
-        lambda s: s.update({"VOCA/SpeechEncoder/conv3/weights": np.ones((5, 1, 6, 8), np.float32)}),
-        "conv3",
-    ),
-    "not finite": (lambda s: s["VOCA/SpeechEncoder/fc1/biases"].fill(np.nan), "fc1/biases"),
-}
-
-
-@pytest.mark.parametrize("name", CHECKPOINTS)
-def test_a_checkpoint_that_does_not_fit_is_named(name: str, tmp_path: Path) -> None:
-    change, named = CHECKPOINTS[name]
-    state = voca.voca_state()
-    change(state)
-    index = write_arrays(tmp_path / "model.npz", state)
-    graph = write_arrays(tmp_path / "graph.npz", voca.deepspeech_state())
-    with pytest.raises(FaceDiffError, match=named) as caught:
-        imported([index, graph])
-    assert str(caught.value).count(". ") <= 1
-
-
-GRAPHS: dict[str, tuple[Callable[[voca.Arrays], object], str]] = {
-    "a layer is missing": (drop("h3"), "h3"),
-    "a cell is missing": (drop("bidirectional_rnn/bw/basic_lstm_cell/bias"), "bw"),
-    "another shape": (lambda s: s.update(h2=np.ones((3, 4), np.float32)), "second"),
-    "another rank": (lambda s: s.update(h2=np.ones((3, 4, 5), np.float32)), "graph.npz"),
-    "other features": (lambda s: s.update(h1=np.ones((80, 12), np.float32)), "inputs"),
-    "not finite": (lambda s: s["h6"].fill(np.inf), "logits.weight"),
-    "two networks": (lambda s: s.update({"tower/h1": s["h1"]}), "several"),
-}
-
-
-@pytest.mark.parametrize("name", GRAPHS)
-def test_a_graph_of_another_network_is_named(name: str, tmp_path: Path) -> None:
-    change, named = GRAPHS[name]
-    index, _ = write_voca(tmp_path)
-    state = voca.deepspeech_state()
-    change(state)
-    graph = write_arrays(tmp_path / "graph.npz", state)
-    with pytest.raises(FaceDiffError, match=named):
-        imported([index, graph])
-
-
-@pytest.mark.parametrize(
-    ("files", "named"),
-    [
-        (["voca.npz"], "deepspeech"),
-        (["deepspeech.npz"], "checkpoint"),
-        (["voca.npz", "absent.npz"], r"absent\.npz"),
-        (["voca.npz", "deepspeech.npz", "second.npz"], r"second\.npz"),
-        (["author.pth", "deepspeech.npz"], r"deepspeech\.npz"),
-    ],
-)
-def test_files_that_do_not_make_a_model_are_named(
-    files: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from tests.fakes.published import write_author_files
-
-    _, graph = write_voca(tmp_path)
-    shutil.copy(graph, tmp_path / "second.npz")
-    write_author_files(tmp_path)
-    given = [str(tmp_path / name) for name in files]
-    options = ["--dataset", "vocaset", "--identities", "A,B,C", "--templates", str(tmp_path / "faces.pkl")]
-    assert main(["import-checkpoint", *given, *options, "-o", str(tmp_path / "m.ckpt")]) == 2
-    printed = capsys.readouterr().err
-    assert printed.count("\n") == 1
-    assert re.search(named, printed)
-    assert not (tmp_path / "m.ckpt").exists()
 
 
 # Training.
@@ -310,5 +208,5 @@ def test_what_is_not_needed_is_reported(tmp_path: Path) -> None:
     state = voca.deepspeech_state() | {"other/table": np.ones(3, np.float32)}
     write_arrays(files[1], state)
     made = import_files(files, ImportOptions(dataset="vocaset", identities=IDENTITIES, templates=templates()))
-    assert "deepspeech.npz: other/table" in made.ignored
-    assert "VOCA/SpeechEncoder/conv1/weights/Adam_1" in made.ignored
+    assert "other/table" in made.ignored
+    assert "SpeechEncoder/conv1/weights/Adam_1" in made.ignored
