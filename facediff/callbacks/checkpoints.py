@@ -426,8 +426,10 @@ def throughput_monitors(trainer: Trainer) -> list[ThroughputMonitor]:
 
 def counted(monitor: ThroughputMonitor) -> list[float]:
     """Samples, batches and seconds of training that a monitor has counted; empty before it has begun."""
-    counters = [getattr(monitor, name, {}).get(TRAIN) for name in ("_samples", "_batches", "_t0s")]
-    return [] if None in counters else [*counters[:2], time.perf_counter() - counters[2]]
+    samples, batches, began = (getattr(monitor, name, {}).get(TRAIN) for name in ("_samples", "_batches", "_t0s"))
+    return (
+        [] if samples is None or batches is None or began is None else [samples, batches, time.perf_counter() - began]
+    )
 
 
 def continue_counting(trainer: Trainer, counts: list[list[float]]) -> None:

@@ -72,9 +72,6 @@ class SamplingPreview(Callback):
         view: from where: ``front``, ``three_quarter`` or ``side``.
         error_scale: error that gets the last colour, in the corpus's unit of length; if None, the distance from the
             neutral face that one in a hundred vertices of the true motion exceed. The same in every epoch.
-
-    Raises:
-        FaceDiffError: if an option is impossible, or a named clip is no validation clip.
     """
 
     @checks_arguments

@@ -75,9 +75,6 @@ def newest_run(trainer: Trainer, entries: Entries, asked: str = "last") -> Path:
     """The run that was written to last, among those that the trainer's first logger would add one to.
 
     A run that has no ``last.ckpt`` was stopped before its first step, and begins again.
-
-    Raises:
-        FaceDiffError: if there is no run, or if the newest has no checkpoint while an older one has.
     """
     logger, folder = trainer.logger, runs_folder(trainer)
     runs = [path for path in folder.glob("*") if (path / LAST).is_file() or _began_training(path / CONFIG)]
@@ -105,11 +102,7 @@ def newest_run(trainer: Trainer, entries: Entries, asked: str = "last") -> Path:
 
 
 def best_checkpoint(run: Path) -> Path:
-    """The best checkpoint of a run by the bookkeeping of its ``ModelCheckpoint``, which ``last.ckpt`` holds.
-
-    Raises:
-        FaceDiffError: if there is none.
-    """
+    """The best checkpoint of a run by the bookkeeping of its ``ModelCheckpoint``, which ``last.ckpt`` holds."""
     callbacks = read_checkpoint(run / LAST).get("callbacks", {}) if (run / LAST).is_file() else {}
     paths = [Path(state["best_model_path"]) for state in callbacks.values() if state.get("best_model_path")]
     # The folder may have another name by now.
@@ -136,11 +129,7 @@ def _began_training(config: Path) -> bool:
 
 
 def find_scored(trainer: Trainer, entries: Entries, asked: str | None) -> Path | None:
-    """The checkpoint to score: a path, or ``last`` or ``best`` of the run that training would continue; None for none.
-
-    Raises:
-        FaceDiffError: if it is not there.
-    """
+    """The checkpoint to score: a path, or ``last`` or ``best`` of the run that would be continued; None for none."""
     if asked == "best":
         return best_checkpoint(newest_run(trainer, entries, asked))
     if asked is None or asked == "last":
@@ -159,9 +148,6 @@ def find_checkpoint(trainer: Trainer, entries: Entries, asked: str | None) -> Pa
         trainer: its loggers say where the runs are.
         entries: the loggers' options.
         asked: a path, ``last``, ``best``, or None; a job that SLURM has started again continues its run then.
-
-    Raises:
-        FaceDiffError: if a checkpoint is asked for, and there is none.
     """
     if asked is not None:
         if asked in ("last", "best"):
@@ -220,9 +206,6 @@ def entered_run(
         run: the folder of the run that is continued; None for a new run. Where another process has just taken the
             number that its loggers would take, it gets the next.
         content: the checkpoint that is continued from.
-
-    Raises:
-        FaceDiffError: if another process trains in the folder.
     """
     checkpoints = trainer.checkpoint_callbacks
     numbered = run is None and isinstance(trainer.logger, CSVLogger | TensorBoardLogger) and not _has_version(entries)

@@ -40,11 +40,7 @@ class SpeechFeatureCache(Callback):
 
     @torch.no_grad()
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Encode the clips that have no features yet, each process its share, and let the data module read all.
-
-        Raises:
-            FaceDiffError: if the audio encoder has no frozen part, or hears pieces of clips.
-        """
+        """Encode the clips that have no features yet, each process its share, and let the data module read all."""
         data = trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
             raise FaceDiffError("SpeechFeatureCache works with facediff's models and data modules only")
@@ -96,11 +92,7 @@ class CompiledTraining(Callback):
         self._compiled: list[nn.Module] = []
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check that the parts exist and that this machine can compile.
-
-        Raises:
-            FaceDiffError: if a part is not there, or nothing can be compiled on this machine.
-        """
+        """Find the parts."""
         network = getattr(pl_module, "network", None)
         if not isinstance(network, nn.Module):
             raise FaceDiffError(
@@ -114,16 +106,6 @@ class CompiledTraining(Callback):
                 raise FaceDiffError(
                     f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
                 )
-        try:
-            probe = torch.ones(8, device=pl_module.device)
-            torch.compile(lambda values: (values.sin() * 2).sum(), backend=self.backend)(probe)
-        except Exception as error:  # what it raises depends on what is missing
-            text = str(getattr(error, "inner_exception", error)).strip()
-            reason = text.splitlines()[0] if text else type(error).__name__
-            raise FaceDiffError(
-                f"CompiledTraining: torch.compile does not work on this machine ({reason}); install a C++ compiler "
-                f"such as g++, or omit the callback"
-            ) from error
         self._compiled = [modules[name] for name in self.parts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

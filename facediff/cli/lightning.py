@@ -286,11 +286,7 @@ def corpus_and_folder(
 
 
 def prepared(data: SpeechMotionDataModule) -> SpeechMotionDataModule:
-    """A data module whose corpus is on this machine.
-
-    Raises:
-        FaceDiffError: if it is not, and is none that facediff makes.
-    """
+    """A data module whose corpus is on this machine."""
     data.prepare_data()
     _ = data.corpus
     return data

@@ -82,7 +82,7 @@ def parsing(words: Sequence[str], experiment: str) -> Iterator[None]:
     """Have Lightning parse some words; an error of ours that a library has wrapped comes out as it was.
 
     Args:
-        words: the subcommand and its options.
+        words: the subcommand, if it runs, and its options.
         experiment: what ``${experiment_name:}`` stands for in a config of 1.x.
     """
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
@@ -97,7 +97,7 @@ def parsing(words: Sequence[str], experiment: str) -> Iterator[None]:
         yield
     except ParsingError as error:
         reason = " ".join(line.strip()[:160] for line in str(error).splitlines())
-        raise FaceDiffError(explain(words[1:]) or reason) from error
+        raise FaceDiffError(explain(words) or reason) from error
     except Exception as error:
         ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
         if ours is None and any(restores(cause) for cause in causes(error)):
@@ -116,7 +116,7 @@ def parsing(words: Sequence[str], experiment: str) -> Iterator[None]:
 
 def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
     """Parse the words of ``fit`` and make nothing of them; class of the model, class and options of the data module."""
-    with parsing(["fit", *arguments], "benchmark"), warnings.catch_warnings():
+    with parsing(arguments, "benchmark"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         parsed = ParsedCLI(save_config_callback=None, command="fit", experiment="benchmark", run=False)
     data = parsed.options["data"]
@@ -213,12 +213,7 @@ class FaceDiffCLI(LightningCLI):
         return [entry for entry in (stated if isinstance(stated, list) else [stated]) if hasattr(entry, "class_path")]
 
     def before_instantiate_classes(self) -> None:
-        """Check the experiment's name and the corpus, and decide whether wandb uploads before anything starts it.
-
-        Raises:
-            ArgumentError: if the name is not that of a folder below that of all runs.
-            FaceDiffError: if the corpus is not there.
-        """
+        """Check the experiment's name and the corpus, and decide whether wandb uploads before anything starts it."""
         name = self.options.name
         if not name or not name.isprintable() or os.path.isabs(name) or ".." in Path(name).parts:
             raise ArgumentError({"name": name}, "expected the name of a folder for the runs", located=True)
@@ -267,11 +262,7 @@ class FaceDiffCLI(LightningCLI):
         return plain(self.options[name].as_dict()) if self.options.get(name) else None
 
     def before_fit(self) -> None:
-        """Let a run that was stopped continue in its folder.
-
-        Raises:
-            FaceDiffError: if the checkpoint's training had another ``--lr_scheduler``.
-        """
+        """Let a run that was stopped continue in its folder."""
         trainer: Trainer = self.trainer
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return

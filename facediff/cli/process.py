@@ -13,7 +13,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -178,13 +177,11 @@ def report(error: BaseException) -> int:
     if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
         error = list(_chain(error))[-1]
         text = " ".join(str(error).split())
-    own = ""
-    with suppress(Exception):  # of objects from elsewhere; the error itself is to be said in any case
-        own = _own_classes(error)
-    whose = f"unless the fault is in {own}, it is one of facediff" if own else "this is a fault of facediff"
+    place, ours = _place(error)
     return fail(
-        f"unexpected {type(error).__name__}: {text[:300]} ({_place(error)}, facediff {facediff.__version__}); "
-        f"{whose}: run the command again with {TRACEBACK}=1 and report what it prints",
+        f"unexpected {type(error).__name__}: {text[:300]} ({place}, facediff {facediff.__version__}); "
+        f"{'this is a fault of facediff: ' if ours else ''}run the command again with {TRACEBACK}=1"
+        f"{' and report what it prints' if ours else ', which shows where'}",
         FAULT,
     )
 
@@ -211,31 +208,12 @@ def _refuses(error: BaseException) -> bool:
     return module.partition(".")[0] in LIBRARIES and not fault
 
 
-def _own_classes(error: BaseException) -> str:
-    """Classes from elsewhere that extend facediff's, such as a decoder of the user's, in the calls of an error."""
+def _place(error: BaseException) -> tuple[str, bool]:
+    """The innermost line that is in no library, and whether it is facediff's: it may be in a file of the user's."""
     import traceback
 
-    held: list[Any] = []
-    for cause in _chain(error):
-        for frame, _ in traceback.walk_tb(cause.__traceback__):
-            held += frame.f_locals.values()
-    torch: Any = sys.modules.get("torch")
-    for thing in list(held):
-        if isinstance(thing, partial):
-            held += [thing.func, *thing.args]
-        elif torch is not None and isinstance(thing, torch.nn.Module):
-            with suppress(AttributeError):  # of a module whose constructor has failed
-                held += [part for module in thing.modules() for part in (module, *vars(module).values())]
-    classes = {base for thing in held for base in (thing if isinstance(thing, type) else type(thing)).__mro__}
-    ours = {cls for cls in classes if cls.__module__.startswith("facediff.")}
-    own = {f"{cls.__module__}.{cls.__qualname__}" for cls in classes - ours if ours & set(cls.__mro__)}
-    return " or ".join(sorted(own))
-
-
-def _place(error: BaseException) -> str:
-    """The innermost line of facediff that an error passed through."""
-    import traceback
-
-    own = Path(__file__).parents[1]
-    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if own in Path(frame.filename).parents]
-    return f"{Path(lines[-1].filename).relative_to(own.parent)}, line {lines[-1].lineno}" if lines else "in a library"
+    package, libraries = Path(__file__).parents[1], ("site-packages", os.path.dirname(os.__file__))
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
+    frames = [frame for frame in frames if not any(library in frame.filename for library in libraries)] or frames
+    ours = not frames or package in Path(frames[-1].filename).parents
+    return (f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else "in a library"), ours

@@ -99,7 +99,8 @@ def fault_of(option: str, name: str) -> str:
 def subclasses(kind: registry.Kind) -> set[str]:
     """Names of the imported classes that extend a base of the registered ones."""
     bases = {base for entry in kind for base in entry.implementation.__mro__ if base.__module__.startswith("facediff.")}
-    return {cls.__name__ for base in bases for cls in base.__subclasses__()}
+    found: list[type] = [cls for base in bases for cls in base.__subclasses__()]
+    return {cls.__name__ for cls in found}
 
 
 def import_fault(option: str, path: str) -> str:

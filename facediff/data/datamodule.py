@@ -198,10 +198,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         facts = ("corpus_name", "unit", "frame_rate", "n_vertices", "identities")
         missing = [name for name in facts if not hasattr(self, name)]
         if missing:
-            raise FaceDiffError(
-                f"{type(self).__name__}: the class states no {' and no '.join(missing)}; every corpus has {facts[0]}, "
-                f"{', '.join(facts[1:])}"
-            )
+            raise FaceDiffError(f"{type(self).__name__}: the class states no {' and no '.join(missing)}")
         if not str(root):
             raise ArgumentError({"root": root}, "expected the corpus's folder")
         self.source = address_of(root) or str(root)
@@ -386,9 +383,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         Args:
             root: the folder, or an address of a packed corpus, which is not looked at.
-
-        Raises:
-            FaceDiffError: if it is missing, unless the data module may make it.
         """
         # A corpus that says how it is obtained is there before a run; others may be made by their data module.
         folder = Path(root).expanduser()
@@ -632,9 +626,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         Args:
             project: from motion in the corpus's unit (1, T, V, dims) to the projections (1, T, K), linear.
             frames: length of the window.
-
-        Raises:
-            FaceDiffError: if no training clip is that long.
         """
         return measure_windows(self.corpus, self.clips("train"), self.trainer, project, frames)
 
@@ -742,11 +733,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
 
 def further_corpus(name: str, options: dict[str, Any]) -> SpeechMotionDataModule:
-    """The data module of another face, from its options.
-
-    Raises:
-        ArgumentError: if they name no registered corpus, or have further corpora themselves.
-    """
+    """The data module of another face, from its options."""
     option = f"further_corpora.{name}"
     named = options.get("corpus")
     # A checkpoint states these options too: as anywhere in it, a class must be registered, or imported already.

@@ -25,9 +25,6 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     Args:
         model: a trained model.
         identities: the new list of identities; the model's own must be its end.
-
-    Raises:
-        FaceDiffError: if the model has other identities.
     """
     trained = model.identities
     count = len(identities) - len(trained)
@@ -56,9 +53,6 @@ def with_new_face(model: AnimationModel, data: SpeechMotionDataModule) -> Animat
     Args:
         model: a trained dual-path model, of one face or of many.
         data: the new face's corpus, whose folder is there.
-
-    Raises:
-        FaceDiffError: if it is no dual-path model.
     """
     if not isinstance(model, DualPathDiffusion):
         raise FaceDiffError(
@@ -84,9 +78,6 @@ def with_audio_encoder(model: AnimationModel, encoder: dict[str, Any]) -> Animat
     Args:
         model: a trained model.
         encoder: the encoder as a checkpoint's hyperparameters name it: ``class_path`` and ``init_args``.
-
-    Raises:
-        FaceDiffError: if the model's audio encoder is not chosen by name, or such a one cannot be made.
     """
     if model.hears_all or "audio_encoder" not in model.hparams:  # the published methods have rules for their own one
         raise FaceDiffError(f"{type(model).__name__}: its audio encoder cannot be replaced")
@@ -115,11 +106,7 @@ def grow(before: Tensor, after: Tensor) -> Tensor:
 
 
 def train_only(model: AnimationModel, part: Part) -> None:
-    """Freeze everything but a part; ``all`` leaves everything as it is.
-
-    Raises:
-        FaceDiffError: if the model has nothing of that part.
-    """
+    """Freeze everything but a part; ``all`` leaves everything as it is."""
     if part == "all":
         return
     if part == "head":

@@ -53,11 +53,7 @@ DIVERGENCE_INTERVAL = 50
 
 
 def read_space(space: object, points: int) -> Space:
-    """A space, or its state, or None for vertices.
-
-    Raises:
-        ArgumentError: if it is anything else, or has not as many channels as the motion has points.
-    """
+    """A space, or its state, or None for vertices."""
     try:
         record = Space() if space is None else space if isinstance(space, Space) else Space.from_state(space)
     except FaceDiffError as error:
@@ -190,11 +186,7 @@ class AnimationModel(PersonStyles, ABC):
 
     @functools.cached_property
     def evaluation(self) -> Evaluation:
-        """The metrics of validation and test; a model that only animates makes none.
-
-        Raises:
-            FaceDiffError: if there is no such protocol, metric or option.
-        """
+        """The metrics of validation and test; a model that only animates makes none."""
         return Evaluation(
             self.protocol,
             self.unseen_identity,
@@ -254,11 +246,7 @@ class AnimationModel(PersonStyles, ABC):
 
     @property
     def speech_encoder(self) -> AudioEncoder:
-        """The model's audio encoder: the first among its modules.
-
-        Raises:
-            FaceDiffError: if there is none.
-        """
+        """The model's audio encoder: the first among its modules."""
         for module in self.modules():
             if isinstance(module, AudioEncoder):
                 return module
@@ -321,11 +309,7 @@ class AnimationModel(PersonStyles, ABC):
         return losses["loss"]
 
     def stop_if_diverged(self, loss: Tensor) -> None:
-        """Stop training whose loss is no number any more: no further step can mend its weights.
-
-        Raises:
-            FaceDiffError: with what to change.
-        """
+        """Stop training whose loss is no number any more: no further step can mend its weights."""
         # On an accelerator, looking at every loss would wait for the device. In 16-bit mixed precision an overflow is
         # usual, and the step is skipped.
         looked_at = loss.device.type == "cpu" or self.trainer.global_step % DIVERGENCE_INTERVAL == 0
@@ -493,11 +477,7 @@ class AnimationModel(PersonStyles, ABC):
         return self.modules()
 
     def attach_mesh(self) -> None:
-        """Give the mesh to those mesh encoders that have none yet; their tables are kept in the checkpoint.
-
-        Raises:
-            FaceDiffError: if one needs a mesh and the corpus has none.
-        """
+        """Give the mesh to those mesh encoders that have none yet; their tables are kept in the checkpoint."""
         waiting = [m for m in self.own_modules() if isinstance(m, MeshEncoder) and not m.attached]
         if not waiting:
             return
@@ -530,9 +510,6 @@ class AnimationModel(PersonStyles, ABC):
         Returns:
             the components of scaled, weighted motion, each as long as its standard deviation; None if no part of
             the model needs them.
-
-        Raises:
-            FaceDiffError: if some modules need them and the training motion never changes.
         """
         weights = self.coordinate_weights(data)
         if self.geometry is not None:
@@ -602,9 +579,6 @@ class AnimationModel(PersonStyles, ABC):
         Returns:
             the folder.
 
-        Raises:
-            FaceDiffError: if the folder is not empty or cannot be written.
-
         Example:
             >>> model.save_pretrained("talking-face", license="apache-2.0")  # doctest: +SKIP
         """
@@ -618,11 +592,7 @@ class AnimationModel(PersonStyles, ABC):
         *arguments: Any,  # noqa: ANN401
         **options: Any,  # noqa: ANN401
     ) -> Self:
-        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's.
-
-        Raises:
-            FaceDiffError: as :func:`facediff.models.checkpoint.read_checkpoint`.
-        """
+        """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's."""
         with checked_file(checkpoint_path) as stream:
             model: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
         return model

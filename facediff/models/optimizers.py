@@ -97,9 +97,6 @@ def parameter_groups(model: LightningModule, options: Mapping[str, Mapping[str, 
         model: the model.
         options: options of parts by their name among the modules, such as ``{audio_encoder: {lr: 1e-5}}``; ``network.``
             may be left out. A parameter belongs to the longest name that it begins with.
-
-    Raises:
-        ArgumentError: if a part has no trainable parameters.
     """
     groups: dict[str, dict[str, Any]] = {"": {"params": []}}
     groups |= {name: {"params": [], **values} for name, values in (options or {}).items()}
@@ -132,11 +129,11 @@ def configure(
     else:
         made = instantiate_class(parameter_groups(model, model_.parameter_groups), dict(optimizer))
     if lr_scheduler is None:
-        return model_.scheduled(made)  # type: ignore[no-any-return]
+        return model_.scheduled(made)
     schedule: Any = instantiate_class(made, dict(lr_scheduler))
     schedule.description = dict(lr_scheduler)  # a part of its state in checkpoints, see schedule_changed
     apply_at_resume(made)
-    return LightningCLI.configure_optimizers(model, made, schedule)  # type: ignore[no-any-return]
+    return LightningCLI.configure_optimizers(model, made, schedule)
 
 
 def schedule_changed(checkpoint: Mapping[str, Any], lr_scheduler: Description | None) -> bool:

@@ -74,29 +74,13 @@ def test_compiled_training_gives_the_same_losses_weights_and_names(tiny_root: Pa
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     plain, found, calls, late = json.loads(done.stdout.splitlines()[-1])
-    assert max(calls) > 20  # the decoder was compiled, not the probe alone
+    assert max(calls) > 20  # the decoder was compiled
     assert len(calls) <= 5  # once for all lengths
     assert found[0] == pytest.approx(plain[0], rel=1e-4)
     assert list(found[1]) == list(plain[1])
     assert found[1] == pytest.approx(plain[1], rel=1e-3, abs=1e-2)
     assert found[2] == []
     assert late == [[]]
-
-
-def test_compiled_training_on_a_machine_that_cannot_compile_is_an_error(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny
-) -> None:
-    def backend(*_: object) -> Callable[..., object]:
-        raise RuntimeError("No working C++ compiler found")
-
-    trainer = make_trainer(callbacks=[CompiledTraining(backend=backend)])
-    with pytest.raises(FaceDiffError, match=r"does not work on this machine \(.*C\+\+ compiler.*install a C\+\+ comp"):
-        trainer.fit(make_model(), datamodule=tiny)
-
-
-def test_compiled_training_of_a_model_without_a_network_is_an_error(make_trainer: MakeTrainer) -> None:
-    with pytest.raises(FaceDiffError, match="LightningModule has no network whose parts could be compiled"):
-        CompiledTraining().on_fit_start(make_trainer(), pl.LightningModule())
 
 
 def test_compiled_training_names_a_part_that_does_not_exist(

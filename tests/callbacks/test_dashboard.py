@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from facediff.callbacks import GradientNorm, RunDescription, ScoreTable
-from facediff.callbacks.dashboard import draw_errors, measure_clips, worst_clips
+from facediff.callbacks.dashboard import draw_errors, measure_clips
 from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny, write_tiny
 from tests.fakes.wandb_run import OfflineRun
@@ -226,12 +226,6 @@ def test_error_pictures_are_of_the_identity_and_the_style_that_was_scored(
     for clip, row in zip(measure_clips(trainer, model, rows), rows, strict=True):
         assert clip.condition == row["identity"]
         assert clip.errors.mean() == pytest.approx(row["mve"], rel=1e-4)
-
-
-def test_worst_clips_of_a_protocol_without_lip_error_are_those_by_mve() -> None:
-    rows = [{"method": method, "clip": clip, "mve": mve} for method, clip, mve in (
-        ("model", "a", 1.0), ("still", "a", 9.0), ("model", "b", 2.0))]  # fmt: skip
-    assert [row["clip"] for row in worst_clips(rows, 1)] == ["b"]
 
 
 def test_sequence_table_without_faces_has_sound_only(tested: tuple[OfflineRun, pl.Trainer, DualPathDiffusion]) -> None:

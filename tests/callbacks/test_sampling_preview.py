@@ -22,11 +22,10 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, length, lip_score, scores
+from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, scores
 from facediff.cli.app import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
-from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.render import Renderer
 from facediff.render.panels import heat_colours
@@ -249,29 +248,6 @@ def test_preview_that_fails_warns_and_leaves_nothing_half_written(
     assert not [path for path in tmp_path.rglob("*") if "previews" in str(path)]
 
 
-def test_preview_logger_that_fails_does_not_stop_the_others(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    board, table = TensorBoardLogger(tmp_path / "board"), CSVLogger(tmp_path / "csv")
-    monkeypatch.setattr(type(board.experiment), "add_image", lambda *_, **__: 1 / 0)
-    trainer = make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=[board, table])
-    with pytest.warns(UserWarning, match="after epoch 1 for TensorBoardLogger failed.*division by zero"):
-        trainer.fit(make_model(), datamodule=tiny)
-    assert "preview/seconds" in (Path(table.log_dir) / "metrics.csv").read_text()
-    assert len(list(Path(board.log_dir).glob("previews/epoch_0001/*"))) == 4
-
-
-@pytest.mark.slow
-def test_preview_warns_once_of_a_missing_package(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    trainer = make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)])
-    with pytest.warns(UserWarning, match=r"no previews in this run: .*facediff\[render\]") as told:
-        trainer.fit(make_model(), datamodule=tiny)
-    assert sum("no previews" in str(warning.message) for warning in told) == 1
-
-
 def test_preview_without_a_mesh_is_reported_once(
     make_model: MakeModel,
     make_trainer: MakeTrainer,
@@ -286,18 +262,6 @@ def test_preview_without_a_mesh_is_reported_once(
     assert told.count(f"no previews in this run: {tiny.root} holds no mesh to draw (absent.ply)") == 1
     assert told.count("preview") == 1
     assert not (tmp_path / "previews").exists()
-
-
-def test_preview_refuses_bad_options(make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny) -> None:
-    with pytest.raises(FaceDiffError, match=r"SamplingPreview\.seconds 0"):
-        SamplingPreview(seconds=0)
-    with pytest.raises(FaceDiffError, match=r'SamplingPreview\.view side_wise: .*did you mean "side"'):
-        SamplingPreview(view="side_wise")
-    with pytest.raises(FaceDiffError, match='no sampler "dim": did you mean "ddim"'):
-        SamplingPreview(sampler="dim")
-    trainer = make_trainer(callbacks=[SamplingPreview(names=["A_e05", "A_e06"])])
-    with pytest.raises(FaceDiffError, match="A_e06 is no validation clip"):
-        trainer.fit(make_model(), datamodule=tiny)
 
 
 @pytest.mark.slow
@@ -383,15 +347,6 @@ def test_first_of_each_identity_comes_before_any_second() -> None:
     assert first_of_each_identity(clips, 2) == ["A_e1", "B_e1"]
     assert first_of_each_identity(clips, 5) == ["A_e1", "B_e1", "C_e1", "A_e2", "C_e2"]
     assert first_of_each_identity(clips[:2], 9) == ["A_e1", "A_e2"]
-
-
-def test_length_has_a_readable_unit() -> None:
-    assert [length(0.0051, "m"), length(0.0051, "mm"), length(2, "unit")] == ["5.1 mm", "0.0051 mm", "2 unit"]
-
-
-def test_footer_has_the_score_that_the_protocol_has() -> None:
-    assert lip_score({"mve": 0.5, "lve": 0.25}) == "LVE 0.25"
-    assert lip_score({"mve": 0.5, "fd_jaw": 2.0}) == "MVE 0.5"
 
 
 def test_scores_of_a_preview_are_in_the_unit_of_the_protocol_and_of_what_it_scores(

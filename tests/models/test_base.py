@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,12 @@ from lightning.pytorch.cli import instantiate_module
 from facediff import registry
 from facediff.callbacks import PredictionWriter, SamplingPreview, ScoreTable
 from facediff.cli.app import main
-from facediff.data import Puppet, collate
+from facediff.data import collate
 from facediff.data.batch import FORMAT_KEY
 from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel, DualPathDiffusion, load_model
+from facediff.models import DualPathDiffusion, load_model
 from facediff.models.checkpoint import read_assets
+from facediff.models.inference import noise_stream
 from facediff.models.optimizers import Schedule, lr_factor
 from tests.fakes.tiny import Tiny
 
@@ -177,6 +179,29 @@ def test_validation_draws_by_clips_not_by_the_number_of_a_batch(
     assert means[0] == means[1] != {}
 
 
+def test_loss_terms_of_several_processes_are_means_over_all_clips(
+    make_model: Make, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three clips on two processes: sums and counts add up, and a repeated clip counts for nothing."""
+    model, dataset = make_model(metrics=[]).eval(), tiny.dataset("train")
+    model.adopt(tiny.assets().with_motion_scale(2.0))
+    monkeypatch.setattr(model.evaluation, "score", lambda *_: None)
+    samples = [dataset[0], dataset[3], dataset[5]]
+    shares = [[collate(samples[:2])], [collate(samples[2:]), replace(collate(samples[:1]), repeated=True)]]
+    sums = np.zeros(2)
+    for share in shares:
+        model._validation_means = {}
+        for batch in share:
+            model.validation_step(batch, 0)
+        mean = model._validation_means["loss"]
+        sums += [float(mean.mean_value), float(mean.weight)]
+    expected = [
+        (float(model.losses(batch, noise_stream(" ".join(batch.names), 0, model.device))["loss"]), len(batch))
+        for batch in (shares[0][0], shares[1][0])
+    ]
+    assert sums[0] / sums[1] == pytest.approx(sum(loss * count for loss, count in expected) / 3, rel=1e-5)
+
+
 def test_the_best_checkpoint_is_chosen_by_energy_over_a_still_faces(
     make_model: Make, tiny: Tiny, make_trainer: MakeTrainer
 ) -> None:
@@ -261,28 +286,6 @@ def test_the_learning_rate_warms_up_and_ends_as_asked(schedule: Schedule) -> Non
     assert factors[0] == pytest.approx(0.1)
     assert factors[4] < factors[8] <= 1.0
     assert factors[-1] == (1.0 if schedule == "constant" else pytest.approx(0.0, abs=1e-3))
-
-
-def test_files_that_are_no_checkpoints_are_refused(tmp_path: Path, trained: Path) -> None:
-    with pytest.raises(FaceDiffError, match="no such checkpoint"):
-        load_model(tmp_path / "none.ckpt")
-    (tmp_path / "text.ckpt").write_text("hello")
-    with pytest.raises(FaceDiffError, match="not a checkpoint that can be loaded safely"):
-        load_model(tmp_path / "text.ckpt")
-    torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
-    with pytest.raises(FaceDiffError, match="not of facediff"):
-        load_model(tmp_path / "other.ckpt")
-    (tmp_path / "cut.ckpt").write_bytes(trained.read_bytes()[:5000])
-    with pytest.raises(FaceDiffError, match="not a checkpoint that can be loaded safely"):
-        load_model(tmp_path / "cut.ckpt")
-
-
-def test_a_checkpoint_of_an_unknown_model_is_refused(tmp_path: Path, trained: Path) -> None:
-    checkpoint = torch.load(trained, weights_only=True)
-    checkpoint["hyper_parameters"]["_class_path"] = "os.system"
-    torch.save(checkpoint, tmp_path / "evil.ckpt")
-    with pytest.raises(FaceDiffError, match=r'"os\.system".* was not loaded'):
-        load_model(tmp_path / "evil.ckpt")
 
 
 def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path, trained: Path) -> None:
@@ -396,12 +399,6 @@ def test_scores_do_not_depend_on_the_batch_size(trained: Path, tiny_root: Path, 
     assert scores[0] == pytest.approx(scores[1], rel=1e-4)
 
 
-def test_a_corpus_folder_given_as_a_path_object_is_kept_as_text(tmp_path: Path) -> None:
-    data = Puppet(root=tmp_path)  # type: ignore[arg-type]
-    torch.save(dict(data.hparams), tmp_path / "h.pt")
-    assert torch.load(tmp_path / "h.pt", weights_only=True)["root"] == str(tmp_path)
-
-
 def test_a_corpus_that_does_not_fit_the_checkpoint_is_refused(
     trained: Path, tiny_root: Path, make_trainer: MakeTrainer
 ) -> None:
@@ -410,10 +407,6 @@ def test_a_corpus_that_does_not_fit_the_checkpoint_is_refused(
 
     with pytest.raises(FaceDiffError, match="identities are"):
         make_trainer().test(load_model(trained), datamodule=Other(root=str(tiny_root)), verbose=False)
-
-
-def test_models_are_animation_models() -> None:
-    assert issubclass(DualPathDiffusion, AnimationModel)
 
 
 def test_training_stops_when_the_loss_is_no_number(
