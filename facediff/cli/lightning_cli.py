@@ -36,6 +36,7 @@ from facediff.callbacks import EpochLines, LastCheckpoint, defaults
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
 from facediff.callbacks.runs import continued_run, entered_run, find_checkpoint, find_scored, run_loggers
 from facediff.cli.configs import guard_configs
+from facediff.cli.process import chain
 from facediff.cli.trainer_options import IDLE_WARNINGS, check_trainer, without_warnings
 from facediff.cli.words import explain
 from facediff.data import SpeechMotionDataModule
@@ -99,8 +100,8 @@ def parsing(words: Sequence[str], experiment: str) -> Iterator[None]:
         reason = " ".join(line.strip()[:160] for line in str(error).splitlines())
         raise FaceDiffError(explain(words) or reason) from error
     except Exception as error:
-        ours = next((cause for cause in causes(error) if isinstance(cause, FaceDiffError)), None)
-        if ours is None and any(restores(cause) for cause in causes(error)):
+        ours = next((cause for cause in chain(error) if isinstance(cause, FaceDiffError)), None)
+        if ours is None and any(restores(cause) for cause in chain(error)):
             raise FaceDiffError(
                 f"--ckpt_path: training cannot continue from this checkpoint ({brief(error)}); it is damaged, or of "
                 f"another model or trainer. Give the config of its run, or train from the beginning"
@@ -354,13 +355,6 @@ class RunConfig(SaveConfigCallback):
             if isinstance(logger, WandbLogger):
                 config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))
                 logger.log_hyperparams({"config": config})
-
-
-def causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and what it came from, outermost first."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
 
 
 # Weights & Biases without questions and waiting: offline where there is no key or the server does not answer.

@@ -149,7 +149,7 @@ def report(error: BaseException) -> int:
     Raises:
         BaseException: the error itself where it is unexpected and ``FACEDIFF_TRACEBACK`` is set.
     """
-    if any(isinstance(cause, KeyboardInterrupt) for cause in _chain(error)):
+    if any(isinstance(cause, KeyboardInterrupt) for cause in chain(error)):
         return fail("interrupted", INTERRUPTED)
     if isinstance(error, StoppedBySignal):
         return fail(error.sentence, int(str(error.code)))
@@ -171,11 +171,11 @@ def report(error: BaseException) -> int:
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
     if isinstance(error, UnicodeError):
         return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
-    refusal = next((cause for cause in _chain(error) if _refuses(cause)), None)
+    refusal = next((cause for cause in chain(error) if _refuses(cause)), None)
     if refusal is not None:
         return fail(f"{' '.join(str(refusal).split())} ({more})")
     if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
-        error = list(_chain(error))[-1]
+        error = list(chain(error))[-1]
         text = " ".join(str(error).split())
     place, ours = _place(error)
     return fail(
@@ -186,7 +186,8 @@ def report(error: BaseException) -> int:
     )
 
 
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
+def chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception and what it came from, outermost first."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))

@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Bool, Float
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
-from torchmetrics import MeanMetric
 
 from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
@@ -165,7 +164,7 @@ class AnimationModel(PersonStyles, ABC):
         self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.style_source: StyleSource = style_source
-        self._validation_means: dict[str, MeanMetric] = {}
+        self._validation_sums: dict[str, Tensor] = {}  # of each loss term, and the number of clips
 
     geometry: Tensor | None
 
@@ -325,17 +324,17 @@ class AnimationModel(PersonStyles, ABC):
         # The same steps and noise in every epoch; otherwise the curve would show their chance. They follow from the
         # clips and not from the batch's number, which is another one where several processes share the batches.
         losses = self.losses(batch, noise_stream(" ".join(batch.names), 0, self.device))
+        clips = 0 if batch.repeated else len(batch)
         for name, value in losses.items():
-            if name not in self._validation_means:
-                self._validation_means[name] = MeanMetric(nan_strategy="disable").to(self.device)
-            self._validation_means[name].update(value, 0 if batch.repeated else len(batch))
+            total = torch.stack([value.detach() * clips, value.new_tensor(clips)])
+            self._validation_sums[name] = self._validation_sums.get(name, 0) + total
         model = self.model_of(batch)
         model.evaluation.score(model, "val", model.with_person_styles(batch))
 
     def on_validation_epoch_start(self) -> None:
-        """Encode the speakers; begin new means, also after a validation that was stopped."""
+        """Encode the speakers; begin new sums, also after a validation that was stopped."""
         super().on_validation_epoch_start()
-        self._validation_means = {}
+        self._validation_sums = {}
 
     def on_validation_epoch_end(self) -> None:
         """Log the loss terms and the metrics as ``val/mve`` …."""
@@ -347,7 +346,11 @@ class AnimationModel(PersonStyles, ABC):
 
         Lightning's own reduction averages the number of clips over the processes as a whole number.
         """
-        return {f"val/{name}": mean.compute() for name, mean in self._validation_means.items()}
+        if not self._validation_sums:
+            return {}
+        sums = torch.stack([*self._validation_sums.values()])
+        totals, counts = self.trainer.strategy.reduce(sums, reduce_op="sum").T
+        return {f"val/{name}": value for name, value in zip(self._validation_sums, totals / counts, strict=True)}
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Score generated motion, faces that do not move, and the model's motion for another sentence's speech."""
