@@ -36,7 +36,7 @@ def check_graph(path: Path) -> None:
     try:
         with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
             problem = problem_of_model(content)
-    except (ValueError, IndexError, UnicodeDecodeError, OSError) as error:
+    except (ValueError, LookupError, OSError) as error:
         raise FaceDiffError(f"{path}: not an ONNX graph ({error}); {REMEDY}") from error
     if problem:
         raise FaceDiffError(f"{path}: {problem}; {REMEDY}")

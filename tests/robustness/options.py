@@ -3,13 +3,10 @@
 The law: a command ends with status 0, or with one sentence on standard error and status 2 (1 where some recordings of a
 batch failed). No exception leaves it, no file that it was not told to write changes, nothing half-written is left
 behind, and it takes at most :data:`SECONDS` of processor time, or :data:`RECORDING`.
-
-A long run: ``python -m tests.robustness.options --rounds 200`` prints the counts for every command.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import io
 import json
@@ -17,14 +14,10 @@ import os
 import random
 import shutil
 import sys
-import tempfile
 import time
 import traceback
-import warnings
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args, get_origin
 from unittest import mock
@@ -247,15 +240,6 @@ def without(words: list[str], parameter: Parameter) -> list[str]:
 # The law.
 
 
-@dataclass
-class Counts:
-    """How often the law held for a command, and where it did not."""
-
-    passed: int = 0
-    refused: int = 0
-    broken: dict[str, str] = field(default_factory=dict)  # by what was broken: the shortest command line that did it
-
-
 def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
     """Size and time of change of every file, but for those that may be named as outputs."""
     files = [path for path in folder.rglob("*") if not path.is_dir() and path.stem != "empty"]
@@ -332,47 +316,3 @@ def run(name: str, line: Sequence[str]) -> int:
         print(f"facediff: error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def rounds(world: Path, name: str, count: int, seed: int, folder: Path) -> Counts:
-    """Try a command with ``count`` command lines."""
-    counts = Counts()
-    for number in range(count):
-        words = draw(name, random.Random(f"{seed}/{name}/{number}"))  # noqa: S311 - it must repeat
-        status, problem = obey(world, name, words, folder / "run")
-        if problem:
-            shown = " ".join(repr(word) if len(word) < 80 else repr(word[:80] + "…") for word in words)
-            if len(shown) < len(counts.broken.get(problem, shown + " ")):
-                counts.broken[problem] = shown
-        elif status == 0:
-            counts.passed += 1
-        else:
-            counts.refused += 1
-    return counts
-
-
-def start() -> int:
-    """The long run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="commands that contain this")
-    options = parser.parse_args()
-    warnings.simplefilter("error", RuntimeWarning)
-    total: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as temporary:
-        world = build_world(Path(temporary) / "world")
-        for name in BASES:
-            if options.only not in name:
-                continue
-            counts = rounds(world, name, options.rounds, options.seed, Path(temporary))
-            total.update(passed=counts.passed, refused=counts.refused, broken=len(counts.broken))
-            print(f"{name:22} {counts.passed:5} passed {counts.refused:5} refused {len(counts.broken):3} broken")
-            for problem, words in counts.broken.items():
-                print(f"    {problem}\n        facediff {name} {words}", flush=True)
-    print(dict(total))
-    return int(total["broken"] > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(start())

@@ -1,12 +1,9 @@
-"""Mesh files built to deceive: headers that lie, sizes without data, numbers that are none, names of other files."""
+"""Meshes are read as they were written, in every format, and lies about their content are refused."""
 
 from __future__ import annotations
 
 import json
 import struct
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,6 @@ import trimesh
 
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
-from facediff.utils.limits import Limits
 
 XYZ = ["property float x", "property float y", "property float z"]
 LIST = "property list uchar int vertex_indices"
@@ -79,104 +75,43 @@ def changed(path: str, value: object) -> bytes:
 
 REFUSED: dict[str, tuple[str, bytes]] = {
     # OBJ
-    "obj of 1e999": (".obj", b"v 0 0 1e999\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj of nan": (".obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj of a colour of nan": (".obj", b"v 0 0 0 1 1 nan\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n"),
     "obj of 1e308": (".obj", b"v 0 0 1e308\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj with vertex 0": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n"),
     "obj with vertex 4": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"),
-    "obj with vertex -4": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -4\n"),
-    "obj with a huge vertex": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + b"9" * 30 + b"\n"),
-    "obj with a longer number": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + b"9" * 9999 + b"\n"),
-    "obj with a point as face": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1\n"),
     "obj with two coordinates": (".obj", b"v 0 0 0\nv 1 0\nv 0 1 0 1\nf 1 2 3\n"),
     "obj with relative faces in between": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 5 5\nf -3 -2 -1\n"),
     "obj with such faces after tabs": (".obj", b"v\t0 0 0\nv\t1 0 0\nv\t0 1 0\nf\t-3\t-2\t-1\nv\t5 5 5\nf 1 2 3\n"),
-    "obj of zero bytes": (".obj", bytes(1000)),
     # PLY
-    "ply of 1e12 vertices": (".ply", ply("element vertex 1000000000000", *XYZ)),
-    "ply of -1 vertices": (".ply", ply("element vertex -1", *XYZ)),
-    "ply of 10^5 digits": (".ply", ply(f"element vertex {'9' * 50_000}", *XYZ)),
     "ply of one more vertex": (".ply", ply("element vertex 5", *XYZ, body=CORNERS.tobytes())),
     "ply of one vertex less": (".ply", ply("element vertex 3", *XYZ, body=CORNERS.tobytes())),
-    "ply of rows without columns": (".ply", ply("element vertex 2000000", "element face 0", LIST)),
-    "ply without an end": (".ply", b"ply\nformat ascii 1.0\nelement vertex 3\n" + b"comment x\n" * 9999),
-    "ply of an unknown type": (".ply", ply("element vertex 1", "property quad x")),
-    "ply with a property before elements": (".ply", ply("property float x")),
-    "ply with two x": (".ply", ply("element vertex 1", *XYZ, "property float x", body=bytes(16))),
     "ply whose list is cut": (".ply", binary_ply(b"\x03" + struct.pack("<2i", 0, 1))),
-    "ply whose list is huge": (".ply", binary_ply(b"\xff" + struct.pack("<3i", 0, 1, 2))),
-    "ply whose list is negative": (
-        ".ply",
-        ply("element vertex 4", *XYZ, "element face 1", "property list char int vertex_indices")
-        + CORNERS.tobytes()
-        + b"\xff",
-    ),
     "ply with vertex -1": (".ply", binary_ply(b"\x03" + struct.pack("<3i", 0, 1, -1))),
     "ply with vertex 4": (".ply", binary_ply(b"\x03" + struct.pack("<3i", 0, 1, 4))),
-    "ply with an edge as face": (".ply", binary_ply(b"\x02" + struct.pack("<2i", 0, 1))),
     "ply cut in its faces": (".ply", ascii_ply(SQUARE + "3 0 1 2\n", faces=2)),
-    "ply with a word": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 one 0") + "3 0 1 2\n")),
     "ply of nan": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 nan 0") + "3 0 1 2\n")),
-    "ply of 1e39": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 1e39 0") + "3 0 1 2\n")),
     # STL
-    "stl of 2^32 triangles": (".stl", stl(0xFFFFFFFF, bytes(50))),
     "stl of one more triangle": (".stl", stl(2, bytes(50))),
     "stl that is cut": (".stl", b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"),
-    "stl of two corners": (
-        ".stl",
-        b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop\nendfacet\nendsolid\n",
-    ),
     # OFF
-    "off of 1e12 vertices": (".off", b"OFF\n1000000000000 1 0\n0 0 0\n"),
-    "off of -1 faces": (".off", b"OFF\n3 -1 0\n0 0 0\n1 0 0\n0 1 0\n"),
     "off cut in its faces": (".off", b"OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
     "off with vertex 3": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n"),
-    "off with two coordinates": (".off", b"OFF\n3 1 0\n0 0\n1 0\n0 1\n3 0 1 2\n"),
     "off with a short face": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n"),
     # Binary glTF
-    "glb of 1e9 vertices": (".glb", changed("accessors.0.count", 10**9)),
-    "glb of a million vertices": (".glb", changed("accessors.0.count", 10**6)),
-    "glb of -1 vertices": (".glb", changed("accessors.0.count", -1)),
-    "glb of 4.0 vertices": (".glb", changed("accessors.0.count", 4.5)),
-    "glb of true vertices": (".glb", changed("accessors.0.count", True)),
     "glb beyond its view": (".glb", changed("bufferViews.0.byteLength", 47)),
     "glb beyond its data": (".glb", changed("bufferViews.1.byteOffset", 1 << 40)),
-    "glb before its data": (".glb", changed("accessors.0.byteOffset", -4)),
     "glb with stride 0": (".glb", changed("bufferViews.0.byteStride", 0)),
-    "glb with view -1": (".glb", changed("accessors.0.bufferView", -1)),
     "glb with accessor -1": (".glb", changed("meshes.0.primitives.0.attributes.POSITION", -1)),
     "glb of another file": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "/etc/passwd"})),
-    "glb of a page": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "http://localhost/x"})),
     "glb of data in a name": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "data:;base64,AAAA"})),
     "glb compressed": (".glb", changed("extensionsRequired", ["KHR_draco_mesh_compression"])),
-    "glb without data": (".glb", changed("accessors.0", {"componentType": 5126, "count": 4, "type": "VEC3"})),
     "glb of a cycle": (".glb", changed("nodes.0", {"mesh": 0, "children": [0]})),
-    "glb of two parents": (".glb", changed("nodes", [{"children": [1, 1]}, {"mesh": 0}])),
-    "glb of mesh 7": (".glb", changed("nodes.0", {"mesh": 7})),
     "glb of a huge scale": (".glb", changed("nodes.0", {"mesh": 0, "scale": [1e300, 1, 1]})),
-    "glb of a word as scale": (".glb", changed("nodes.0", {"mesh": 0, "scale": ["1", 1, 1]})),
-    "glb of a short matrix": (".glb", changed("nodes.0", {"mesh": 0, "matrix": [1, 2, 3]})),
     "glb with vertex 9": (".glb", glb(GOOD, DATA.replace(bytes([0, 2, 3, 0, 0]), bytes([0, 2, 9, 0, 0])))),
     "glb whose chunk is longer": (".glb", glb(GOOD)[:-8]),
-    "glb of nan in json": (".glb", glb(b'{"asset": NaN}')),
-    "glb of brackets": (".glb", glb(b"[" * 100_000)),
-    "glb of a list": (".glb", glb([])),
-    "glb of no json": (".glb", b"glTF" + struct.pack("<II", 2, 12)),
-    "glb that is sparse without data": (
-        ".glb",
-        changed(
-            "accessors.0.sparse",
-            {
-                "count": 1,
-                "indices": {"bufferView": 1, "componentType": 5121, "byteOffset": 9},
-                "values": {"bufferView": 0},
-            },
-        ),
-    ),
     # Others
     "a format that is not read": (".gltf", json.dumps(GOOD).encode()),
-    "an archive": (".zip", b"PK\x05\x06" + bytes(18)),
 }
 
 
@@ -296,51 +231,3 @@ def test_nodes_place_the_meshes_of_a_glb(node: dict[str, Any], expected: list[fl
 def test_a_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(changed("nodes", [{"mesh": 0, "scale": [-1, 1, 1]}]))
     assert read_mesh(tmp_path / "a.glb").faces.tolist() == [[2, 1, 0], [3, 2, 0]]
-
-
-def shared(content: dict[str, Any]) -> None:
-    content["nodes"] = [{"children": [*range(1, 40)]}, *({"mesh": 0} for _ in range(39))]
-
-
-def parts(content: dict[str, Any]) -> None:
-    content["meshes"][0]["primitives"] *= 40
-
-
-@pytest.mark.parametrize("grow", [shared, parts])
-def test_data_that_is_used_often_counts_as_often(grow: Callable[[dict[str, Any]], None], tmp_path: Path) -> None:
-    """A few bytes, named by many nodes or parts, would fill any memory."""
-    content = json.loads(json.dumps(GOOD))
-    grow(content)
-    (tmp_path / "a.glb").write_bytes(glb(content))
-    assert len(read_mesh(tmp_path / "a.glb").vertices) >= 39 * 4
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("glb", "glb_scene"):
-            patch.setattr(f"facediff.mesh.{module}.LIMITS", Limits(vertices=100))
-        with pytest.raises(FaceDiffError, match="vertices"):
-            read_mesh(tmp_path / "a.glb")
-
-
-def test_meshes_that_declare_gigabytes_are_refused_in_little_memory(tmp_path: Path) -> None:
-    bombs = {name: REFUSED[name] for name in REFUSED if "1e12" in name or "1e9" in name or "2^32" in name}
-    assert len(bombs) >= 4
-    paths = []
-    for number, (suffix, content) in enumerate(bombs.values()):
-        paths.append(tmp_path / f"{number}{suffix}")
-        paths[-1].write_bytes(content)
-    code = """
-import resource, sys
-from pathlib import Path
-from facediff.errors import FaceDiffError
-from facediff.mesh import read_mesh
-size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (size + (64 << 20),) * 2)
-for name in sys.argv[1:]:
-    try:
-        read_mesh(Path(name))
-    except FaceDiffError:
-        print("refused")
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, paths)], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.stdout.split() == ["refused"] * len(paths), done.stderr
