@@ -85,7 +85,7 @@ def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
 def _read(path: Path, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
     if not path.is_file() or path.stat().st_size == 0:
         raise FaceDiffError(
-            f"{path}: is no sound file, or an empty one; expected speech as {', '.join(SUFFIXES + CONTAINERS)}"
+            f"{path}: no such sound file, or an empty one; expected speech as {', '.join(SUFFIXES + CONTAINERS)}"
         )
     refuse_cut_short(path)
     if path.suffix.lower() in CONTAINERS:
@@ -331,7 +331,8 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
             return SpeechRecording.of(*_decoded(sound, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
         first, second = cast("tuple[Any, Any]", speech)
-        speech, rate = (second, first) if isinstance(first, numbers.Real) else (first, second)
+        rate_first = isinstance(first, numbers.Real)  # NumPy's as well
+        speech, rate = (second, first) if rate_first else (first, second)
     if rate is None:
         if not hasattr(speech, "detach"):  # a tensor has the models' rate, an array may have any
             raise FaceDiffError("rate: is missing; give the array's sample rate, as in animate(samples, rate=48000)")

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar, cast, overload
+from typing import Any, Generic, TypeVar, cast
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.progress import progress_bar
@@ -96,31 +96,6 @@ class PerWorker(Generic[Task, Result]):
             except FaceDiffError as error:
                 raise SetupError(error.on_command_line) from error
         return cast(Callable[[Task], Result], work)(task)
-
-
-@overload
-def run_tasks(
-    work: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    *,
-    workers: int | None = None,
-    mode: Literal["threads", "serial"],
-    progress: str = "",
-) -> Generator[tuple[Task, Result]]: ...
-
-
-@overload
-def run_tasks(
-    work: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    *,
-    workers: int | None = None,
-    mode: Mode = "processes",
-    scheduler: str | None = "",
-    writes: Path | None = None,
-    reads: Iterable[Path] = (),
-    progress: str = "",
-) -> Generator[tuple[Task, Result | WorkerDied]]: ...
 
 
 def run_tasks(

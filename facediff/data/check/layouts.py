@@ -93,9 +93,10 @@ def identify(
     """
     root, n_vertices = folder.root, folder.n_vertices()
     if corpus is None and isinstance(manifest.get("person"), str):
+        view: CorpusView | None = None
         with findings.guard("manifest_unreadable", root / MANIFEST, root):
-            return _view_of_person(manifest, n_vertices)
-        return None
+            view = _view_of_person(manifest, n_vertices)
+        return view
     module = recognise(folder, recorded, n_vertices) if corpus is None else by_name(corpus, n_vertices)
     if module is not None:
         return _view_of_module(module, root)

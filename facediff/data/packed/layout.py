@@ -228,7 +228,7 @@ def _fields(kind: type[Any], plain: Mapping[str, Any], source: str, **known: Any
     """An object with every field of the type that its dataclass declares: texts, numbers from 0, lists of them."""
     values = dict(known)
     for name, hint in get_type_hints(kind).items():
-        value = plain[name] if name not in known else None
+        value: Any = plain[name] if name not in known else None
         if name not in known and hint is str:
             _require(isinstance(value, str) and value.isprintable() and len(value) <= LONGEST, source, f"odd {name}")
         elif name not in known:

@@ -164,7 +164,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         "lip pair too high",
         lambda r: (r / "regions" / "inner_lip_pairs.txt").write_text("0, 24\n"),
         {"region_broken"},
-        "0 to 23",
+        "below 24",
     ),
     ("table without clips", lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"), {"clips_table"}, "no column clip"),
     (
