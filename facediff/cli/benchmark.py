@@ -209,7 +209,6 @@ def check_cells(
     from facediff.benchmark.running import Setting, fit_options, option_words
     from facediff.cli.lightning import parse_fit
 
-    check_test_options(plan)
     setting = Setting(folder, plan.protocol, plan.metrics, plan.weights, plan.threads)
     seen: set[str] = set()
     prepared: dict[str, SpeechMotionDataModule] = {}
@@ -262,31 +261,18 @@ def check_cells(
 
 @contextmanager
 def naming(plan: BenchmarkPlan, cell: Cell) -> Iterator[None]:
-    """Errors inside it name the plan, the row and the corpus; a missing folder is asked for with --root."""
+    """Errors inside it name the plan, the row and the corpus, and how its folder is given if they are about that."""
     try:
         yield
     except FaceDiffError as error:
-        if "--data.root must be given" in str(error):
-            remedy = f"give it with --root {cell.corpus}=FOLDER; docs/data.md says how to obtain it"
-            raise FaceDiffError(f"{plan.file}: the corpus {cell.corpus} has no folder; {remedy}") from error
-        raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}") from error
-
-
-def check_test_options(plan: BenchmarkPlan) -> None:
-    """Refuse options of a test that would change the model: its weights fit no other."""
-    from facediff.cli.lightning import FREE
-
-    for options in [plan.test_options, *(method.test_options for method in plan.methods.values())]:
-        for name in options:
-            if name.startswith("model.") and name.split(".")[1] not in FREE:
-                free = [f"model.{name}" for name in FREE]
-                raise FaceDiffError(f"{plan.file}: test_options: {name} is none of a test's: {choices(name, free)}")
+        remedy = f"; give the corpus's folder with --root {cell.corpus}=FOLDER" if "root" in str(error) else ""
+        raise FaceDiffError(f"{plan.file}: {cell.row} on {cell.corpus}: {error}{remedy}") from error
 
 
 def check_checkpoint(
     cell: Cell, kind: type[SpeechMotionDataModule] | None, class_path: str | None, root: str | None
 ) -> None:
-    """Refuse a checkpoint that cannot be tested, is of another corpus than the plan's, or whose corpus is not here.
+    """Refuse a checkpoint that is of another corpus than the plan's, or whose corpus is not here.
 
     Args:
         cell: of a checkpoint.
@@ -296,24 +282,26 @@ def check_checkpoint(
     """
     from facediff.cli.lightning import corpus_and_folder
     from facediff.models.checkpoint import read_checkpoint
-    from facediff.models.loading import build_model
 
     path = Path(str(cell.source))
-    content = read_checkpoint(path)
-    build_model(path, content)
     chosen = cell.test_options.get("data") or class_path
     folder = cell.root or (None if root is None else Path(root))
-    module, options = corpus_and_folder(path, content, None if chosen is None else str(chosen), folder)
+    corpus = None if chosen is None else str(chosen)
+    module, options = corpus_and_folder(path, read_checkpoint(path), corpus, folder)
     if kind is not None and module.corpus_name != kind.corpus_name:
         raise FaceDiffError(
             f"{path}: is of the corpus {module.corpus_name}, and the plan's is {kind.corpus_name}; name with the "
             f"method's key `corpora` those that it is of"
         )
-    corpus_root = options.get("root")
-    if corpus_root is None and not module.makes_itself:
-        raise FaceDiffError(f"{path}: names no folder of its corpus; give it with --root {cell.corpus}=FOLDER")
-    if corpus_root is not None and not module.makes_itself and not Path(str(corpus_root)).expanduser().is_dir():
-        raise FaceDiffError(f"{path}: its corpus {corpus_root} is not there; give it with --root {cell.corpus}=FOLDER")
+    require_folder(module, options.get("root"))
+
+
+def require_folder(module: type[SpeechMotionDataModule], root: object) -> None:
+    """Refuse a corpus that is not here, unless it is the built-in one or at an address."""
+    if not module.makes_itself and (
+        root is None or ("://" not in str(root) and not Path(str(root)).expanduser().is_dir())
+    ):
+        raise module.missing(Path(str(root or f"{module.corpus_name} without data.root")))
 
 
 def read_data(path: Path) -> tuple[str, dict[str, Any]]:
@@ -340,22 +328,13 @@ def data_of(
 ) -> SpeechMotionDataModule:
     """The data module of a config, each once; a built-in corpus is made, any other must be there."""
     mark = f"{class_path} {sorted((key, str(value)) for key, value in arguments.items())}"
-    if mark in modules:
-        return modules[mark]
-    module = data_class(class_path)
-    if "root" not in arguments and not module.makes_itself:
-        raise FaceDiffError(
-            f"the corpus {module.corpus_name} has no folder; give it with --root {module.corpus_name}=FOLDER"
-        )
-    data = module(**dict(arguments))
-    if make:
-        data.prepare_data()
-    if not data.root.is_dir() and (make or not module.makes_itself):
-        raise FaceDiffError(
-            f"{data.root}: no such folder; expected the corpus {module.corpus_name}. {data.obtain}".strip()
-        )
-    modules[mark] = data
-    return data
+    if mark not in modules:
+        module = data_class(class_path)
+        require_folder(module, arguments.get("root"))
+        modules[mark] = module(**dict(arguments))
+        if make:
+            modules[mark].prepare_data()
+    return modules[mark]
 
 
 def truth_words(data: SpeechMotionDataModule) -> tuple[str, ...]:

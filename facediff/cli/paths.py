@@ -11,35 +11,18 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError
 from facediff.utils.destinations import protect, refuse_equal, refuse_overwriting
 from facediff.utils.files import check_folder_writable, check_writable
 from facediff.utils.option import Option
 
-
-class PathParameter(Protocol):
-    """What the checks read of a :class:`facediff.cli.parsing.Parameter`."""
-
-    @property
-    def name(self) -> str:
-        """Name of the value."""
-
-    @property
-    def option(self) -> Option:
-        """Whether a path is read or written."""
-
-    @property
-    def is_path(self) -> bool:
-        """Whether a value is a path; texts may hold one as well."""
-
-    @property
-    def flag(self) -> str:
-        """The name as it is typed."""
+if TYPE_CHECKING:
+    from facediff.cli.parsing import Parameter
 
 
-def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) -> None:
+def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
     """Refuse, before any work is done, files that cannot be read or written, and outputs that are inputs.
 
     The inputs are protected from then on: nothing that the command writes replaces one of them.
@@ -74,7 +57,7 @@ def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) 
     protect(inputs)
 
 
-def given_paths(parameter: PathParameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
+def given_paths(parameter: Parameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
     """The paths in a value; in a text, such as ``NAME=FOLDER`` or ``a.npy:0.3,b.npy:0.7``, all that may be one."""
     option = parameter.option
     if value is None or not (parameter.is_path or option.reads or option.writes):
