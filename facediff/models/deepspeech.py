@@ -23,7 +23,7 @@ from facediff.models.audio_encoders import Features, FrozenEncoder, Lengths, Wav
 from facediff.models.layers import Width, all_states, exporting, frame_mask, longest, sliding
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.limits import quoted
+from facediff.utils.limits import brief, quoted
 from facediff.utils.torch_files import read_authors_checkpoint
 
 FRAME, HOP, SPECTRUM = 400, 160, 512
@@ -164,9 +164,6 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
     Args:
         graph: a frozen graph's constants by name.
         source: the file, for messages.
-
-    Raises:
-        FaceDiffError: if it is another network's.
     """
     matched: dict[str, Tensor] = {}
     left = []
@@ -188,22 +185,26 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
             f"{source}: lacks {', '.join(missing[:3])}, so it is not DeepSpeech's network; expected output_graph.pb of "
             f"{RELEASE}"
         )
-    misshapen = [
-        name
-        for name, value in matched.items()
-        if value.ndim != (1 if name[-1] == "b" or name[0] == "b" and name[:2] != "bw" else 2)
-    ]
-    if misshapen or len(matched["bw.k"]) != len(matched["fw.k"]) or matched["fw.k"].shape[1] % 4:
-        raise FaceDiffError(f"{source}: its network has another form than DeepSpeech 0.1.0; expected {RELEASE}")
-    cells = matched["fw.k"].shape[1] // 4
-    sizes = dict(
-        zip(
-            SIZES,
-            [*matched["h1"].shape, matched["h2"].shape[1], matched["h3"].shape[1], cells, *matched["h6"].shape],
-            strict=True,
-        )
-    )
+    try:
+        cells = matched["fw.k"].shape[1] // 4
+        ends = [*matched["h1"].shape, matched["h2"].shape[1], matched["h3"].shape[1], cells, *matched["h6"].shape]
+        sizes = checked_sizes(dict(zip(SIZES, ends, strict=True)))
+        state = state_of(matched, sizes)
+        with torch.device("meta"):
+            DeepSpeech(sizes).load_state_dict(state, assign=True)
+    except (ValueError, IndexError, RuntimeError, ArgumentError) as error:
+        raise FaceDiffError(
+            f"{source}: its network has another form than DeepSpeech 0.1.0 ({brief(error)}); expected {RELEASE}"
+        ) from error
+    if damaged := next((name for name, value in state.items() if not bool(value.isfinite().all())), None):
+        raise FaceDiffError(f"{source}: its {damaged} holds NaN or infinity; the file is damaged")
+    return state, sizes, left
+
+
+def state_of(matched: Mapping[str, Tensor], sizes: Mapping[str, int]) -> dict[str, Tensor]:
+    """The graph's weights by the names of :class:`DeepSpeech`."""
     state: dict[str, Tensor] = {}
+    cells = sizes["cell"]
     for number, layer in DENSE.items():
         state[f"{layer}.weight"] = matched[f"h{number}"].T
         state[f"{layer}.bias"] = matched[f"b{number}"]
@@ -216,17 +217,7 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
         state[f"recurrent.weight_hh_l0{end}"] = kernel[:, sizes["third"] :]
         state[f"recurrent.bias_ih_l0{end}"] = bias
         state[f"recurrent.bias_hh_l0{end}"] = torch.zeros_like(bias)
-    with torch.device("meta"):
-        own = DeepSpeech(checked_sizes(sizes)).state_dict()
-    for name, value in state.items():
-        if value.shape != own[name].shape:
-            raise FaceDiffError(
-                f"{source}: its {name} has the shape {tuple(value.shape)}, expected {tuple(own[name].shape)}; the "
-                f"file is of another network, expected {RELEASE}"
-            )
-        if not bool(value.isfinite().all()):
-            raise FaceDiffError(f"{source}: its {name} holds NaN or infinity; the file is damaged")
-    return {name: value.float().contiguous() for name, value in state.items()}, sizes, left
+    return {name: value.float().contiguous() for name, value in state.items()}
 
 
 def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
@@ -236,11 +227,7 @@ def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
 
 
 def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
-    """The network's sizes, checked.
-
-    Raises:
-        ArgumentError: if they are others than expected.
-    """
+    """The network's sizes, checked."""
     stated = {name: sizes.get(name) for name in SIZES}
     sizes = {name: size for name, size in sizes.items() if name != "_name_or_path"}
     fits = all(isinstance(size, int) and not isinstance(size, bool) and 0 < size <= 1 << 16 for size in stated.values())
@@ -268,9 +255,6 @@ class DeepSpeechEncoder(FrozenEncoder):
         source: the frozen graph ``output_graph.pb`` of the release 0.1.0, converted by ``tools/convert_tensorflow.py``.
         config: the network's sizes; if given, the weights are not read from ``source`` but left for a checkpoint to
             fill in. Checkpoints use it, so that they need no access to ``source``.
-
-    Raises:
-        FaceDiffError: if ``source`` cannot be read, or is no such graph.
     """
 
     checkpoint_options = ("config",)  # without it, a file could have another one read

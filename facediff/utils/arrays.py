@@ -33,13 +33,9 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
     """
     name = name or str(path)
     try:
-        if not path.is_file():  # a pipe would never end
-            raise FaceDiffError(f"{name}: no such file, or no regular file; expected a NumPy array (.npy)")
         with _PARSING, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
             array = np.load(path, mmap_mode=mode, allow_pickle=False)
-    except FaceDiffError:
-        raise
     except Exception as error:  # a damaged header makes NumPy raise anything
         raise FaceDiffError(
             f"{name}: not a readable NumPy array ({brief(error)}); expected a .npy file of numbers"

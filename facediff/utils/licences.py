@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any, Literal, get_args
 
 from facediff.errors import FaceDiffError, OptionError
@@ -130,25 +130,20 @@ def require_cleared(source: object, licences: Iterable[Licence]) -> None:
     )
 
 
-def read_licences(source: object, state: object) -> tuple[Licence, ...]:
+def read_licences(source: object, state: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - whatever a file holds
     """The labels that a file holds."""
-    fields = set(Licence.__dataclass_fields__)
-    if not isinstance(state, list | tuple) or len(state) > MOST:
-        raise FaceDiffError(f"{source}: its licences are {quoted(state)}; expected a list. The file is damaged")
-    labels = []
-    for entry in state:
-        good = isinstance(entry, Mapping) and entry.keys() == fields
-        if not good or not all(isinstance(text, str) and is_plain_text(text) for text in entry.values()):
-            raise FaceDiffError(
-                f"{source}: one of its licences is {quoted(entry)}; expected the texts {', '.join(sorted(fields))}"
-            )
-        if entry["commercial"] not in get_args(Commercial):
-            raise FaceDiffError(
-                f"{source}: the licence of {quoted(entry['of'])} says of commercial use {quoted(entry['commercial'])}; "
-                f"expected {', '.join(get_args(Commercial))}"
-            )
-        labels.append(Licence(**entry))
-    return tuple(labels)
+    try:
+        labels = tuple(Licence(**entry) for entry in state)
+        known = all(label.commercial in get_args(Commercial) for label in labels)
+        fits = known and all(is_plain_text(text) for label in labels for text in astuple(label))
+    except TypeError:
+        fits = False
+    if not fits:
+        raise FaceDiffError(
+            f"{source}: its licences are {quoted(state)}; expected texts {', '.join(Licence.__dataclass_fields__)}, "
+            f"and of commercial use {', '.join(get_args(Commercial))}. The file is damaged"
+        )
+    return labels
 
 
 def network_licences(options: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - plain data of any form

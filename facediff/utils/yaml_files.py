@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +41,6 @@ class _Plain(yaml.SafeLoader):
 def yaml_text(path: Path | str, remedy: str) -> str:
     """The text of a YAML file; ``remedy`` is how messages end."""
     try:
-        if not os.path.isfile(path):  # noqa: PTH113 - a pipe would never end
-            raise FaceDiffError(f"{path}: no such file; {remedy}")
         return Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import signal
 import subprocess
@@ -22,7 +21,6 @@ from facediff.utils.checksums import describe_files, same_sizes, sha256
 from facediff.utils.files import (
     atomic,
     atomic_folder,
-    cache_dir,
     check_writable,
     discard,
     locked,
@@ -30,7 +28,6 @@ from facediff.utils.files import (
     reserve_room,
     scratch_folder,
 )
-from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_json, write_json, write_rows
 from facediff.utils.tables import format_table
 
@@ -58,49 +55,6 @@ def test_stereo_is_averaged(tmp_path: Path) -> None:
     left = np.linspace(-0.5, 0.5, 1600)
     soundfile.write(tmp_path / "a.wav", np.stack([left, -left / 2], 1), 16000, subtype="FLOAT")
     np.testing.assert_allclose(read_speech(tmp_path / "a.wav"), left / 4, atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        (None, "no such sound file"),
-        (b"", "is empty"),
-        (b"this is text\n" * 9, "not a readable sound file"),
-        (b"RIFF\x10\x00\x00\x00WAVEfmt ", "not a readable sound file"),
-    ],
-)
-def test_a_file_without_sound_is_refused_by_name(tmp_path: Path, content: bytes | None, sentence: str) -> None:
-    path = tmp_path / "speech.wav"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(FaceDiffError, match=sentence) as error:
-        read_speech(path)
-    assert str(path) in str(error.value)
-
-
-class Bomb:
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.mkdir, ("bomb-went-off",)
-
-
-@pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_a_pickle_that_would_run_code_is_refused_and_does_not_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "templates.pkl").write_bytes(pickle.dumps({"A": Bomb()}, protocol))
-    with pytest.raises(FaceDiffError, match=r"templates\.pkl: not a pickle of plain NumPy arrays"):
-        load_pickle(tmp_path / "templates.pkl")
-    assert not (tmp_path / "bomb-went-off").exists()
-
-
-@pytest.mark.parametrize("protocol", [0, 1, 2, 4, 5])
-def test_arrays_in_containers_come_back(tmp_path: Path, protocol: int) -> None:
-    data = {"A": np.arange(6.0).reshape(2, 3), "B": [np.float32(2.5), (1, "x")]}
-    (tmp_path / "t.pkl").write_bytes(pickle.dumps(data, protocol))
-    loaded = load_pickle(tmp_path / "t.pkl")
-    assert np.array_equal(loaded["A"], data["A"])
-    assert loaded["B"] == data["B"]
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj"])
@@ -439,15 +393,3 @@ def test_a_file_a_thousand_folders_deep_is_written(tmp_path: Path, monkeypatch: 
     assert (Path("a/" * 1200) / "x.txt").read_text() == "x"
     (Path("a/" * 1200) / "x.txt").unlink()
     os.removedirs("a/" * 1200)  # pytest's tidying up would call itself for each
-
-
-def test_a_user_without_a_home_directory_is_told_of_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_home() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", no_home)
-    monkeypatch.setenv("FACEDIFF_CACHE", "elsewhere")
-    assert cache_dir() == Path("elsewhere")
-    monkeypatch.delenv("FACEDIFF_CACHE")
-    with pytest.raises(FaceDiffError, match="no home directory; set the variable FACEDIFF_CACHE"):
-        cache_dir()

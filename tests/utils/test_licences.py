@@ -51,17 +51,14 @@ def test_inherited_labels_are_kept_once() -> None:
 @pytest.mark.parametrize(
     "state",
     [
-        {},
         "x",
         [1],
         [{}],
-        [{"of": "a"}],
         [{**Licence("a").state(), "commercial": "yes"}],
         [{**Licence("a").state(), "name": 3}],
         [{**Licence("a").state(), "name": "${oc.env:HOME}"}],
         [{**Licence("a").state(), "source": "a\x1bb"}],
         [{**Licence("a").state(), "more": "x"}],
-        [Licence("a").state()] * 5000,
     ],
 )
 def test_labels_of_a_file_are_checked(state: object) -> None:
