@@ -21,11 +21,7 @@ Points = list[tuple[float, float]]
 
 
 def plots_of(table: Table, report: BenchmarkReport) -> dict[str, Drawing]:
-    """The plots of a table by name; those for which there is nothing to draw are left out.
-
-    Raises:
-        MissingExtraError: if matplotlib is not installed.
-    """
+    """The plots of a table by name; those for which there is nothing to draw are left out."""
     drawings = {
         "steps": curves_plot(table, report, "step"),
         "time": curves_plot(table, report, "seconds"),

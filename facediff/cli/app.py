@@ -258,11 +258,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
 
 
 def load(name: str) -> Callable[..., int | None]:
-    """Import a command's function.
-
-    Raises:
-        FaceDiffError: if the package that adds it cannot be imported, naming the file and the line.
-    """
+    """Import a command's function."""
     if name not in COMMANDS:
         point = installed_commands()[name]
         try:

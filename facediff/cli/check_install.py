@@ -63,11 +63,7 @@ def check_install() -> None:
 
 
 def trial() -> Animation:
-    """Animate bursts of a tone.
-
-    Raises:
-        FaceDiffError: if the motion is not finite or of another length.
-    """
+    """Animate bursts of a tone."""
     import numpy as np
 
     import facediff

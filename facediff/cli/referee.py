@@ -116,11 +116,7 @@ def judged(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None
 def candidates_of(
     models: Sequence[str], motion: Sequence[str], layout: str | None, frame_rate: float | None
 ) -> list[Candidate]:
-    """What is compared: from words and plans.
-
-    Raises:
-        FaceDiffError: naming what does not exist, or is called twice.
-    """
+    """What is compared: from words and plans."""
     from facediff.pipelines.candidates import Candidate
 
     candidates: list[Candidate] = []

@@ -20,9 +20,6 @@ def check_trainer(options: Mapping[str, Any], command: str = "fit") -> None:
     Args:
         options: of the trainer.
         command: fit, validate, test or predict.
-
-    Raises:
-        ArgumentError: naming the option.
     """
     limit = f"limit_{ {'fit': 'train', 'validate': 'val'}.get(command, command) }_batches"
     precision, clipping = options.get("precision"), options.get("gradient_clip_val") or 0

@@ -64,9 +64,6 @@ class ParameterFiles:
             layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
             rig: a ``.glb``, a folder of shapes, or FLAME's model file; None to score channels only.
             stride: of the truth, every frame at a multiple of this number is scored.
-
-        Raises:
-            FaceDiffError: if it cannot be read, or the rig has none of its channels.
         """
         files = sorted(
             path for path in truth.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
@@ -108,11 +105,7 @@ class ParameterFiles:
         return rig.template if person is None else rig.shaped(person)
 
     def read(self, path: Path, stride: int) -> Motion:
-        """Channels of a file in the order of the space, and the vertices of a face that does not turn its head.
-
-        Raises:
-            FaceDiffError: if the file has other channels, or another frame rate.
-        """
+        """Channels of a file in the order of the space, and the vertices of a face that does not turn its head."""
         inside = [folder for folder in self.predictions if folder != self.truth and folder.is_relative_to(self.truth)]
         is_truth = path.is_relative_to(self.truth) and not any(map(path.is_relative_to, inside))
         clip = even(_read(path, self.layouts[1 if is_truth else 0]))

@@ -109,9 +109,6 @@ class Scorer:
         read: reads a file, every ``stride``-th frame of it; None for files of vertices.
         channels: regions ``lips`` and ``upper_face`` of channels, for protocols of channels.
         scales: factor of lengths of each protocol, by its name.
-
-    Raises:
-        FaceDiffError: if a protocol needs what is not given, or a region does not fit the mesh.
     """
 
     def __init__(
@@ -200,11 +197,7 @@ class Scorer:
         )
 
     def score(self, pair: Pair) -> ClipScores | str:
-        """The scores of a clip, or in words why it has none: a file of it cannot be used.
-
-        Raises:
-            FaceDiffError: if it holds NaN or infinity, or a protocol refuses its lengths.
-        """
+        """The scores of a clip, or in words why it has none: a file of it cannot be used."""
         subject = pair.truth.name.subject
         template = self.templates.get(subject)
         if self.needs_template and template is None:
@@ -363,9 +356,6 @@ def score_all(
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         reads: the folders of the clips, which workers of a cluster must see.
         progress: whether to show a bar.
-
-    Raises:
-        FaceDiffError: the first that a clip raises; clips not yet begun are left.
     """
     by_method: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
     results = run_tasks(

@@ -171,10 +171,6 @@ def distil_audio_encoder(
     Returns:
         the remaining error of the student's features, as a share of the teacher features' variance: the mean of the
         last tenth of the steps.
-
-    Raises:
-        FaceDiffError: if nothing of the encoder can be trained, an augmentation is unknown, or recordings with words
-            are missing, damaged or of no use to this corpus.
     """
     augmentations = read_augmentations(options.augmentations)
     # The teacher's features of the clean recording are the target: its frames must stay where they are.

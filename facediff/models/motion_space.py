@@ -111,9 +111,6 @@ class PrincipalComponents(nn.Module):
             shapes: principal components of weighted motion, each as long as its standard deviation, largest first;
                 those beyond ``count`` are left out.
             weights: what each coordinate was multiplied by, or the matrix that all were.
-
-        Raises:
-            FaceDiffError: if the training motion never changes.
         """
         shapes = shapes[: self.count]
         deviations = torch.linalg.vector_norm(shapes, dim=1)

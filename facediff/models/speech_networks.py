@@ -58,10 +58,6 @@ class Wav2Vec2Encoder(FrozenEncoder):
         do_normalize: standardise speech first; without it, the network takes the waveform as it is.
         config: the network's configuration as plain data; if given, the weights are not read from ``source`` but left
             for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
-
-    Raises:
-        FaceDiffError: if ``source`` cannot be read, or is no such network.
-        MissingExtraError: if transformers is not installed.
     """
 
     checkpoint_options = ("config",)  # without it, a file could have weights fetched from anywhere

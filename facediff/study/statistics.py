@@ -56,9 +56,6 @@ def bradley_terry(wins: Array) -> BradleyTerry:
     Args:
         wins: (R, K, K): how often rater r preferred i to j; half for no difference.
 
-    Raises:
-        FaceDiffError: if some conditions were never compared with the others, not even through third ones.
-
     Example:
         >>> found = bradley_terry(np.array([[[0.0, 3.0], [1.0, 0.0]]]))
         >>> bool(np.isclose(found.scores[0] - found.scores[1], np.log(3)))

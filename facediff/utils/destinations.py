@@ -20,12 +20,7 @@ RECORDS = frozenset(["manifest.json", "prepare.json", "metrics.csv"])
 
 
 def destination(path: Path) -> Path:
-    """The file or folder that a name leads to, through links; it need not exist.
-
-    Raises:
-        OSError: if links lead to each other, or the name cannot be looked up.
-        FaceDiffError: if it is a device or a pipe: a file that is renamed to that name would take its place.
-    """
+    """The file or folder that a name leads to, through links; it need not exist."""
     with suppress(FileNotFoundError, NotADirectoryError):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):

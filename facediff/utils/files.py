@@ -27,11 +27,7 @@ ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then eve
 
 
 def cache_dir() -> Path:
-    """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``.
-
-    Raises:
-        FaceDiffError: without that variable, of a user who has no home directory.
-    """
+    """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     if named := os.environ.get("FACEDIFF_CACHE"):
         return Path(named)
     try:
@@ -65,10 +61,6 @@ def atomic(path: Path) -> Iterator[Path]:
     Yields:
         a temporary path next to the file, which is renamed at the end and removed if anything fails. Its suffix is that
         of ``path``, since many writers choose the format by it.
-
-    Raises:
-        FaceDiffError: if the folder cannot be made, the file cannot be written, is protected against writing, or is an
-            input of the running command.
 
     Example:
         >>> import tempfile
@@ -169,10 +161,6 @@ def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
 
     As in :func:`atomic`, links are followed, and owner and permissions of a file stay. Without ``replace``, only an
     empty folder may be replaced.
-
-    Raises:
-        OSError: if that fails; what was at ``target`` is there again.
-        FaceDiffError: if ``target`` is, or holds, an input of the running command.
     """
     place = destination(target)
     if place.is_dir():
@@ -258,12 +246,7 @@ def _hand_on(old: Path, new: Path) -> None:
 
 
 def _refuse_unwritable(path: Path, place: Path) -> None:
-    """Refuse to replace an input, or a file that is protected against writing: renaming would not ask.
-
-    Raises:
-        FaceDiffError: if the file is an input of the running command.
-        OSError: if it is protected.
-    """
+    """Refuse to replace an input, or a file that is protected against writing: renaming would not ask."""
     refuse_protected(path)
     with suppress(FileNotFoundError, NotADirectoryError):
         if not place.stat().st_mode & 0o222:  # root may write to everything, but not against somebody's wish
@@ -425,9 +408,6 @@ def reserve_room(path: Path) -> None:
     """Take the room of a file that is to be written through a memory map.
 
     Without it, a disk that fills up ends the process (SIGBUS) in the middle of an assignment.
-
-    Raises:
-        OSError: if the disk has no room.
     """
     with path.open("r+b") as stream:
         if hasattr(os, "posix_fallocate") and (size := path.stat().st_size):

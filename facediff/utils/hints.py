@@ -261,9 +261,6 @@ def convert(hint: Any, value: Any) -> Any:  # noqa: ANN401 - a type hint and its
 def read(hint: Any, word: str) -> Any:  # noqa: ANN401 - a type hint and its value
     """A word of the command line as a value of a hint; numbers in ASCII digits, without underscores or blanks.
 
-    Raises:
-        ValueError: if it is none; it says what was expected.
-
     Example:
         >>> read(Annotated[float, Range(0, 1)] | None, "0.5"), read(bool, "true"), read(str, "0.5")
         (0.5, True, '0.5')
@@ -396,9 +393,6 @@ def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a data
     """Refuse options, the fields of a dataclass, that do not fit their type hints; for ``__post_init__``.
 
     None is allowed.
-
-    Raises:
-        OptionError: naming the option and the range.
     """
     owner: Any = type(options)
     for name, hint in hints_of(owner).items():

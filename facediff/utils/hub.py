@@ -128,21 +128,13 @@ def may_have_weights(source: str | os.PathLike[str]) -> bool:
 
 
 def check_animating_source(source: str | os.PathLike[str]) -> None:
-    """Refuse, before anything heavy is imported, what cannot be animated with.
-
-    Raises:
-        FaceDiffError: as :func:`check_model_source`; a folder of ``facediff export-model`` is no error.
-    """
+    """Refuse, before anything heavy is imported, what cannot be animated with."""
     if not is_exported(source):
         check_model_source(source, expected=EXPECTED_TO_ANIMATE)
 
 
 def model_or_bundled(source: Source | None) -> Source | Path:
-    """The model that somebody named, or the one that comes with facediff; that none was named is said in a line.
-
-    Raises:
-        FaceDiffError: if it is the latter, and this copy of facediff was installed without it.
-    """
+    """The model that somebody named, or the one that comes with facediff; that none was named is said in a line."""
     named = BUNDLED if source is None else bundled_by_name(source)
     if named is BUNDLED and not is_exported(BUNDLED):
         raise FaceDiffError(f"--checkpoint: missing, and this copy of facediff has no model at {BUNDLED}; {EXPECTED}")
@@ -166,20 +158,12 @@ def check_training_source(source: str | os.PathLike[str]) -> None:
 
 
 def model_path(source: str | os.PathLike[str]) -> Path:
-    """The checkpoint or the model folder that a name stands for; a model of the hub is fetched.
-
-    Raises:
-        FaceDiffError: if there is none, or it cannot be fetched.
-    """
+    """The checkpoint or the model folder that a name stands for; a model of the hub is fetched."""
     return _located(source)[0]
 
 
 def local_model(source: str | os.PathLike[str]) -> Path:
-    """As :func:`model_path`, with the face after it where one is named.
-
-    Raises:
-        FaceDiffError: as :func:`model_path`.
-    """
+    """As :func:`model_path`, with the face after it where one is named."""
     path, face = _located(source)
     return path if face is None else path.with_name(f"{path.name}:{face}")
 
@@ -192,11 +176,7 @@ def _located(source: str | os.PathLike[str]) -> tuple[Path, str | None]:
 
 
 def model_files(source: str | os.PathLike[str]) -> list[Path]:
-    """The files that decide what a model makes: the checkpoint, or those of the folder that hold numbers.
-
-    Raises:
-        FaceDiffError: as :func:`model_path`.
-    """
+    """The files that decide what a model makes: the checkpoint, or those of the folder that hold numbers."""
     path = model_path(source)
     return [path / name for name in (CONFIG, WEIGHTS, ASSETS)] if path.is_dir() else [path]
 
@@ -219,12 +199,7 @@ def model_name(source: str | os.PathLike[str]) -> str:
 
 
 def fetch(name: str, revision: str | None = None) -> Path:
-    """The folder of a model of the hub, in the hub's cache on this machine.
-
-    Raises:
-        FaceDiffError: if there is no such model or no network.
-        MissingExtraError: if huggingface_hub is not installed.
-    """
+    """The folder of a model of the hub, in the hub's cache on this machine."""
     with needs_extra("huggingface_hub", "hub", f"fetching the model {name}"):
         from huggingface_hub import snapshot_download
     shown = name if revision is None else f"{name}@{revision}"
@@ -241,12 +216,7 @@ def fetch(name: str, revision: str | None = None) -> Path:
 
 
 def push(folder: Path, name: str, *, private: bool = False) -> str:
-    """Send a model folder to the hub; the model's address.
-
-    Raises:
-        FaceDiffError: if it cannot be sent.
-        MissingExtraError: if huggingface_hub is not installed.
-    """
+    """Send a model folder to the hub; the model's address."""
     with needs_extra("huggingface_hub", "hub", "sending a model to the hub"):
         from huggingface_hub import HfApi
     with _hub_errors(name, "sent"), _progress():

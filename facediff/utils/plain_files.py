@@ -94,11 +94,7 @@ def json_text(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write an object as JSON, whole or not at all; equal objects give equal bytes.
-
-    Raises:
-        FaceDiffError: if a number is NaN or infinite.
-    """
+    """Write an object as JSON, whole or not at all; equal objects give equal bytes."""
     text = json_text(path, content) + "\n"
     with atomic(path) as temporary:
         # Bytes of a file name that are no UTF-8 become the escapes by which JSON names them; they come back on reading.

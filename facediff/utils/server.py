@@ -161,9 +161,6 @@ def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn
         purpose: what they are needed for.
         names: of the packages.
         extra: of facediff that brings them.
-
-    Raises:
-        MissingExtraError: naming the extra.
     """
     for name in names:
         with needs_extra(name, extra, purpose):

@@ -391,11 +391,7 @@ class ChunkStream(PieceStream):
 
     @torch.inference_mode()
     def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
-        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames.
-
-        Raises:
-            FaceDiffError: if the stream was finished.
-        """
+        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames."""
         for chunk in self._pieces(samples, self.model.chunk_samples):
             self._next(chunk, self.model.scales[-1])
         end = min(self._first + len(self._raw), self._spoken)
@@ -404,12 +400,7 @@ class ChunkStream(PieceStream):
 
     @torch.inference_mode()
     def finish(self, frames: int | None = None) -> Motion:
-        """Give the motion that is left; arguments and errors are those of the base class.
-
-        Raises:
-            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
-                the stream was finished.
-        """
+        """Give the motion that is left; arguments and errors are those of the base class."""
         self._refuse_finished()
         self._finished = True
         end, size = self._first + len(self._raw), self.model.chunk_samples

@@ -150,11 +150,7 @@ class AuthorFiles:
     ignored: dict[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Tensor:
-        """A tensor.
-
-        Raises:
-            FaceDiffError: if it is missing.
-        """
+        """A tensor."""
         if name not in self.tensors:
             raise FaceDiffError(
                 f"{self.source}: lacks the tensor {name} of {self.card.method}; give the whole checkpoint, as its "
@@ -163,11 +159,7 @@ class AuthorFiles:
         return self.tensors[name]
 
     def size(self, name: str, axis: int) -> int:
-        """A size of a tensor.
-
-        Raises:
-            FaceDiffError: if there is no such tensor, or it has no such axis.
-        """
+        """A size of a tensor."""
         shape = self[name].shape
         if axis >= len(shape):
             raise FaceDiffError(f"{self.source}: its tensor {name} has the shape {tuple(shape)}; expected another")
@@ -200,11 +192,7 @@ class AuthorFiles:
         return options
 
     def check_positions(self, frame_rate: float, dataset: str) -> None:
-        """Leave out the table of positions, once it is seen to be that of the frame rate.
-
-        Raises:
-            OptionError: if it is another table: the model would be given the wrong rate.
-        """
+        """Leave out the table of positions, once it is seen to be that of the frame rate."""
         name = self.card.positions
         if name not in self.tensors:
             return
@@ -236,11 +224,7 @@ class AuthorFiles:
         return self.backbone(f"{into}.network.", entry["kind"], stated.get(into, stated))
 
     def backbone(self, prefix: str, kind: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-        """The configuration of a speech network.
-
-        Raises:
-            OptionError: if a setting that is needed does not follow from the tensors.
-        """
+        """The configuration of a speech network."""
         convolutions = [
             self[f"{prefix}feature_extractor.conv_layers.{i}.conv.weight"].shape
             for i in range(max(1, self.count(f"{prefix}feature_extractor.conv_layers.")))

@@ -197,9 +197,6 @@ class CodeTalker(AutoregressiveModel):
 
         Args:
             path: a checkpoint of either stage, a model folder, or a name of the Hugging Face hub.
-
-        Raises:
-            OptionError: if there is none, it cannot be read, or its prior has other sizes or options.
         """
         from facediff.models.loading import load_model
         from facediff.utils.licences import merged
@@ -229,11 +226,7 @@ class CodeTalker(AutoregressiveModel):
 
     @classmethod
     def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """The prior, which a file of the second stage may hold by itself, with its layers counted as here.
-
-        Raises:
-            FaceDiffError: if the files hold no prior.
-        """
+        """The prior, which a file of the second stage may hold by itself, with its layers counted as here."""
         if inner := files.beginning("autoencoder."):
             for prefix in ("encoder.", "decoder.", "quantize."):
                 files.ignore(prefix, "the file of the second stage holds a prior of its own")

@@ -150,11 +150,7 @@ class DiffPoseTalk(ParametricModel):
 
     @classmethod
     def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Sizes, statistics, and what the files say that their networks were trained with.
-
-        Raises:
-            OptionError: if they are of a variant.
-        """
+        """Sizes, statistics, and what the files say that their networks were trained with."""
         said, style_dim = files.arguments.get("start_motion_feat", {}), files.size("null_style_feat", 2)
         if str(said.get("target", "sample")) != "sample" or str(said.get("pad_mode", "zero")) != "zero":
             raise OptionError.naming(
@@ -194,11 +190,7 @@ class DiffPoseTalk(ParametricModel):
         return False
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
-        """Follow speech (``audio``) or ``style`` by other scales.
-
-        Raises:
-            FaceDiffError: if the model was not trained without such a condition.
-        """
+        """Follow speech (``audio``) or ``style`` by other scales."""
         for name in scales:
             if name not in self.guiding:
                 raise OptionError.naming(f"{{guidance}} {name}: expected {choices(name, list(self.guiding))}")
@@ -474,11 +466,7 @@ class WindowStream(PieceStream):
 
     @torch.inference_mode()
     def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
-        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames.
-
-        Raises:
-            FaceDiffError: if the stream was finished.
-        """
+        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames."""
         model = self.model
         return self._counted(
             [self._next(piece, model.window_frames) for piece in self._pieces(samples, model.window_samples)]
@@ -486,12 +474,7 @@ class WindowStream(PieceStream):
 
     @torch.inference_mode()
     def finish(self, frames: int | None = None) -> Motion:
-        """Give the motion that is left; arguments and errors are those of the base class.
-
-        Raises:
-            FaceDiffError: if the speech was shorter than a frame, more frames than wanted were given out already, or
-                the stream was finished.
-        """
+        """Give the motion that is left; arguments and errors are those of the base class."""
         self._refuse_finished()
         self._finished = True
         # By rounding, all of the speech may last a frame less than its windows.
@@ -546,11 +529,7 @@ STATISTICS = tuple(f"{key}_{name}" for key in ("exp", "pose", "shape") for name 
 
 
 def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
-    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised.
-
-    Raises:
-        FaceDiffError: if a file cannot be read, or does not fit.
-    """
+    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised."""
     count = files.size("denoising_net.person_proj.weight", 1) - files.size("null_style_feat", 2)
     statistics, given = options.statistics, options.templates
     if statistics is None:

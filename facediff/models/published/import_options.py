@@ -95,11 +95,7 @@ class ImportOptions:
         return replace(self, **chosen, model_options={**flags, **self.model_options}), left
 
     def all_model_options(self) -> dict[str, Any]:
-        """Options of the model and its audio encoder by name; ``ignore`` is a list, since it may be repeated.
-
-        Raises:
-            OptionError: if an option has no name or no value.
-        """
+        """Options of the model and its audio encoder by name; ``ignore`` is a list, since it may be repeated."""
         options = dict(self.model_options)
         ignored = options.pop("ignore", [])
         options["ignore"] = [ignored] if isinstance(ignored, str) else list(ignored)

@@ -68,9 +68,6 @@ def import_checkpoint(paths: str | Path | Sequence[str | Path], **options: Any) 
         options: fields of :class:`~facediff.models.published.import_options.ImportOptions`, such as ``templates``; and
             options of the model or its audio encoder, such as ``num_heads=4`` or ``long_speech="extend"``.
 
-    Raises:
-        FaceDiffError: if a file cannot be read, is of no known method, or lacks something that is not given.
-
     Example:
         >>> model = import_checkpoint("vocaset.pth", templates="templates.pkl")  # doctest: +SKIP
         >>> model.animate(speech, identity="FaceTalk_170809_00138_TA", condition=model.identities[2])  # doctest: +SKIP
@@ -190,11 +187,7 @@ def convert(paths: str | Path | Sequence[str | Path], options: ImportOptions) ->
 
 
 def read_files(paths: Sequence[Path]) -> AuthorFiles:
-    """The tensors of all files together, and the card of their method.
-
-    Raises:
-        FaceDiffError: if a file cannot be read, two of them hold the same tensor, or they are of no known method.
-    """
+    """The tensors of all files together, and the card of their method."""
     tensors: dict[str, Tensor] = {}
     arguments: dict[str, Mapping[str, Any]] = {}
     for path in paths:
@@ -255,11 +248,7 @@ def datasets() -> dict[str, Dataset]:
 
 
 def facts_of(files: AuthorFiles, options: ImportOptions, asked: Mapping[str, Any]) -> Facts:
-    """Data set, frame rate, identities and neutral faces: by the sizes of the tensors, or as the user says.
-
-    Raises:
-        FaceDiffError: if they contradict each other, or do not follow.
-    """
+    """Data set, frame rate, identities and neutral faces: by the sizes of the tensors, or as the user says."""
     card, numbers = files.card, files.size(*files.card.coordinates)
     count = files.size(*card.speakers) if card.speakers else 0
     rate = read_value(asked.get("frame_rate", card.frame_rate)) if card.frame_rate else 0.0
@@ -289,11 +278,7 @@ def facts_of(files: AuthorFiles, options: ImportOptions, asked: Mapping[str, Any
 
 
 def identities_of(given: Sequence[str] | None, count: int, usual: list[str]) -> list[str]:
-    """The training identities.
-
-    Raises:
-        OptionError: if they are not as many as the checkpoint has, or no different names.
-    """
+    """The training identities."""
     names = usual if given is None else list(given)
     if (count and len(names) != count) or len(set(names)) < len(names) or not all(map(is_name, names)):
         raise OptionError.naming(
@@ -304,11 +289,7 @@ def identities_of(given: Sequence[str] | None, count: int, usual: list[str]) -> 
 
 
 def templates_of(given: Path | Mapping[str, Any] | None, points: int) -> dict[str, Tensor]:
-    """The neutral faces by speaker.
-
-    Raises:
-        FaceDiffError: if there are none, or they have another number of vertices.
-    """
+    """The neutral faces by speaker."""
     if given is None:
         raise OptionError.naming(
             "{templates}: no checkpoint holds the neutral faces; give the data set's templates.pkl, as the projects "
@@ -326,11 +307,7 @@ def templates_of(given: Path | Mapping[str, Any] | None, points: int) -> dict[st
 
 
 def assets_of(facts: Facts, options: ImportOptions) -> Assets:
-    """Faces and regions, with notes on what is missing.
-
-    Raises:
-        FaceDiffError: if a file cannot be read, or has another number of vertices.
-    """
+    """Faces and regions, with notes on what is missing."""
     points = len(next(iter(facts.templates.values())))
     indices = {name: torch.arange(points) for name in ("lips", "upper_face")}
     triangles = None
@@ -373,11 +350,7 @@ def assets_of(facts: Facts, options: ImportOptions) -> Assets:
 
 
 def read_triangles(mesh: Path | None, points: int) -> Tensor | None:
-    """The triangles of a mesh, if there is one.
-
-    Raises:
-        OptionError: if it has another number of vertices.
-    """
+    """The triangles of a mesh, if there is one."""
     from facediff.mesh import read_mesh
 
     if mesh is None:
@@ -392,11 +365,7 @@ def read_triangles(mesh: Path | None, points: int) -> Tensor | None:
 
 
 def read_config(config: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """The configuration of an audio encoder.
-
-    Raises:
-        OptionError: if the file holds no options by name.
-    """
+    """The configuration of an audio encoder."""
     if config is None or isinstance(config, Mapping):
         return config
     content = load_json(Path(config), name=f"--audio-config {config}", remedy="expected the config.json of the network")
@@ -418,11 +387,7 @@ def read_value(text: object) -> object:
 
 
 def with_options(method: str, given: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
-    """A model's options: those of the files, then those that the user gives; some are its audio encoder's.
-
-    Raises:
-        OptionError: if there is no such option.
-    """
+    """A model's options: those of the files, then those that the user gives; some are its audio encoder's."""
     own = options_of(registry.model.get(method)).keys() - {"n_vertices", "identities", "frame_rate", "space"}
     encoder = given.get("audio_encoder")
     encoders = options_of(component_class(encoder)).keys() - {"dim", "config", "source"} if encoder else set()
@@ -458,11 +423,7 @@ def label(model: AnimationModel, card: Card, facts: Facts) -> None:
 
 
 def save_model(model: AnimationModel, path: Path) -> None:
-    """Write a model as a checkpoint, in the form in which training writes one.
-
-    Raises:
-        FaceDiffError: if the file cannot be written.
-    """
+    """Write a model as a checkpoint, in the form in which training writes one."""
     from lightning.pytorch import Trainer
 
     from facediff.utils.files import atomic

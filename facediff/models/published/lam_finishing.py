@@ -47,9 +47,6 @@ def read_steps(text: str, known: Sequence[str], space: Space) -> frozenset[str]:
         text: what was asked for; nothing if empty.
         known: the method's steps.
         space: of the motion.
-
-    Raises:
-        ArgumentError: if there is no such step, or the motion is not of ARKit's channels.
     """
     steps = frozenset(filter(None, text.split("+")))
     if odd := sorted(steps - set(known)):

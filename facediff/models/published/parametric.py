@@ -183,11 +183,7 @@ class PieceStream(SpeechStream):
             yield piece
 
     def _left(self, end: int, frames: int | None) -> int:
-        """Frames to give out at the end, of all that the speech has or of so many.
-
-        Raises:
-            FaceDiffError: if there are none, or more were given out already.
-        """
+        """Frames to give out at the end, of all that the speech has or of so many."""
         total = end if frames is None else frames
         if end < 1 or total < self.frames:
             raise FaceDiffError(

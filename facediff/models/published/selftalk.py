@@ -137,11 +137,7 @@ class SelfTalk(DirectModel):
 
     @classmethod
     def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """The lip reader and its recogniser, which only training needs, are left out unless they are asked for.
-
-        Raises:
-            OptionError: if the vertices that the lip reader sees are not given; no file holds them.
-        """
+        """The lip reader and its recogniser, which only training needs, are left out unless they are asked for."""
         if asked.get("lip_reader") != "text":
             for prefix in ("text_encoder.", "lip_map.", "transformer.", "lm_head."):
                 files.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")

@@ -366,11 +366,7 @@ def space_of(name: str) -> Space:
 
 
 def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
-    """The chosen data set's frame rate, speakers and neutral face.
-
-    Raises:
-        FaceDiffError: if there is no such data set, or its files are missing or do not fit.
-    """
+    """The chosen data set's frame rate, speakers and neutral face."""
     known, name = files.card.data, options.dataset or DEFAULT
     if name not in known:
         raise OptionError.naming(f"{{dataset}} {name}: UniTalker has no such data set: {choices(name, known)}")
@@ -422,22 +418,14 @@ def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
 
 
 def released_array(path: Path) -> np.ndarray:
-    """An array of the data release.
-
-    Raises:
-        OptionError: if there is no such file.
-    """
+    """An array of the data release."""
     if not path.is_file():
         raise OptionError.naming(f"{{data_root}}: has no {path}; expected UniTalker's data release")
     return np.asarray(open_array(path, kinds="f"))
 
 
 def components_of(root: Path, data: Mapping[str, Any], count: int) -> tuple[Tensor, Tensor]:
-    """Mean and principal components of a data set's vertices.
-
-    Raises:
-        FaceDiffError: if the file is missing, or holds others.
-    """
+    """Mean and principal components of a data set's vertices."""
     path = Path(root) / data["folder"] / "pca.npz"
     if not path.is_file():
         raise OptionError.naming(f"{{data_root}}: has no {path}; expected UniTalker's data release")

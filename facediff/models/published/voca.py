@@ -94,11 +94,7 @@ class Voca(DirectModel):
 
     @classmethod
     def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """TensorFlow's layouts, the speaker's rows of two layers, and DeepSpeech's graph.
-
-        Raises:
-            OptionError: if the frame rate does not divide the published one, or DeepSpeech is missing.
-        """
+        """TensorFlow's layouts, the speaker's rows of two layers, and DeepSpeech's graph."""
         if PUBLISHED_RATE % facts.frame_rate:
             raise OptionError.naming(
                 f"{{option}} frame_rate={facts.frame_rate:g}: VOCA gives {PUBLISHED_RATE:g} frames a second; expected "
