@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from typing import ClassVar, Literal, Unpack
+from typing import Any, ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
@@ -325,7 +325,7 @@ class BilabialClosureRate(OpeningMetric):
         """Frames in closures, or closures, whichever are counted."""
         return len(clip.closures) if self.count == "closures" else sum(end - start for start, end in clip.closures)
 
-    def update(
+    def update(  # type: ignore[override]  # closures must be given
         self,
         prediction: Tensor,
         truth: Tensor,
@@ -352,10 +352,10 @@ class BilabialClosureRate(OpeningMetric):
 def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: bool) -> Clips:
     """The sequences with their closures, as far as these lie in scored frames; a mask has as many as are padded."""
     if isinstance(closures, Tensor):
-        by_clip = [_runs(row) for row in closures.reshape(-1, closures.shape[-1]).tolist()]
+        by_clip: list[Any] = [_runs(row) for row in closures.reshape(-1, closures.shape[-1]).tolist()]
         fits = closures.dtype == torch.bool and closures.shape[-1] == padded
     else:
-        by_clip, fits = [closures] if single else list(closures), True  # type: ignore[list-item]  # as the shape says
+        by_clip, fits = [closures] if single else list(closures), True
     if not fits or len(by_clip) != len(clips.clips):
         raise ValueError(
             f"closures of {len(by_clip)} sequences; expected, for each of {len(clips.clips)}, {padded} booleans or a "
