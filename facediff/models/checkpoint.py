@@ -133,8 +133,11 @@ def read_content(path: str | os.PathLike[str] | IO[bytes], *, weights: bool = Tr
     if isinstance(path, str | os.PathLike):
         source, face = split_face(path)
         name, path = str(source), model_path(source)
-    folder = isinstance(path, Path) and path.is_dir()
-    content = read_model(path, weights=weights or face is not None) if folder else load_tensors(path)
+    with naming(name):
+        if isinstance(path, Path) and path.is_dir():
+            content = read_model(path, weights=weights or face is not None)
+        else:
+            content = load_tensors(path)
     check_content(content, name)
     return (content if face is None else face_content(content, face, name)), name
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -246,3 +247,35 @@ def test_a_folder_with_content_is_not_replaced(checkpoint: Path, copy: Path) -> 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:  # noqa: ANN401
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path, *(found for key, part in items for found in leaves(part, (*path, key)))][bool(not path) :]
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors", "assets.npz"])
+def test_a_damaged_folder_is_refused_in_a_sentence_or_read(copy: Path, name: str) -> None:
+    original, rng = (copy / name).read_bytes(), np.random.default_rng(len(name))
+    damages = [original[: len(original) // 2], b"", *(bytearray(original) for _ in range(12))]
+    for damaged in damages:
+        if isinstance(damaged, bytearray):
+            for place in rng.integers(len(damaged), size=3):
+                damaged[place] = int(rng.integers(256))
+        (copy / name).write_bytes(damaged)
+        with contextlib.suppress(FaceDiffError):
+            load_model(copy)
+    (copy / name).unlink()
+    with pytest.raises(FaceDiffError, match=name):
+        load_model(copy)
+
+
+WILD = (None, True, -1, 2**70, 1e400, "", "x", "../x", [], [1], {}, {"a": 1}, {"$tensor": "x"})
+
+
+def test_every_leaf_of_a_config_may_be_anything(copy: Path) -> None:
+    text = (copy / "config.json").read_text()
+    for number, place in list(enumerate(leaves(json.loads(text))))[::5]:
+        config = json.loads(text)
+        inner = config
+        for key in place[:-1]:
+            inner = inner[key]
+        inner[place[-1]] = WILD[number % len(WILD)]
+        (copy / "config.json").write_text(json.dumps(config))
+        with contextlib.suppress(FaceDiffError):
+            load_model(copy)
