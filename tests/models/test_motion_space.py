@@ -301,6 +301,28 @@ def test_a_silent_network_smooths_by_the_frames_of_its_window(step: int) -> None
     assert predicted(scales, noisy[:, :3], silence[:, :3], steps, mask[:, :3]).isfinite().all()
 
 
+@pytest.mark.parametrize("lengths", [(15, 9), (7, 8), (5, 1), (3, 12)])
+def test_every_frame_is_smoothed_within_its_own_clip(lengths: tuple[int, int]) -> None:
+    """By the dense formula G = √ᾱ C (ᾱ C + (1 − ᾱ) I)⁻¹ of the outermost window that holds the frame.
+
+    What is shorter than a window goes on at the mean; whatever padding holds, it enters none.
+    """
+    process, width, count = NoiseProcess(), 7, max(lengths) + 2
+    scales, kept = smooth(process, width), float(process.signal.double()[400])
+    noisy = torch.randn(2, count, 3, generator=torch.Generator().manual_seed(2))
+    mask = torch.arange(count) < torch.tensor(lengths)[:, None]
+    made = scales.posterior_mean(noisy, torch.tensor([400, 400]), mask)
+    places = torch.arange(width)
+    covariance = over_time(places[:, None] - places).double()
+    gains = kept**0.5 * covariance @ torch.linalg.inv(kept * covariance + (1 - kept) * torch.eye(width))
+    for clip, length in enumerate(lengths):
+        values = torch.cat([noisy[clip, :length].double(), torch.zeros(width, 3)])
+        for frame in range(length):
+            first = min(max(frame - width // 2, 0), max(length - width, 0))
+            expected = torch.einsum("cw,wc->c", gains[:, frame - first], values[first : first + width])
+            torch.testing.assert_close(made[clip, frame].double(), expected, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "sampler", [lambda p: DdpmSampler(process=p, steps=100), lambda p: DpmSolverSampler(process=p, steps=50)]
 )

@@ -17,6 +17,7 @@ from facediff.errors import FaceDiffError
 from facediff.hyperparameters import describe
 from facediff.models.audio_encoders import HubertEncoder, standardise
 from facediff.models.layers import interpolate_frames
+from facediff.models.speech_networks import Wav2Vec2Encoder
 
 Change = Callable[[Path], object]
 
@@ -256,3 +257,15 @@ def test_hubert_frozen_key_changes_with_the_features(hubert_source: Path) -> Non
     assert key(frozen_layers=1) != first
     assert key(train_projection=True) != first
     assert key(spec_augment=True) is None
+
+
+@pytest.mark.parametrize(("frozen", "first"), [(0, 0), (2, 2), (-1, None)])
+def test_wav2vec2_trains_the_layers_above_the_frozen_ones(frozen: int, first: int | None, hubert_source: Path) -> None:
+    """0 freezes the convolutions alone, further layers go with the feature projection, −1 freezes all."""
+    encoder = Wav2Vec2Encoder(dim=None, source=str(hubert_source), frozen_layers=frozen, edges=False)
+    trained = {name for name, weight in encoder.network.named_parameters() if weight.requires_grad}
+    layers = {int(name.split(".")[2]) for name in trained if name.startswith("encoder.layers.")}
+    assert layers == (set() if first is None else set(range(first, len(encoder.network.encoder.layers))))
+    assert any(name.startswith("feature_projection.") for name in trained) == (frozen == 0)
+    assert not any(name.startswith("feature_extractor.") for name in trained)
+    assert any(name.startswith("encoder.pos_conv_embed.") for name in trained) == (frozen >= 0)
