@@ -127,20 +127,18 @@ PUBLISHED = {"scaled_by": "width", "place": "constant"}
 
 
 def reference(
-    one: State, two: State, speech: Tensor, dataset: str, identity: int, template: Tensor, *, output: str = "together"
+    one: State, two: State, speech: Tensor, dataset: str, identity: int, template: Tensor
 ) -> tuple[Tensor, float]:
     """Absolute vertices (frames, 3V), everything anew for each frame; and how near a tie any code was."""
     features, frames = resampled(features_of(standardised(speech, 1e-5), two, "audio_encoder."), dataset)
     memory = linear(hidden_of(features, two, "audio_encoder."), two, "audio_feature_map")
     style, table = two["learnable_style_emb.weight"][identity], two["PPE.pe"][0]
-    tokens, margin, fed_back = style[None], math.inf, []
+    tokens, margin = style[None], math.inf
     for i in range(frames):
         made = decoded(tokens + table[: i + 1], memory, two, "transformer_decoder.", dataset)
         codes, gap = quantised(linear(made, two, "feat_map"), one)
         margin = min(margin, gap)
         # A single frame is given twice, and the first of both is taken.
         last = decoded_motion(codes, one)[-1] if i else decoded_motion(codes.repeat(2, 1), one)[0]
-        fed_back.append(last)
         tokens = torch.cat([tokens, linear(last[None], two, "vertice_map") + style])
-    motion = decoded_motion(codes, one) if output == "together" else torch.stack(fed_back)
-    return motion + template, margin
+    return decoded_motion(codes, one) + template, margin

@@ -351,8 +351,8 @@ def talkingstyle_state(dataset: str, seed: int = 0, dim: int = 16, layers: int =
     return made | norm_state(f"{attention}.norm", 4, draw) | linear_state(f"{attention}.head", 1, 4, draw)
 
 
-def talkingstyle_style(s: State, identity: int, *, components: bool = False) -> Tensor:
-    """(dim,): each component attends to itself alone, or to all components."""
+def talkingstyle_style(s: State, identity: int) -> Tensor:
+    """(dim,): each component attends to itself alone."""
     name = "style_encoder.attention"
     row = s["style_encoder.my_obj_vector.weight"][identity]
     query, key, value = (
@@ -364,19 +364,17 @@ def talkingstyle_style(s: State, identity: int, *, components: bool = False) -> 
         for third, part in enumerate("qkv")
     )
     own = torch.full((len(row), len(row)), -torch.inf).fill_diagonal_(0.0)
-    mixed = attend(query, key, value, 1, 0.0 if components else own)
+    mixed = attend(query, key, value, 1, own)
     mixed = layer_norm(linear(mixed, s, f"{name}.attention.out_proj"), s, f"{name}.norm")
     return torch.relu(s["style_encoder.obj_vector.weight"][:, identity] + linear(mixed, s, f"{name}.head")[:, 0])
 
 
-def talkingstyle_offsets(
-    s: State, speech: Tensor, dataset: str, identity: int, frames: int | None = None, *, components: bool = False
-) -> Tensor:
+def talkingstyle_offsets(s: State, speech: Tensor, dataset: str, identity: int, frames: int | None = None) -> Tensor:
     """Offsets (frames, 3V), each frame from all earlier frames again."""
     features = features_of(standardised(speech, 1e-7), s, "audio_encoder.")
     features, frames = resampled(features, dataset, frames)
     memory = linear(hidden_of(features, s, "audio_encoder."), s, "audio_feature_map")
-    style, table = talkingstyle_style(s, identity, components=components), s["PPE.pe"][0]
+    style, table = talkingstyle_style(s, identity), s["PPE.pe"][0]
     tokens = style[None]
     for i in range(frames):
         made = decoded(tokens + table[: i + 1], memory, s, "transformer_decoder.", dataset)

@@ -348,7 +348,7 @@ class ARTalk(ParametricModel):
 
     def placed(self, motion: Float[Tensor, "frames modelled"]) -> Float[Tensor, "frames channels"]:
         """What the codec gives as all channels of the space; the others are 0."""
-        whole = motion.new_zeros(len(motion), self.n_vertices * self.dims)
+        whole = motion.new_zeros(len(motion), self.coordinates)
         whole[:, list(self.modelled)] = motion
         return whole
 
@@ -386,7 +386,7 @@ class ChunkStream(PieceStream):
             self._token = model.style_token(self.clip)
             self._state = model.begin(self._token)
         self._wave = self._token.new_zeros(0)
-        self._raw = self._token.new_zeros(0, model.n_vertices * model.dims)  # not smoothed yet
+        self._raw = self._token.new_zeros(0, model.coordinates)  # not smoothed yet
         self._first = 0  # the frame that it begins with
 
     @torch.inference_mode()
@@ -512,15 +512,7 @@ class ModulatedBlock(nn.Module):
 class BitGenerator(nn.Module):
     """Bits of a chunk's tokens from the tokens, those of the chunk before, and speech.
 
-    Args:
-        code_dim: bits of a token.
-        style_dim: channels of the style.
-        audio_width: channels of the speech.
-        dim: channels of the tokens.
-        num_layers: blocks.
-        num_heads: attention heads.
-        feed_forward_dim: channels between the two maps of a block.
-        scales: tokens of each rate.
+    Its sizes are options of ``ARTalk``.
     """
 
     mask: Tensor

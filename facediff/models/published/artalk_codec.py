@@ -20,9 +20,7 @@ Bits = Int[Tensor, "batch tokens code_dim"]
 class CodecAttention(nn.Module):
     """Self-attention of normalised frames, divided by the square root of the whole width.
 
-    Args:
-        dim: channels.
-        num_heads: attention heads.
+    Its sizes are options of ``ARTalk``.
     """
 
     def __init__(self, dim: int, num_heads: int) -> None:
@@ -44,12 +42,7 @@ class CodecAttention(nn.Module):
 class CodecTransformer(nn.Module):
     """A linear map, layers of attention and maps of each frame, a linear map.
 
-    Args:
-        in_dim: channels of the input.
-        dim: channels of the layers.
-        out_dim: channels of the result.
-        depth: layers.
-        num_heads: attention heads.
+    Its sizes are options of ``ARTalk``.
     """
 
     def __init__(self, in_dim: int, dim: int, out_dim: int, depth: int, num_heads: int) -> None:
@@ -74,13 +67,7 @@ class CodecTransformer(nn.Module):
 class BitCodec(nn.Module):
     """Motion to bits and back, each chunk together with the one before it.
 
-    Args:
-        channels: numbers of a frame of motion.
-        scales: tokens of a chunk at each rate, the coarsest, 1, first; the last is the chunk's frames.
-        code_dim: bits of a token.
-        dim: channels of the Transformers.
-        depth: their layers.
-        num_heads: their attention heads.
+    Its sizes are options of ``ARTalk``.
 
     Attributes:
         motion_mean, motion_std: by which motion is standardised.

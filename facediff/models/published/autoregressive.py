@@ -122,7 +122,7 @@ class OffsetModel(AutoregressiveModel):
         frames = self.trained_frames(batch)
         self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
-        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        truth = self.scaled_truth(batch, frames)
         if self.teacher_forcing:
             predicted = self.network.teacher_forced(style, memory, truth)
         else:
@@ -138,7 +138,7 @@ class OffsetModel(AutoregressiveModel):
         self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
         motion = self.network.generate(style, memory)
-        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
+        return self.offsets_of(motion)
 
 
 class ProjectedKeysValues(NamedTuple):
@@ -351,18 +351,17 @@ class SpokenDecoder(nn.Module):
 
     Args:
         audio_width: channels of the features of speech.
-        n_vertices: points V.
-        dims: numbers that each point has.
+        coordinates: numbers of a frame, 3V.
         decoder: the decoder's options.
     """
 
     style: nn.Module
 
-    def __init__(self, audio_width: int, n_vertices: int, dims: int, decoder: dict[str, Any]) -> None:
+    def __init__(self, audio_width: int, coordinates: int, decoder: dict[str, Any]) -> None:
         super().__init__()
         dim = int(decoder["dim"])
         self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(dims * n_vertices, dim)
+        self.motion_in = nn.Linear(coordinates, dim)
         self.decoder = PeriodicDecoder(**decoder)
 
     def after_motion(
@@ -380,8 +379,7 @@ class AutoregressiveNetwork(SpokenDecoder):
 
     Args:
         audio_width: channels of the features.
-        n_vertices: points V.
-        dims: numbers that each point has.
+        coordinates: numbers of a frame, 3V.
         style: weights of the training identities to a vector of the decoder's width.
         decoder: the decoder's options.
     """
@@ -390,13 +388,12 @@ class AutoregressiveNetwork(SpokenDecoder):
         self,
         *,
         audio_width: int,
-        n_vertices: int,
-        dims: int,
+        coordinates: int,
         style: nn.Module,
         decoder: dict[str, Any],
     ) -> None:
-        super().__init__(audio_width, n_vertices, dims, decoder)
-        self.motion_out = still_map(int(decoder["dim"]), dims * n_vertices)
+        super().__init__(audio_width, coordinates, decoder)
+        self.motion_out = still_map(int(decoder["dim"]), coordinates)
         self.style = style
 
     def teacher_forced(

@@ -103,6 +103,19 @@ class PublishedModel(AnimationModel):
         self.pairs = self.frame_rate == 25.0 and not self.interpolates
         self.audio_encoder, self.audio_width = make_encoder(audio_encoder or self.published_encoder, audio_dim)
 
+    @property
+    def coordinates(self) -> int:
+        """Numbers of a frame of motion."""
+        return self.n_vertices * self.dims
+
+    def scaled_truth(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames coordinates"]:
+        """True motion as training compares it, of so many frames."""
+        return (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+
+    def offsets_of(self, motion: Float[Tensor, "batch frames coordinates"]) -> BatchMotion:
+        """Scaled motion of a network in the unit of the corpus."""
+        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
+
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, with the published audio encoder where none was given."""
         chosen = arguments.get("audio_encoder")
@@ -281,7 +294,7 @@ class DirectModel(PublishedModel):
     ) -> BatchMotion:
         """All frames in one pass; nothing is random."""
         motion = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
+        return self.offsets_of(motion)
 
     @property
     def heard_steps(self) -> int:
@@ -331,7 +344,7 @@ class DirectMotion(ModelPart[DirectModel]):
         """In the unit of the corpus; the identity is an index, or −1."""
         model = self.model
         motion = model.decode(features, model.weights_of(identity), None)
-        return motion.view(*motion.shape[:2], model.n_vertices, model.dims) / model.scale
+        return model.offsets_of(motion)
 
 
 def direct_graphs(model: DirectModel) -> Graphs:

@@ -134,7 +134,7 @@ class CodeTalker(AutoregressiveModel):
             "leak": leak,
             "corrected": corrected,
         }
-        self.prior = MotionPrior(n_vertices=self.n_vertices, dims=self.dims, **self.prior_options)
+        self.prior = MotionPrior(coordinates=self.coordinates, **self.prior_options)
         self._lacks_prior = stage == "predictor"
         if stage == "prior":
             self.windows = type(self.windows)(above=math.inf)
@@ -145,8 +145,7 @@ class CodeTalker(AutoregressiveModel):
         self.prior.requires_grad_(False)
         self.network = Predictor(
             audio_width=self.audio_width,
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             width=self.prior.width,
             n_identities=len(self.identities),
             decoder=self.decoder_options,
@@ -263,7 +262,7 @@ class CodeTalker(AutoregressiveModel):
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """The published terms of either stage."""
         frames = batch.frame_lengths if self.stage == "prior" else self.trained_frames(batch)
-        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        truth = self.scaled_truth(batch, frames)
         if self.stage == "prior":
             return self.prior_losses(truth, frames)
         return self.predictor_losses(batch, truth, frames, generator)
@@ -332,7 +331,7 @@ class CodeTalker(AutoregressiveModel):
                 token = self.following(self.prior.decode_last(torch.cat(values, 1)), place - 1, style)
             values.append(self.prior.quantise(self.network.out(state.step(token))).values)
         motion = self.prior.decode_clips(torch.cat(values, 1), frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
+        return self.offsets_of(motion)
 
     def following(self, motion: Float[Tensor, "batch coordinates"], place: int, style: Tensor) -> Tensor:
         """The token of the frame after ``place``."""
@@ -372,7 +371,7 @@ class CodeTalker(AutoregressiveModel):
         frames = batch.frame_lengths
         tokens = self.prior.encode_clips((batch.motion * self.scale).flatten(2), frames)
         motion = self.prior.decode_clips(self.prior.quantise(tokens).values, frames)
-        return motion.view(*motion.shape[:2], self.n_vertices, self.dims) / self.scale
+        return self.offsets_of(motion)
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
         """One motion for all seeds."""
@@ -407,17 +406,16 @@ class Predictor(SpokenDecoder):
 
     Args:
         audio_width: channels of the features of speech.
-        n_vertices: points V.
-        dims: numbers that each point has.
+        coordinates: numbers of a frame, 3V.
         width: channels of all codes of a frame.
         n_identities: rows of the table of speakers.
         decoder: options of the decoder.
     """
 
     def __init__(
-        self, *, audio_width: int, n_vertices: int, dims: int, width: int, n_identities: int, decoder: dict[str, Any]
+        self, *, audio_width: int, coordinates: int, width: int, n_identities: int, decoder: dict[str, Any]
     ) -> None:
-        super().__init__(audio_width, n_vertices, dims, decoder)
+        super().__init__(audio_width, coordinates, decoder)
         dim = int(decoder["dim"])
         self.out = nn.Linear(dim, width, bias=False)
         self.style = SpeakerTable(n_identities, dim, "embedding")

@@ -31,17 +31,7 @@ Threshold = tuple[float, float, float]
 class PoseDenoiser(nn.Module):
     """Clean motion of a window from noisy motion.
 
-    Args:
-        channels: numbers of a frame of motion.
-        person_dim: numbers that describe the person: shape and style.
-        dim: channels of the Transformer.
-        num_layers: its layers.
-        num_heads: its attention heads.
-        feed_forward_dim: channels between the two maps of its feed-forward layers.
-        window: frames that are predicted in one pass.
-        context: frames before them.
-        steps: of the diffusion.
-        dropout: in the Transformer, in training.
+    Its sizes are options of ``DiffPoseTalk``.
     """
 
     steps_table: Tensor

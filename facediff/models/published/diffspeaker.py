@@ -123,8 +123,7 @@ class DiffSpeaker(DiffusionModel):
         self.process = NoiseProcess(variances=variances)
         self.network = DiffSpeakerNetwork(
             audio_width=self.audio_width,
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             dim=self.dim,
             num_layers=num_layers,
             num_heads=num_heads,
@@ -207,7 +206,7 @@ class DiffSpeaker(DiffusionModel):
 
     def state_space(self) -> VertexSpace | FoldedSpace:
         """Where the reverse process runs."""
-        rest = self.network.motion_out.bias.new_zeros(1, 1, self.dims * self.n_vertices)
+        rest = self.network.motion_out.bias.new_zeros(1, 1, self.coordinates)
         return space_of(self.network, self.sampling_space, rest, fresh_noise=False)
 
     def graphs(self) -> Graphs:
@@ -225,7 +224,7 @@ class DiffSpeaker(DiffusionModel):
         """The reverse process from noise that is drawn once."""
         self.check_length(frames, batch.names)
         conditions = self.conditions(batch, frames)
-        drawn = noise(batch.template.new_empty(len(batch), int(frames.max()), self.dims * self.n_vertices))
+        drawn = noise(batch.template.new_empty(len(batch), int(frames.max()), self.coordinates))
 
         def denoise(state: Tensor, step: int) -> Tensor:
             return self.predict(state, torch.full((len(batch),), step, device=state.device), conditions)[0]
@@ -264,7 +263,7 @@ class DiffSpeaker(DiffusionModel):
             features, last = state[..., self.dim : -2], self.network.motion_out
             coordinates = F.linear(features, last.weight) + state[..., -2:-1] * last.bias
             state = coordinates if noise is None else coordinates + state[..., -1:] * noise
-        return state.view(*state.shape[:2], self.n_vertices, self.dims) / self.scale
+        return self.offsets_of(state)
 
 
 class SpeakerSampler(Sampler):
@@ -371,25 +370,14 @@ def joined(first: Tensor, second: Tensor) -> Tensor:
 class DiffSpeakerNetwork(nn.Module):
     """Predicts clean motion from noisy motion, speech, the speaker and the step.
 
-    Args:
-        audio_width: channels of a frame's speech.
-        n_vertices: points V.
-        dims: numbers that each point has.
-        dim: channels.
-        num_layers: layers.
-        num_heads: attention heads.
-        hidden_dim: channels of the feed-forward layers.
-        dropout: everywhere, and on the positions.
-        period: frames after which positions and bias repeat.
-        n_identities: rows of the table of speakers.
+    Its sizes are options of ``DiffSpeaker``.
     """
 
     def __init__(
         self,
         *,
         audio_width: int,
-        n_vertices: int,
-        dims: int,
+        coordinates: int,
         dim: int,
         num_layers: int,
         num_heads: int,
@@ -402,14 +390,14 @@ class DiffSpeakerNetwork(nn.Module):
         self.dim, self.num_heads, self.period = dim, num_heads, period
         self.time_dim = audio_width  # sinusoids of the step; even
         self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(dims * n_vertices, dim)
+        self.motion_in = nn.Linear(coordinates, dim)
         # Each layer has tokens of its own.
         self.style = SpeakerTable(n_identities, num_layers * dim, "embedding")
         self.time = nn.Sequential(
             nn.Linear(audio_width, num_layers * dim), nn.SiLU(), nn.Linear(num_layers * dim, num_layers * dim)
         )
         self.layers = nn.ModuleList(AdaptedLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
-        self.motion_out = still_map(dim, dims * n_vertices)
+        self.motion_out = still_map(dim, coordinates)
         self.dropout = nn.Dropout(dropout)
         self.of_weights: WeightCache[Fold] = WeightCache()
 
@@ -524,7 +512,7 @@ def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
     speech = features_graph(model, model.network, 1)
     features = results_of(speech)
     batch, frames, dim = features.shape
-    folded, coordinates = model.sampling_space == "folded", model.dims * model.n_vertices
+    folded, coordinates = model.sampling_space == "folded", model.coordinates
     width = 2 * dim + 2 if folded else coordinates
     inputs = conditions_of(features, model)
     del inputs["template"]

@@ -116,7 +116,7 @@ class EmoTalk(DirectModel):
         self.emotion_encoder = Wav2Vec2Encoder(dim=None, source=emotion_source, config=emotion_config, edges=False)
         self.network = EmoTalkNetwork(
             widths=(self.audio_width, self.emotion_encoder.width),
-            coordinates=self.dims * self.n_vertices,
+            coordinates=self.coordinates,
             n_identities=len(self.identities),
             levels=levels,
             dim=dim,
@@ -167,7 +167,7 @@ class EmoTalk(DirectModel):
         """The mean squared error; the authors' own losses are not released."""
         frames = self.trained_frames(batch)
         predicted = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        truth = (batch.motion * self.scale).flatten(2)[:, : int(frames.max())]
+        truth = self.scaled_truth(batch, frames)
         error = masked_mean((predicted - truth).square(), frames)
         return {"reconstruction": error, "loss": error}
 
@@ -195,18 +195,7 @@ class EmoTalk(DirectModel):
 class EmoTalkNetwork(nn.Module):
     """Features of two speech networks, the level and the person to values of channels.
 
-    Args:
-        widths: channels of the features of content and of emotion.
-        coordinates: numbers of a frame.
-        n_identities: rows of the table of persons.
-        levels: rows of the table of levels.
-        dim: channels of the decoder.
-        parts: its channels of emotion, its level and the person; the others are of the content.
-        num_layers: its layers.
-        num_heads: its attention heads.
-        hidden_dim: channels of its feed-forward layers.
-        dropout: in the decoder.
-        period: frames that count alike.
+    Its sizes are options of ``EmoTalk``.
     """
 
     def __init__(

@@ -94,8 +94,7 @@ class FaceDiffuser(DiffusionModel):
         self.process = NoiseProcess(variances=torch.tensor(cosine_betas(self.steps), dtype=torch.float64, device="cpu"))
         self.network = FaceDiffuserNetwork(
             audio_width=2 * self.audio_width,
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             dim=dim or (512 if self.pairs else 256),
             steps=self.steps,
             num_layers=num_layers,
@@ -155,7 +154,7 @@ class FaceDiffuser(DiffusionModel):
         rest = self.rest(batch.template)
         # Published: absolute vertices are noised, the template included. The same template is added to the network's
         # output, which therefore learns offsets in either case.
-        clean = (batch.motion * self.scale).flatten(2)[:, :longest] + rest
+        clean = self.scaled_truth(batch, frames) + rest
         noisy = self.process.add_noise(clean, noise[:, :longest], step)
         network = self.network
         audio = network.audio_map(self.hear(batch, frames))
@@ -201,8 +200,7 @@ class FaceDiffuser(DiffusionModel):
             start = start * self.noise_share
         sampler.run(denoise, start, noise=lambda like: space.noise(noise(like)), progress=progress)
         # The last step gives the prediction itself, whose features are the only ones that are mapped to vertices.
-        motion = network.motion_out(hidden) / self.scale
-        return motion.view(*motion.shape[:2], self.n_vertices, self.dims)
+        return self.offsets_of(network.motion_out(hidden))
 
     @property
     def noise_share(self) -> float:
@@ -213,23 +211,14 @@ class FaceDiffuser(DiffusionModel):
 class FaceDiffuserNetwork(nn.Module):
     """Predicts clean motion from noisy motion, speech, the speaker and the step.
 
-    Args:
-        audio_width: channels of a frame's speech.
-        n_vertices: points V.
-        dims: numbers that each point has.
-        dim: channels of each of the three inputs, and of the recurrent layers.
-        steps: noising steps.
-        num_layers: recurrent layers.
-        dropout: between them.
-        n_identities: rows of the table of speakers.
+    Its sizes are options of ``FaceDiffuser``.
     """
 
     def __init__(
         self,
         *,
         audio_width: int,
-        n_vertices: int,
-        dims: int,
+        coordinates: int,
         dim: int,
         steps: int,
         num_layers: int,
@@ -238,14 +227,14 @@ class FaceDiffuserNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.audio_map = nn.Linear(audio_width, dim)
-        self.motion_in = nn.Linear(dims * n_vertices, 2 * dim)
+        self.motion_in = nn.Linear(coordinates, 2 * dim)
         self.smooth = nn.Conv1d(1, 1, kernel_size=9, padding=4)
         self.step = nn.Linear(steps, dim)
         self.norm = nn.LayerNorm(3 * dim)
         # Forward only, so that a frame's motion does not depend on later speech but for HuBERT's own attention.
         self.gru = nn.GRU(3 * dim, dim, num_layers, batch_first=True, dropout=dropout if num_layers > 1 else 0.0)
         self.style = SpeakerTable(n_identities, dim)
-        self.motion_out = still_map(dim, dims * n_vertices)
+        self.motion_out = still_map(dim, coordinates)
         self.of_weights: WeightCache[Fold] = WeightCache()
 
     def forward(
@@ -294,7 +283,7 @@ class DiffuserStart(ModelPart[FaceDiffuser]):
 
     def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
         """Noised zeros."""
-        space = self.model.state_space(torch.zeros(1, 1, self.model.dims * self.model.n_vertices))
+        space = self.model.state_space(torch.zeros(1, 1, self.model.coordinates))
         return space.noise(noise) * self.model.noise_share
 
 
@@ -303,14 +292,13 @@ class LastMap(ModelPart[FaceDiffuser]):
 
     def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
-        coordinates = self.model.network.motion_out(sample)
-        return coordinates.view(*coordinates.shape[:2], self.model.n_vertices, self.model.dims) / self.model.scale
+        return self.model.offsets_of(self.model.network.motion_out(sample))
 
 
 def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
     """FaceDiffuser over all of its steps, with fresh noise in each but the last."""
     speech = features_graph(model, model.network, 2)
-    features, space = results_of(speech), model.state_space(torch.zeros(1, 1, model.dims * model.n_vertices))
+    features, space = results_of(speech), model.state_space(torch.zeros(1, 1, model.coordinates))
     batch, frames, dim = features.shape
     step = Graph(
         "step",

@@ -40,8 +40,7 @@ class FaceFormer(OffsetModel):
         # training command line, which no checkpoint records.
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             style=SpeakerTable(len(self.identities), self.dim),
             decoder=self.decoder_options,
         )

@@ -90,7 +90,7 @@ class LamAudio2Expression(DirectModel):
         self.network = LamNetwork(
             audio_width=self.audio_width,
             space=self.space,
-            coordinates=self.dims * self.n_vertices,
+            coordinates=self.coordinates,
             n_identities=len(self.identities),
             dim=dim,
             identity_dim=identity_dim,
@@ -116,7 +116,7 @@ class LamAudio2Expression(DirectModel):
         """The mean absolute error."""
         frames = self.trained_frames(batch)
         predicted = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        truth = (batch.motion * self.scale).flatten(2)[:, : predicted.shape[1]]
+        truth = self.scaled_truth(batch, frames)
         error = masked_mean((predicted - truth).abs(), frames)
         return {"reconstruction": error, "loss": error}
 
@@ -187,17 +187,7 @@ class LamAudio2Expression(DirectModel):
 class LamNetwork(nn.Module):
     """Features of speech and a speaker to values of channels.
 
-    Args:
-        audio_width: channels of the features.
-        space: of the motion; says which channels are bounded.
-        coordinates: numbers of a frame.
-        n_identities: rows of the table of speakers.
-        dim: channels.
-        identity_dim: channels of a speaker's row.
-        layers: of the Transformer.
-        num_heads: its attention heads.
-        hidden_dim: channels of its feed-forward layers.
-        dropout: on the features, and in the Transformer.
+    Its sizes are options of ``LamAudio2Expression``.
     """
 
     def __init__(

@@ -21,11 +21,7 @@ from facediff.models.speech_networks import by_lengths
 class PriorBlock(nn.Module):
     """Self-attention over all frames, then a feed-forward layer; each normalises its input and is added.
 
-    Args:
-        dim: channels.
-        num_heads: attention heads.
-        hidden_dim: channels of the feed-forward layer.
-        corrected: divide scores by the root of a head's width, and not of the whole layer's.
+    Its sizes are options of ``CodeTalker``.
     """
 
     def __init__(self, dim: int, num_heads: int, hidden_dim: int, *, corrected: bool) -> None:
@@ -61,13 +57,7 @@ class PriorBlock(nn.Module):
 class Half(nn.Module):
     """One half of the autoencoder: a convolution over time, and Transformer layers.
 
-    Args:
-        dim: channels.
-        num_layers: Transformer layers.
-        num_heads: their attention heads.
-        hidden_dim: channels of their feed-forward layers.
-        leak: slope below zero of the activation.
-        corrected: scores by the root of a head's width, and to each frame its own position.
+    Its sizes are options of ``CodeTalker``.
     """
 
     def __init__(
@@ -124,24 +114,13 @@ class Codes(NamedTuple):
 class MotionPrior(nn.Module):
     """Motion as tokens of a table of codes, and back.
 
-    Args:
-        n_vertices: points V.
-        dims: numbers that each point has.
-        dim: channels of both halves.
-        tokens: tokens of a frame.
-        token_dim: channels of a token.
-        codes: rows of the table.
-        token_maps: a linear map between the halves and the tokens, as on BIWI; without it, ``tokens`` · ``token_dim``
-            must be ``dim``.
-        out_bias: a bias of the map to vertices, as on VOCASET.
-        options: those of :class:`Half`.
+    Its sizes are options of ``CodeTalker``.
     """
 
     def __init__(
         self,
         *,
-        n_vertices: int,
-        dims: int,
+        coordinates: int,
         dim: int,
         tokens: int,
         token_dim: int,
@@ -152,7 +131,7 @@ class MotionPrior(nn.Module):
     ) -> None:
         super().__init__()
         self.tokens, self.width = tokens, tokens * token_dim
-        self.motion_in = nn.Linear(dims * n_vertices, dim)
+        self.motion_in = nn.Linear(coordinates, dim)
         self.encoder = Half(dim=dim, **options)
         self.to_tokens = nn.Linear(dim, self.width) if token_maps else nn.Identity()
         # Uniform in ±1/codes, as in the public VQ-VAE implementations that the released code follows: all codes start
@@ -160,7 +139,7 @@ class MotionPrior(nn.Module):
         self.codebook = nn.Parameter(torch.empty(codes, token_dim).uniform_(-1 / codes, 1 / codes))
         self.from_tokens = nn.Linear(self.width, dim) if token_maps else nn.Identity()
         self.decoder = Half(dim=dim, **options)
-        self.motion_out = nn.Linear(dim, dims * n_vertices, bias=out_bias)
+        self.motion_out = nn.Linear(dim, coordinates, bias=out_bias)
 
     def encode(self, motion: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames width"]:
         """Tokens of clips of one length, not yet codes."""

@@ -73,7 +73,7 @@ class ParametricModel(PublishedModel):
         if style_dim % style_heads or style_dim % 2:
             raise ArgumentError({"style_dim": style_dim}, "it must be even, and a multiple of its attention heads")
         self.plan_long_speech("extend")  # the methods cut speech into windows by themselves
-        numbers = self.n_vertices * self.dims
+        numbers = self.coordinates
         turned = () if self.space.is_vertices else self.space.rotations
         still = {place for turn in turned if turn.joint == "head" and not head for place in turn.channels}
         for turn in turned:

@@ -110,8 +110,7 @@ class SelfTalk(DirectModel):
         self.consistency_weight, self.ctc_weight = consistency_weight, ctc_weight
         self.network = SelfTalkNetwork(
             audio_width=self.audio_width * (2 if self.pairs else 1),
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             dim=dim,
             num_layers=num_layers,
             num_heads=num_heads,
@@ -186,8 +185,7 @@ class SelfTalk(DirectModel):
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Squared errors of positions and velocities, and the two losses of the lip reader."""
         frames = self.trained_frames(batch)
-        longest = int(frames.max())
-        truth = (batch.motion * self.scale).flatten(2)[:, :longest]
+        truth = self.scaled_truth(batch, frames)
         motion = self.network(self.hear(batch, frames), frames)
         position, change = squared_errors(motion, truth, frames)
         terms = {
@@ -242,23 +240,14 @@ class SelfTalk(DirectModel):
 class SelfTalkNetwork(nn.Module):
     """Features of speech to offsets of the vertices, all frames in one pass.
 
-    Args:
-        audio_width: channels of a frame's speech.
-        n_vertices: points V.
-        dims: numbers that each point has.
-        dim: channels of the decoder.
-        num_layers: its layers.
-        num_heads: its attention heads.
-        hidden_dim: channels of its feed-forward layers.
-        dropout: everywhere.
+    Its sizes are options of ``SelfTalk``.
     """
 
     def __init__(
         self,
         *,
         audio_width: int,
-        n_vertices: int,
-        dims: int,
+        coordinates: int,
         dim: int,
         num_layers: int,
         num_heads: int,
@@ -269,7 +258,7 @@ class SelfTalkNetwork(nn.Module):
         self.audio_map = nn.Linear(audio_width, dim)
         layer = nn.TransformerDecoderLayer(dim, num_heads, hidden_dim, dropout, batch_first=True)
         self.decoder = nn.TransformerDecoder(layer, num_layers)
-        self.motion_out = still_map(dim, dims * n_vertices)
+        self.motion_out = still_map(dim, coordinates)
 
     def forward(
         self, speech: Float[Tensor, "batch frames width"], frames: Int[Tensor, " batch"] | None
@@ -303,13 +292,7 @@ class Read(NamedTuple):
 class LipReader(nn.Module):
     """A Transformer that reads lips: from offsets of their vertices to letters, 50 times a second.
 
-    Args:
-        vertices: which vertices it sees, in this order; repeats count.
-        dim: channels, those of the recogniser that it learns from.
-        letters: how many there are.
-        num_layers: encoder layers, and as many decoder layers.
-        hidden_dim: channels of the feed-forward layers.
-        dropout: everywhere.
+    Its sizes are options of ``SelfTalk``.
     """
 
     HEADS = 8

@@ -59,8 +59,7 @@ class TalkingStyle(OffsetModel):
         self.mouth_loss = mouth_loss
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             style=SpeakerStyle(len(self.identities), self.dim),
             decoder=self.decoder_options,
         )

@@ -106,7 +106,7 @@ class UniTalker(DirectModel):
             components = 512 if self.space.is_vertices else 0
         self.network = UniTalkerNetwork(
             audio_width=self.audio_width,
-            coordinates=self.dims * self.n_vertices,
+            coordinates=self.coordinates,
             rows=len(self.identities) + 1,
             dim=dim,
             style_dim=dim if decoder_type == "transformer" else style_dim,
@@ -259,16 +259,7 @@ class UniTalker(DirectModel):
 class UniTalkerNetwork(nn.Module):
     """Features of speech and a speaker to the coefficients of a head, and these to motion.
 
-    Args:
-        audio_width: channels of the features.
-        coordinates: numbers of a frame of motion.
-        rows: of the table of speakers.
-        dim: channels.
-        style_dim: channels of a speaker's row.
-        decoder_type: what stands between speech and head.
-        num_heads: attention heads of a Transformer.
-        dropout: on the features, or in the Transformer.
-        components: linear shapes that the head predicts the coefficients of; 0 for motion itself.
+    Its sizes are options of ``UniTalker``.
     """
 
     def __init__(

@@ -83,8 +83,7 @@ class Voca(DirectModel):
         self.rows_per_frame = max(1, round(PUBLISHED_RATE / self.frame_rate))
         self.network = VocaNetwork(
             audio_width=self.audio_width,
-            n_vertices=self.n_vertices,
-            dims=self.dims,
+            coordinates=self.coordinates,
             n_identities=len(self.identities),
             window=speech_window,
             channels=channels,
@@ -221,7 +220,7 @@ class Voca(DirectModel):
         """Squared distances of vertices, and of their differences between frames."""
         frames = self.trained_frames(batch)
         coefficients = self.coefficients(self.hear(batch, frames), self.identity_weights(batch), frames)
-        truth = (batch.motion * self.scale).flatten(2)[:, : coefficients.shape[1]]
+        truth = self.scaled_truth(batch, frames)
         # Distances are sums over the three coordinates; the first frame is its own frame before, so that changes count
         # in as many frames as positions.
         count = frames.sum() * self.n_vertices
@@ -256,15 +255,7 @@ class VocaNetwork(nn.Module):
     joined to the result of the convolutions once more. Both times it picks columns of a matrix, which are the rows of
     two tables here.
 
-    Args:
-        audio_width: channels of speech.
-        n_vertices: points V.
-        dims: numbers that each point has.
-        n_identities: rows of the tables of speakers.
-        window: rows of speech.
-        channels: of the convolutions.
-        dim: channels of the dense layer after them.
-        components: linear shapes.
+    Its sizes are options of ``Voca``.
     """
 
     TAPS = 3
@@ -273,8 +264,7 @@ class VocaNetwork(nn.Module):
         self,
         *,
         audio_width: int,
-        n_vertices: int,
-        dims: int,
+        coordinates: int,
         n_identities: int,
         window: int,
         channels: Sequence[int],
@@ -296,7 +286,7 @@ class VocaNetwork(nn.Module):
         self.dense = nn.Linear(left * widths[-1], dim)
         self.late_style = SpeakerTable(n_identities, dim)
         self.coefficients = nn.Linear(dim, components)
-        self.expression = nn.Linear(components, dims * n_vertices)
+        self.expression = nn.Linear(components, coordinates)
 
     def forward(
         self, windows: Float[Tensor, "frames channels rows"], speaker: Float[Tensor, "frames identities"]

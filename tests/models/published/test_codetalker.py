@@ -12,7 +12,6 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from facediff.cli.app import main
 from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, CodeTalker, import_checkpoint, load_model
@@ -21,7 +20,6 @@ from facediff.models.published.importing import import_files
 from tests.fakes import codetalker, published
 from tests.fakes.published import COORDINATES, IDENTITIES, VERTICES, State
 from tests.fakes.tiny import Tiny
-from tests.models.conftest import no_dropout
 from tests.models.published import test_laws as laws
 from tests.models.published.author import face, speech_of, templates
 
@@ -255,21 +253,11 @@ def test_without_a_prior_no_predictor_is_trained(
         assert torch.equal(model.prior.state_dict()[name], value), name  # type: ignore[operator, union-attr]
 
 
-def test_a_run_without_a_prior_writes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = Path("configs/experiment/puppet_codetalker.yaml").resolve()
-    monkeypatch.chdir(tmp_path)
-    assert main(["fit", "--config", str(config)]) == 2
-    assert "--model.prior" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("option", ["codes", "prior_layers", "tokens", "motion_scale", "leak"])
+@pytest.mark.parametrize("option", ["codes", "motion_scale", "leak"])
 def test_a_prior_of_other_options_is_refused(
     option: str, make_method: MakeMethod, tiny: Tiny, make_trainer: MakeTrainer
 ) -> None:
-    other = {"codes": 5, "prior_layers": 2, "tokens": 4, "motion_scale": "unit", "leak": 0.3}
+    other = {"codes": 5, "motion_scale": "unit", "leak": 0.3}
     model = make_method("CodeTalker", **{option: other[option]})
     with pytest.raises(FaceDiffError, match=f"prior.*{option}"):
         make_trainer().fit(model, datamodule=tiny)
@@ -298,40 +286,6 @@ def test_a_predictor_goes_on_without_the_priors_file(
     model.check_training(resumed=True)  # as `facediff fit` does
     again.fit(model, datamodule=tiny, ckpt_path=tmp_path / "model.ckpt")
     assert again.current_epoch == 2
-
-
-@pytest.mark.slow
-def test_a_tiny_one_learns_one_clip_by_heart(make_method: MakeMethod, tiny: Tiny) -> None:
-    """Both stages, one after the other; the predictor then generates the clip, and not from its true frames."""
-    sample = tiny_clip(tiny)
-    batch = collate([sample])
-    sizes: dict[str, Any] = {"motion_scale": "none", "codes": 32, "tokens": 2, "prior_dim": 32, "dim": 32}
-    prior = laws.with_assets(make_method("CodeTalker", stage="prior", **sizes))
-    train(prior, batch, 80)
-    model = laws.with_assets(make_method("CodeTalker", **sizes))
-    assert isinstance(prior, CodeTalker)
-    assert isinstance(model, CodeTalker)
-    model.prior.load_state_dict(prior.prior.state_dict())
-    train(model, batch, 60)
-    still = batch.motion.square().mean()
-    for each in (prior, model):
-        with torch.no_grad():
-            assert (each.generate(batch) - batch.motion).square().mean() < 0.1 * still, each.stage
-
-
-def tiny_clip(tiny: Tiny) -> Any:  # noqa: ANN401
-    sample = tiny.dataset("train")[0]
-    return replace(sample, motion=sample.motion * 100, reference=sample.reference)
-
-
-def train(model: AnimationModel, batch: Any, steps: int) -> None:  # noqa: ANN401
-    no_dropout(model)
-    optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=3e-3)
-    for _ in range(steps):
-        optimizer.zero_grad()
-        model.losses(batch)["loss"].backward()
-        optimizer.step()
-    model.eval()
 
 
 # The authors' files.
