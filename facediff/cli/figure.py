@@ -78,20 +78,9 @@ class FileOptions:
         from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
         from facediff.evaluation.figures.gather import gather
 
-        material = gather(
-            methods,
-            truth,
-            patterns=self.pattern or DEFAULT_PATTERNS,
-            truth_pattern=self.truth_pattern or TRUTH_PATTERN,
-            identity=self.identity,
-            topology=self.topology,
-            templates=self.templates,
-            mesh=self.mesh,
-            frame_rate=self.frame_rate,
-            truth_stride=self.truth_stride,
-            unit=self.unit,
-        )
-        return paper, material
+        names = {"patterns": self.pattern or DEFAULT_PATTERNS, "truth_pattern": self.truth_pattern or TRUTH_PATTERN}
+        others = {name: value for name, value in vars(self).items() if "pattern" not in name and name != "method"}
+        return paper, gather(methods, truth, **names, **others)
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,6 @@ def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["guess.npz", "-o", "page.mp4"], 'unknown suffix ".mp4"; expected .html'),
         (["guess.npz", "-o", "page.html", "--max-mb", "0.01"], "more than the limit of 0.01 MB"),
         (["guess.npz", "-o", "page.html", "--max-mb", "-1"], "--max-mb -1"),
         (["guess.npz", "-o", "page.html", "--labels", "a", "b"], "2 names for 1 panels"),
