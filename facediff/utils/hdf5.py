@@ -65,7 +65,7 @@ def as_frames(values: npt.NDArray[np.generic], most: int, where: str, *, exact: 
     fits = frames.dtype.kind in "fiu" and frames.ndim == 2 and len(frames)
     if not fits or not (most if exact else 1) <= frames.shape[1] <= most:
         raise FaceDiffError(
-            f"{where} holds {values.dtype} of shape {values.shape}; expected numbers (1, frames, "
-            f"{'' if exact else 'up to '}{most}) with at least one frame"
+            f"{where} has shape {values.shape} of {values.dtype}; expected (1, frames, {'' if exact else 'up to '}"
+            f"{most}) of numbers, with at least one frame"
         )
     return frames.astype(np.float64)

@@ -344,20 +344,23 @@ def cut(key: str) -> Parts:
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        (without("jaw"), r"has no jaw \(it has exp, shape\); expected shape, exp and jaw"),
+        (without("jaw"), r"has no jaw \(it has exp, shape\); expected shape, exp, jaw"),
         (without("exp"), r"has no exp"),
         (with_nan("exp"), "NaN or infinity"),
         (with_nan("jaw"), "NaN or infinity"),
         (with_nan("shape"), "NaN or infinity"),
         (cut("jaw"), rf"frames do not agree \({FRAMES} of shape, {FRAMES} of exp, {FRAMES - 2} of jaw\)"),
         (cut("shape"), r"frames do not agree"),
-        ({**without("jaw"), "jaw": np.zeros((FRAMES, 6))}, r"jaw.* has shape \(1, \d+, 6\); expected \(1, frames, 3\)"),
+        (
+            {**without("jaw"), "jaw": np.zeros((FRAMES, 6))},
+            r"jaw.* has shape \(1, \d+, 6\) of float64; expected \(1, frames, 3\)",
+        ),
         (
             {**without("exp"), "exp": np.zeros((FRAMES, 101))},
-            r"exp.* has shape .*101\); expected \(1, frames, up to 100\)",
+            r"exp.* has shape .*101\) of float\d+; expected \(1, frames, up to 100\)",
         ),
         ({key: value[:0] for key, value in parameters_of(CLIP).items()}, r"with at least one frame"),
-        ({**without("exp"), "exp": np.full((FRAMES, 3), b"text")}, r"exp.* holds no numbers"),
+        ({**without("exp"), "exp": np.full((FRAMES, 3), b"text")}, r"exp.* of \|S4"),
     ],
 )
 def test_wrong_parameters_cost_one_clip_and_say_why(
@@ -386,11 +389,6 @@ def test_a_file_that_points_to_other_files_is_refused(raw: Path, tmp_path: Path)
         file.create_dataset("exp", parts["exp"].shape, "<f4", external=outside)
         file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
     with pytest.raises(FaceDiffError, match="exp lies in another file"):
-        read_parameters(hdf5(raw))
-    with h5py.File(hdf5(raw), "w") as file:
-        file.create_dataset("exp", (1, 10**9, 100), "<f4", chunks=(1, 64, 100))
-        file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
-    with pytest.raises(FaceDiffError, match="expected at most 1000000 frames"):
         read_parameters(hdf5(raw))
 
 
