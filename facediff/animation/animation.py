@@ -83,9 +83,6 @@ class Animation:
         channels: what the vertices were made of, where that is channels of a parametric space; see :attr:`values`.
         metadata: text about how it was made: identity, style, what in it is procedural …
 
-    Raises:
-        FaceDiffError: if the arrays do not fit one another, there is no frame, or a number is out of range.
-
     Example:
         >>> template = np.zeros((4, 3), np.float32)
         >>> animation = Animation("hello", np.stack([template] * 50), template, frame_rate=25)
@@ -189,11 +186,7 @@ class Animation:
 
     @cached_property
     def triangles(self) -> npt.NDArray[np.int32]:
-        """The triangles (F, 3).
-
-        Raises:
-            FaceDiffError: if there are none.
-        """
+        """The triangles (F, 3)."""
         if self.without_face:
             raise FaceDiffError(
                 f"{self.name}: its motion is {len(self.space.channels)} channels ({self.space.kind}), which no rig "
@@ -235,11 +228,7 @@ class Animation:
                 mapped._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
     def refuse_not_finite(self) -> None:
-        """Check every frame.
-
-        Raises:
-            FaceDiffError: naming the first frame that holds NaN, infinity or something near it.
-        """
+        """Check every frame."""
         for index, frame in enumerate(self.frames()):
             if not in_range(frame):
                 raise FaceDiffError(f"{self.name}: frame {index} holds {OUT_OF_RANGE}; generate the motion again")
@@ -261,9 +250,6 @@ class Animation:
 
         Returns:
             the file, and those that were written next to it.
-
-        Raises:
-            FaceDiffError: if there is no such format, it does not support an option, or a file cannot be written.
         """
         files: list[Path] = late(f"{MOTION}:save")([self], path, options)
         return files
@@ -282,9 +268,6 @@ class Animation:
 
         Returns:
             the page, which plays in a notebook and can be written with its ``save``.
-
-        Raises:
-            FaceDiffError: if the two cannot be compared, or the file cannot be written.
         """
         return late(f"{MOTION}:compare")([self], truth, output, labels)
 
@@ -294,9 +277,6 @@ class Animation:
 
         Args:
             options: listed below.
-
-        Raises:
-            FaceDiffError: if a value is out of range, or does not fit the face.
         """
         animation: Animation = late(f"{MOTION}:control")(self, AnimationControls(**options))
         return animation
@@ -314,9 +294,6 @@ class Animation:
             target_mesh: the other face at rest: .obj, .ply, .glb …
             correspondence: .npz to use if it exists, else to write for other animations.
             landmarks: .csv of pairs of vertices that are one place, or the .json of `facediff retarget --pick`.
-
-        Raises:
-            FaceDiffError: if a file cannot be read, or the mesh does not fit.
         """
         animation: Animation = late(f"{MOTION}:retarget")(self, target_mesh, correspondence, landmarks)
         return animation
@@ -328,9 +305,6 @@ class Animation:
             avatar: a .glb with shapes under names of ARKit, Oculus or VRM. Weights go by name where the motion has
                 ARKit's or is of the built-in face; :meth:`retarget` other motion to the avatar first.
             path: the .glb to write.
-
-        Raises:
-            FaceDiffError: if the avatar has no such shapes, or the motion is on another mesh.
         """
         written: list[Path] = late(f"{MOTION}:drive")(self, avatar, path)
         return written
@@ -361,9 +335,6 @@ class Animation:
             region: look at a region of the face only, such as ``lips``.
             residual_limit: share of the motion that weights may leave before they are refused.
             only_arkit: leave out shapes whose names are not ARKit's.
-
-        Raises:
-            FaceDiffError: if the shapes cannot be read or do not fit, or a number is out of range.
         """
         return late(f"{MOTION}:blendshapes")(
             self,

@@ -29,9 +29,6 @@ def recorded_parameters(source: str, frame_rate: float) -> ParameterClip | None:
     Args:
         source: a file, with ``@`` and its layout if it does not say that itself.
         frame_rate: frames a second of an array whose layout has no rate of its own.
-
-    Raises:
-        FaceDiffError: if there is no such file, or it is not of that layout.
     """
     path, stated = with_layout(source)
     if path.suffix not in PARAMETER_FILES or (stated is None and not path.is_file()):
@@ -60,9 +57,6 @@ def channels_of(recorded: ParameterClip, space: Space, frame_rate: float) -> npt
     """Motion in parameters (T, C) in the order of a model's space and at its frame rate.
 
     What phones do not record, such as a tongue that goes up, is at 0.
-
-    Raises:
-        FaceDiffError: if the model takes vertices, or the motion lacks one of its channels.
     """
     if space.is_vertices:
         raise OptionError.naming(

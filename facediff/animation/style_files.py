@@ -86,11 +86,7 @@ def style_paths(words: str | None) -> list[Path]:
 
 
 def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
-    """Weights that sum to 1; a note is printed if that changed them.
-
-    Raises:
-        FaceDiffError: if only some are given, one is not finite, or their sum is too near to 0.
-    """
+    """Weights that sum to 1; a note is printed if that changed them."""
     given = [weight for weight in weights if weight is not None]
     if not given:
         return [1.0 / len(weights)] * len(weights)
@@ -134,9 +130,6 @@ def style_given(style: object, *, vertices: bool) -> str | ParameterClip | Style
     Args:
         style: words; a path; names or paths with their weights; an animation, an array of motion or a vector.
         vertices: whether the model moves vertices, so that an animation's own values are of no use.
-
-    Raises:
-        FaceDiffError: if it is nothing of that kind.
     """
     import numpy as np
 
@@ -199,9 +192,6 @@ def vector_in(
         opened: the file.
         width: S of the model.
         still: gives the answer of the model's own encoder (S,); None if it has none to ask.
-
-    Raises:
-        FaceDiffError: if it has another length, or is not finite, or of another model.
     """
     import numpy as np
 
@@ -231,9 +221,6 @@ def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.f
         opened: the file.
         vertices: V of the model's faces.
         stride: from one frame to the next.
-
-    Raises:
-        FaceDiffError: if the file is of another topology, or not finite.
     """
     import numpy as np
 
@@ -250,11 +237,7 @@ def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.f
 
 
 def stride_of(path: Path, stored: float, wanted: float) -> int:
-    """Every how many-th frame of a file is taken.
-
-    Raises:
-        FaceDiffError: if the file's frame rate is no whole multiple of the model's.
-    """
+    """Every how many-th frame of a file is taken."""
     stride = round(stored / wanted)
     if stride < 1 or abs(stride * wanted - stored) > 1e-6:
         raise OptionError.naming(

@@ -55,9 +55,6 @@ class SolveOptions:
             it means that they are not those of this face; 1 or more allows everything.
         tolerance: what may be left of the optimality conditions, in weights.
         max_iterations: of Newton's method.
-
-    Raises:
-        FaceDiffError: if a strength is negative, or a bound, tolerance or count is impossible.
     """
 
     smoothness: ranges.Strength = 0.02
@@ -159,11 +156,7 @@ class Weights:
         )
 
     def tracks(self, viseme_set: VisemeSet) -> Weights:
-        """The weights as visemes, ``oculus`` or ``vrm``; see :func:`facediff.spaces.visemes.visemes`.
-
-        Raises:
-            FaceDiffError: if none of the shapes is ARKit's.
-        """
+        """The weights as visemes, ``oculus`` or ``vrm``; see :func:`facediff.spaces.visemes.visemes`."""
         columns = [index for index, name in enumerate(self.names) if name in ARKIT]
         if not columns:
             raise OptionError.naming(
@@ -208,11 +201,7 @@ class Weights:
 
 
 def own_weights(animation: Animation) -> Weights:
-    """The weights that an animation was made of, as they are; nothing is solved for.
-
-    Raises:
-        FaceDiffError: if it has none.
-    """
+    """The weights that an animation was made of, as they are; nothing is solved for."""
     values, space = animation.values, animation.space
     if values is None:
         raise FaceDiffError(f"{animation.name}: has no weights of its own; give shapes to solve for them")
@@ -246,11 +235,7 @@ def is_built_in_face(vertices: int, faces: npt.NDArray[np.integer] | None) -> bo
 
 
 def arkit_weights(animation: Animation) -> Weights:
-    """Weights of ARKit's shapes of an animation that :func:`has_arkit_weights`: its own, or solved for.
-
-    Raises:
-        FaceDiffError: as :func:`solve`.
-    """
+    """Weights of ARKit's shapes of an animation that :func:`has_arkit_weights`: its own, or solved for."""
     if animation.values is not None and animation.space.kind == "arkit":
         return own_weights(animation)
     return solve(animation, read_shapes(Path(BUILT_IN), animation.template, animation.unit))
@@ -269,10 +254,6 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         animation: with V vertices and T frames.
         shapes: of the animation's topology.
         options: the usual ones if None.
-
-    Raises:
-        FaceDiffError: if the topologies differ, a frame is not finite, the region is unknown, no shape moves anything,
-            or the weights leave more of the motion than the limit.
 
     Example:
         >>> from facediff.animation import Animation

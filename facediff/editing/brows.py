@@ -50,9 +50,6 @@ def brows_of(
 
     They are those that ``eyes`` or a region "brows" names, where there are; else those of the built-in face, which are
     carried over to other faces.
-
-    Raises:
-        FaceDiffError: if nobody says where they are, and no face is found in the mesh.
     """
     named = eyes.brows if eyes is not None and eyes.brows is not None else regions.get(REGION)
     if named is not None and len(named):

@@ -36,9 +36,6 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
         animation: with inner-lip pairs.
         closures: start and end of each, in seconds.
         budget: millimetres; a closure that would need more stays open by what is missing.
-
-    Raises:
-        FaceDiffError: if the animation does not say which vertices the inner lips are.
     """
     if animation.inner_lip_pairs is None or not len(animation.inner_lip_pairs):
         raise FaceDiffError(

@@ -276,12 +276,7 @@ def refuse_other_mesh(
     expected_vertices: npt.NDArray[np.floating],
     expected_faces: npt.NDArray[np.integer],
 ) -> None:
-    """Require the triangles of the mesh that a correspondence was made for; vertices may have moved.
-
-    Raises:
-        FaceDiffError: calling the mesh ``name``, if it is another one, or has its vertices or triangles in another
-            order.
-    """
+    """Require the triangles of the mesh that a correspondence was made for; vertices may have moved."""
     if len(vertices) != len(expected_vertices):
         raise FaceDiffError(
             f"{name}: has {len(vertices)} vertices, and the correspondence was made for a mesh of "
@@ -317,11 +312,7 @@ OTHER_FACE = 1e-3
 def refuse_other_face(
     name: str, vertices: npt.NDArray[np.floating], expected_vertices: npt.NDArray[np.floating]
 ) -> None:
-    """Require the rest positions that a correspondence was made for, but for what was sculpted since.
-
-    Raises:
-        FaceDiffError: calling the mesh ``name``, if it is another face of the same topology.
-    """
+    """Require the rest positions that a correspondence was made for, but for what was sculpted since."""
     away = float(np.median(np.linalg.norm(vertices - expected_vertices, axis=1)))
     if away > OTHER_FACE * float(np.ptp(expected_vertices, axis=0).max()):
         raise FaceDiffError(

@@ -160,9 +160,6 @@ class Direction:
         source: what messages call it, such as the file that it was read from.
         instead_of: options of :data:`INSTEAD_OF` whose work the keys stand for; with them it would be done twice.
 
-    Raises:
-        FaceDiffError: if there is no key, or two share a channel and a time.
-
     Example:
         >>> direction = Direction([Key(0, "expressiveness", 1.0), Key(2, "expressiveness", 2.0)])
         >>> direction.at([0, 1, 2])["expressiveness"]

@@ -31,9 +31,6 @@ def read_factors(scales: Scales | None, option: str = "expressiveness", highest:
         option: the option's name, for errors.
         highest: the largest factor.
 
-    Raises:
-        FaceDiffError: if the text is neither, a name comes twice, or a factor is not in 0 … ``highest``.
-
     Example:
         >>> read_factors("upper_face=1.5,all=1.1")
         {'upper_face': 1.5, 'all': 1.1}

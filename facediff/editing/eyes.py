@@ -38,11 +38,7 @@ SAME_FACE = 1e-3  # Metres that a face may differ from a puppet's to count as th
 
 @dataclass(frozen=True, eq=False)
 class Eyes:
-    """The eyes of a face.
-
-    Raises:
-        FaceDiffError: if the closing moves nothing or is not finite, or an eyeball is no set of four vertices or more.
-    """
+    """The eyes of a face."""
 
     # (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it is
     # not known

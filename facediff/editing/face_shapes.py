@@ -27,11 +27,7 @@ def own_shapes(template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer
 def shapes_of(
     template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None, unit: str, names: Sequence[str]
 ) -> Fields:
-    """Displacements (V, 3) of a face (V, 3), in its unit, for names of ARKit's shapes.
-
-    Raises:
-        FaceDiffError: if no face is found in the mesh.
-    """
+    """Displacements (V, 3) of a face (V, 3), in its unit, for names of ARKit's shapes."""
     fields = own_shapes(template, faces)
     if fields is not None:
         return {name: fields[name] / np.float32(metres_per_unit(unit)) for name in names}

@@ -19,11 +19,7 @@ SUFFIXES = (".csv", ".json")
 
 
 def read_weights(path: Path) -> Animation:
-    """Read a recording of ARKit's weights, and let the built-in face play it; the weights stay with the animation.
-
-    Raises:
-        FaceDiffError: if the file cannot be read, or holds other parameters.
-    """
+    """Read a recording of ARKit's weights, and let the built-in face play it; the weights stay with the animation."""
     from facediff.synthetic.known_faces import built_in_rig
 
     clip = even(read_parameters(path))

@@ -63,9 +63,6 @@ class RegularisedSolver:
         multipliers: (K,) factor of each weight that was solved for; 1 if None.
         offsets: (K,) what is added to it then; 0 if None.
 
-    Raises:
-        FaceDiffError: if sizes do not fit each other.
-
     Example:
         >>> neutral, deltas = np.eye(3) * 54.7, np.eye(9).reshape(9, 3, 3)[:2]
         >>> solver = RegularisedSolver(neutral, deltas, regularisation=Regularisation(l1=0, l2=0, symmetry=0))

@@ -223,10 +223,6 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh, wh
         target: the mesh.
         whole_head: whether all of a figure moves as its head does, so that the motion of the head can be taken off
             again, as weights of shapes need it; else its body stands still.
-
-    Raises:
-        FaceDiffError: if one of the meshes is not the correspondence's, or has its vertices in another order, or a
-            frame is not finite.
     """
     refuse_other_mesh(
         animation.name,

@@ -21,10 +21,6 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPh
     espeak-ng speaks the text, which gives the times of its phonemes, and both recordings are aligned by dynamic time
     warping of standardised cepstra. This is coarser than an aligner trained on people (50 ms are usual), but needs
     none.
-
-    Raises:
-        FaceDiffError: if the text is empty or too long, or the recording is silent.
-        MissingExtraError: if espeak-ng or the library for warping is not installed.
     """
     if not any(letter.isalpha() for letter in text) or len(text) > MOST_CHARACTERS:
         raise OptionError.naming(

@@ -26,11 +26,7 @@ def command() -> list[str] | None:
 
 
 def refuse_without_blender(path: Path) -> None:
-    """Refuse a file that nothing here can write.
-
-    Raises:
-        FaceDiffError: with the commands that write it on another machine.
-    """
+    """Refuse a file that nothing here can write."""
     if command() is None:
         words = f"{PROGRAM} --background --python {SCRIPT.name} -- {path.stem}.glb {path.name}"
         raise FaceDiffError(
@@ -50,9 +46,6 @@ def write_fbx(
         animation: for its frame rate.
         sound: name of the file of its sound; None if there is none.
         write_glb: writes the .glb of that name, and returns its files.
-
-    Raises:
-        FaceDiffError: if Blender fails.
     """
     refuse_without_blender(path)
     glb, *wav = write_glb(folder / f"{path.stem}.glb")

@@ -37,9 +37,6 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
         animation: on that mesh, vertex by vertex.
         tolerance_mm: largest distance of a vertex from the animation's, in millimetres. A part that moves by less
             stands still.
-
-    Raises:
-        FaceDiffError: if the file is no readable .glb, or not the mesh of the animation.
     """
     try:
         glb, writer = open_to_add(target)
@@ -64,11 +61,7 @@ def open_to_add(target: Path) -> tuple[Glb, GlbWriter]:
 
 
 def parts_of(glb: Glb, animation: Animation) -> tuple[list[Placed], Animation]:
-    """The placed parts of a .glb that an animation was carried to, and the animation in the axes of the file.
-
-    Raises:
-        FaceDiffError: if the animation has another number of vertices.
-    """
+    """The placed parts of a .glb that an animation was carried to, and the animation in the axes of the file."""
     parts = list(placed_parts(glb))
     total = sum(len(part.local) for part in parts)
     if total != len(animation.template):

@@ -103,9 +103,6 @@ def own_shapes(target: Path) -> OwnShapes:
 
     Args:
         target: the .glb.
-
-    Raises:
-        FaceDiffError: if it is no readable .glb, or has no shapes for a mouth.
     """
     try:
         return _own_shapes(open_glb(target))
@@ -136,9 +133,6 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
         path: the file to write.
         target: the avatar, whose face looks along +z as glTF has it, or along -z as VRM 0.x has it.
         animation: of any face with ARKit's shapes, or on the avatar's mesh.
-
-    Raises:
-        FaceDiffError: as :func:`own_shapes`, or if the animation is on another mesh.
     """
     try:
         glb, writer = open_to_add(target)

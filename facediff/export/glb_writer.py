@@ -73,11 +73,7 @@ class GlbWriter:
         return len(self.content["bufferViews"]) - 1
 
     def write(self, path: Path) -> None:
-        """Write the header, the JSON chunk and the binary chunk, each padded to four bytes.
-
-        Raises:
-            FaceDiffError: if the file would be larger than its header can count.
-        """
+        """Write the header, the JSON chunk and the binary chunk, each padded to four bytes."""
         self.content["buffers"][0]["byteLength"] = self._length
         text = json.dumps(self.content, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)

@@ -35,12 +35,7 @@ class Usd(Format):
     uses = ("surface",)
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation; frame t is time code t.
-
-        Raises:
-            FaceDiffError: if the layer cannot be written.
-            MissingExtraError: if usd-core is not installed.
-        """
+        """Write one animation; frame t is time code t."""
         with needs_extra("pxr", "usd", "writing USD"):
             from pxr import Sdf, Tf, Usd, UsdGeom, UsdMedia
         (animation,) = animations

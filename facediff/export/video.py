@@ -35,10 +35,6 @@ class Mp4(Format):
         """Write a video with the speech of the first animation that has one.
 
         An animation that ends before the longest stays on its last frame.
-
-        Raises:
-            FaceDiffError: if an animation has no triangles, or the frame rates differ.
-            MissingExtraError: if the packages that draw or encode are not installed.
         """
         from facediff.render import write_video
 

@@ -69,10 +69,6 @@ def write_animations(
     Returns:
         The written files and folders: first the animations, then what was written next to them.
 
-    Raises:
-        FaceDiffError: as :func:`check_export`; also if a motion is not finite, a mesh is missing, a file that facediff
-            did not write would be replaced, or the disk is full.
-
     Example:
         >>> write_animations(Path("hello.usdc"), [animation], ExportOptions(output_unit="cm", up="z"))  # doctest: +SKIP
         [PosixPath('hello.usdc'), PosixPath('hello.wav')]
@@ -148,11 +144,6 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         options: what the user chose.
         n_animations: how many animations will be written.
         weights: whether the animations have, or may have, weights of ARKit's shapes by themselves.
-
-    Raises:
-        FaceDiffError: if the suffix is unknown, the format does not support an option, the blendshapes are missing, or
-            the place cannot be written.
-        MissingExtraError: if a package is not installed.
     """
     suffix = path.suffix
     if not suffix:

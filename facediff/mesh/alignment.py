@@ -71,10 +71,6 @@ def align(
         weights: (N,), none negative; all alike if None.
         scale: whether to fit the scale; 1 otherwise.
 
-    Raises:
-        FaceDiffError: if shapes differ, a value is not finite, or the points do not determine a rotation: fewer than
-            three with weight, all in one place or all on a line.
-
     Example:
         >>> points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0.0]])
         >>> found = align(points, 3 * points + 1, scale=True)
@@ -271,9 +267,6 @@ def remove_rigid_motion(
         stable: indices of the vertices that the fit uses; all if None.
         out: where to write the result, floating point (T, V, 3); may be ``frames`` itself. A new array if None.
         chunk_bytes: how much to read into memory at a time.
-
-    Raises:
-        FaceDiffError: if shapes differ, a frame holds NaN, or the stable vertices do not determine a rotation.
     """
     if frames.ndim != 3 or frames.shape[1:] != target.shape or frames.shape[-1] != 3:
         raise FaceDiffError(
@@ -315,9 +308,6 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
 
     Returns:
         Sorted vertex indices.
-
-    Raises:
-        FaceDiffError: if a frame that was used holds NaN, or its vertices do not determine a rotation.
     """
     some = _sample(frames, sample)
     # A handful at least: with fewer vertices a single noisy one would turn the whole head.

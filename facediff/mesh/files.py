@@ -35,10 +35,6 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         path: an ``.obj``, ``.ply``, ``.stl``, ``.off`` or ``.glb`` file.
         points_allowed: whether a file without faces is accepted; its mesh has faces of shape (0, 3).
 
-    Raises:
-        FaceDiffError: if the file is missing or damaged, holds no vertices or no triangles, or
-            coordinates that are not finite.
-
     Example:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "square.obj"

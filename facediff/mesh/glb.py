@@ -38,9 +38,6 @@ class Glb:
     Args:
         data: the file.
         source: what messages call it.
-
-    Raises:
-        ValueError: if it is no such file, or damaged; so do all methods.
     """
 
     def __init__(self, data: bytes, source: object) -> None:
@@ -203,11 +200,7 @@ def whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
 
 
 def open_glb(path: Path) -> Glb:
-    """A file from elsewhere.
-
-    Raises:
-        ValueError: saying what is wrong with its content.
-    """
+    """A file from elsewhere."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -71,11 +71,7 @@ class Placed:
 
 
 def placed_parts(glb: Glb) -> Iterator[Placed]:
-    """The primitives with triangles of a file's scene, in the order in which :func:`read_glb` joins them.
-
-    Raises:
-        ValueError: if the file is damaged.
-    """
+    """The primitives with triangles of a file's scene, in the order in which :func:`read_glb` joins them."""
     materials, nodes = glb.entries("materials"), placed_nodes(glb)
     read: dict[int, list[tuple[dict[str, Any], Array, npt.NDArray[np.int64]]]] = {}  # several nodes may show a mesh
     skins: dict[int, Array] = {}
@@ -107,11 +103,7 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
 
 
 def read_glb(data: bytes, source: object) -> Mesh:
-    """All meshes of a file's scene as one, each where its nodes and skins place it.
-
-    Raises:
-        ValueError: if the file is damaged.
-    """
+    """All meshes of a file's scene as one, each where its nodes and skins place it."""
     glb = Glb(data, source)
     points, faces, colours, before = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [], 0
     for part in placed_parts(glb):

@@ -36,9 +36,6 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
         vertices: of the mesh that they are for: the mesh with the most targets, the parts that have targets, or all
             parts of the scene as :func:`facediff.mesh.read_mesh` joins them, whichever has as many. None for the
             parts that have targets, in the scene: of an avatar these are head, teeth and eyes.
-
-    Raises:
-        ValueError: saying what is wrong with the file.
     """
     counts = [
         max((len(glb.entries("targets", primitive)) for primitive in glb.primitives(index)), default=0)

@@ -160,10 +160,6 @@ def mesh_hierarchy(
         vertices: the vertices to use (e.g. a face without its eyeballs), an index set; all if None. Faces with a
             corner elsewhere are dropped.
         cache: folder of the files; ``topology`` in facediff's cache if None.
-
-    Raises:
-        FaceDiffError: if template, faces, vertices or a number is not as described.
-        MissingExtraError: if the simplifier is not installed.
     """
     template = checked_template(np.asarray(template, np.float32))
     faces = checked_faces(faces, len(template))
@@ -269,11 +265,6 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     it. Where the simplifier stops too early (it takes no edge that would fold the surface), the shortest edges follow.
 
     ``up`` writes each vertex as a point of the coarse face nearest to it, among those around its cluster.
-
-    Raises:
-        FaceDiffError: if the template is not (V, 3) or not finite, if faces do not fit it, or if ``n_vertices`` is not
-            between 1 and V.
-        MissingExtraError: if the simplifier is not installed.
     """
     points = checked_template(template)
     faces = checked_faces(faces, len(points))

@@ -38,10 +38,6 @@ def spirals(
 
     Returns:
         (V, length) vertex indices; column 0 is the vertex itself.
-
-    Raises:
-        FaceDiffError: if the faces do not fit the number of vertices, if length or dilation is below one, or if
-            positions are needed and not given.
     """
     faces = checked_faces(faces, n_vertices)
     if length < 1 or dilation < 1:

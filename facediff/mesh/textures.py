@@ -90,9 +90,6 @@ def read_textures(path: Path, n_triangles: int) -> Textures:
     Args:
         path: the file.
         n_triangles: of the mesh that it is of.
-
-    Raises:
-        FaceDiffError: if it has no texture coordinates, is damaged, or is another mesh.
     """
     reader = {".glb": _read_glb, ".obj": _read_obj}.get(path.suffix.lower()) if path.is_file() else None
     try:

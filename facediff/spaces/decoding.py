@@ -25,9 +25,6 @@ class ChannelDecoder:
         neutral: (V, 3) the face at rest.
         deltas: (K, V, 3) what each channel of :attr:`Space.face` moves the vertices by at 1.
 
-    Raises:
-        FaceDiffError: if the arrays do not fit each other.
-
     Example:
         >>> space = Space("linear", ("jawOpen",))
         >>> decoder = ChannelDecoder(space, np.zeros(1), np.zeros((2, 3)), np.ones((1, 2, 3)))

@@ -174,9 +174,6 @@ def find_layout(name: str, where: str = "layout") -> Layout:
     Args:
         name: the layout's name.
         where: what messages call the option or file.
-
-    Raises:
-        FaceDiffError: if there is none.
     """
     if name not in LAYOUTS:
         raise FaceDiffError(f'{where}: there is no layout "{name}"; {choices(name, LAYOUTS)}')

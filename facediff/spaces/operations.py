@@ -43,9 +43,6 @@ def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Spac
         source: their space.
         target: whose channels are returned, under its names.
 
-    Raises:
-        FaceDiffError: if the spaces are of two kinds or versions, or have no channel in common.
-
     Example:
         >>> from facediff.spaces.layouts import layout
         >>> values, space = permuted(np.ones((1, 51)), layout("arkit_51"), layout("arkit"))
@@ -90,9 +87,6 @@ def truncated(values: Values, space: Space, counts: dict[str, int]) -> tuple[Val
         values: (T, C).
         space: their space.
         counts: coefficients that are kept, by the family's name: ``{"expression": 50}``.
-
-    Raises:
-        FaceDiffError: if a family has fewer coefficients than asked for.
     """
     check_values(values, space)
     dropped: set[str] = set()
@@ -117,9 +111,6 @@ def with_rotations(values: Values, space: Space, form: Form, joints: tuple[str, 
         space: their space.
         form: the form that is returned.
         joints: those that are rewritten; all if empty.
-
-    Raises:
-        FaceDiffError: if a channel's new name is one that the space has already.
     """
     from facediff.spaces.layouts import AXES
 

@@ -58,11 +58,7 @@ class LinearRig:
 
     @classmethod
     def from_files(cls, files: ShapeFiles) -> LinearRig:
-        """The rig of a set of shapes.
-
-        Raises:
-            FaceDiffError: if it has no face at rest, or two of its names are one of ARKit's.
-        """
+        """The rig of a set of shapes."""
         if files.neutral is None:
             raise FaceDiffError(f"{files.path}: has no face at rest; add it as neutral{files.first.suffix}")
         names = tuple(arkit_name(name) or name for name in files.names)
@@ -105,11 +101,7 @@ class LinearRig:
         )
 
     def only(self, names: Sequence[str]) -> LinearRig:
-        """The rig's channels of these names, in their order.
-
-        Raises:
-            FaceDiffError: if the rig lacks one.
-        """
+        """The rig's channels of these names, in their order."""
         column = {name.casefold(): index for index, name in enumerate(self.names)}
         lacking = [name for name in names if name.casefold() not in column]
         if lacking:
@@ -174,9 +166,6 @@ def decode_flame(flame: Flame, values: Values, space: Space, shape: Values | Non
         values: (T, C).
         space: their space, of the kind ``flame``.
         shape: (S,) the person's coefficients; the mean face if None.
-
-    Raises:
-        FaceDiffError: if the space is of another kind, or the values do not fit it.
     """
     if space.kind != "flame" or values.ndim != 2 or values.shape[1] != len(space.channels):
         raise FaceDiffError(

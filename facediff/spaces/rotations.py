@@ -30,9 +30,6 @@ def convert(values: npt.NDArray[np.floating], source: Form, target: Form) -> Arr
             yaw about y, then pitch about the turned x, then roll about the z turned by both.
         target: the form that is returned. ``axis_angle_x`` drops what turns about other axes.
 
-    Raises:
-        FaceDiffError: if a form is unknown, or the values do not have its width.
-
     Example:
         >>> convert(np.array([[0.0, 0.0, np.pi / 2]]), "axis_angle", "six_d").round(6) + 0.0
         array([[ 0.,  1.,  0., -1.,  0.,  0.]])

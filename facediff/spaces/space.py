@@ -69,9 +69,6 @@ class Space:
         absent: channels of the layout that the source did not have, which is something else than zero.
         identity: what belongs to a person and is kept apart from motion, such as ``shape 300``.
 
-    Raises:
-        FaceDiffError: if a field has a value that it cannot have, or does not fit the others.
-
     Example:
         >>> space = Space("linear", ("jawOpen", "pitch", "yaw", "roll"), rotations=(Rotation("head", 1, "euler"),))
         >>> space.dims, space.face, space.head, space.index("yaw")
@@ -150,11 +147,7 @@ class Space:
         return tuple(channel for turn in self.rotations if turn.joint in joints for channel in turn.channels)
 
     def index(self, name: str) -> int:
-        """The channel of a name, whatever its case.
-
-        Raises:
-            FaceDiffError: if there is none.
-        """
+        """The channel of a name, whatever its case."""
         folded = [channel.casefold() for channel in self.channels]
         if name.casefold() not in folded:
             raise FaceDiffError(f'space: has no channel "{name}"; its channels are {quoted(list(self.channels))}')
@@ -188,11 +181,7 @@ class Space:
 
     @classmethod
     def from_state(cls, state: object) -> Space:
-        """The inverse of :meth:`state`; what it is given may come from anybody.
-
-        Raises:
-            FaceDiffError: naming the field that is missing or not valid.
-        """
+        """The inverse of :meth:`state`; what it is given may come from anybody."""
         names = {attribute.name for attribute in fields(cls)}
         if not isinstance(state, dict) or state.keys() != names:
             odd = sorted(map(str, names ^ state.keys())) if isinstance(state, dict) else state
@@ -257,9 +246,6 @@ def metres_per_unit(unit: str) -> float:
     Args:
         unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", such as that of a
             corpus whose faces were normalised.
-
-    Raises:
-        FaceDiffError: if it is none of these.
 
     Example:
         >>> metres_per_unit("mm"), metres_per_unit("normalised (about 185 mm)")

@@ -81,9 +81,6 @@ def visemes(values: Values, space: Space, viseme_set: VisemeSet) -> tuple[Values
         viseme_set: ``oculus`` for sil, PP, FF … ou, ``vrm`` for A, I, U, E, O and blinks; of VRM's blinks, both eyes'
             share is Blink, and what one eye closes beyond it is Blink_L or Blink_R, since avatars add them up.
 
-    Raises:
-        FaceDiffError: if there is no such set, or the space has none of ARKit's shapes.
-
     Example:
         >>> open_mouth = np.array([[0.65, 0.3, 0.3]])
         >>> space = Space("arkit", ("jawOpen", "mouthLowerDownLeft", "mouthLowerDownRight"))

@@ -79,11 +79,7 @@ def speakers_of(folder: Path) -> tuple[str, ...]:
 
 
 def recordings_of(speaker: str, most: int) -> list[Recording]:
-    """The first recordings of a speaker's folder that last no longer than 12 s.
-
-    Raises:
-        FaceDiffError: if there is none.
-    """
+    """The first recordings of a speaker's folder that last no longer than 12 s."""
     taken = []
     for stem in _stems(Path(speaker)):
         grid = Path(f"{stem}.TextGrid")

@@ -120,9 +120,6 @@ def spoken_set(languages: Sequence[str], voices: int, sentences: int) -> list[Sp
         languages: codes in :data:`LANGUAGES`.
         voices: of each language, as far as they are installed.
         sentences: of each voice.
-
-    Raises:
-        FaceDiffError: if there is no such language, or no voice of one is installed.
     """
     installed = installed_voices()
     clips = []

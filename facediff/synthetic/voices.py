@@ -78,11 +78,7 @@ class Synthesiser(ABC):
 
     @abstractmethod
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
-        """Speak a sentence; the same arguments give the same samples.
-
-        Raises:
-            FaceDiffError: if the program fails.
-        """
+        """Speak a sentence; the same arguments give the same samples."""
 
 
 def open_voice(name: str) -> Synthesiser:
@@ -96,11 +92,7 @@ def open_voice(name: str) -> Synthesiser:
 
 
 def in_language(voice: str, language: str) -> str:
-    """One of espeak-ng's voices, such as ``en-us+f2``, in another language; as it is if that is empty.
-
-    Raises:
-        FaceDiffError: if espeak-ng does not speak that language.
-    """
+    """One of espeak-ng's voices, such as ``en-us+f2``, in another language; as it is if that is empty."""
     if not language:
         return voice
     languages = Espeak.voices()

@@ -47,9 +47,6 @@ def pack_motion(animation: Animation, blobs: Blobs) -> list[int]:
     With q[t] the offset from the template in steps of `STEP` mm, rounded, a chunk of k frames holds d[0] = q[0] and
     d[t] = q[t] − q[t−1], modulo 2¹⁶, as z = 2 d for d ≥ 0 and −2 d − 1 below, in the order axis, vertex, frame; first
     the low bytes of all, then the high bytes.
-
-    Raises:
-        FaceDiffError: if a vertex is further from the template than 16 bits can say (1.6 m).
     """
     # The differences of one vertex are alike, and nearly all high bytes are 0, which deflate compresses well.
     scale = millimetres(animation) / STEP

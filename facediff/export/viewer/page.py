@@ -90,11 +90,6 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
         max_mb: the largest file that is written, in megabytes (10⁶ bytes).
         truth: number of the animation, from 0, that the others are compared with; those of its topology get a heat map
             of the Euclidean distance of each vertex from it.
-
-    Raises:
-        FaceDiffError: if the animations do not make a page, or the file would be too large or cannot be written; no
-            half-written file is left.
-        MissingExtraError: for a heat map without OpenCV.
     """
     check_writable(path)
     parts = page_parts(animations, truth=truth)
@@ -114,10 +109,6 @@ def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> 
     Args:
         animations: as :func:`write_page` takes them.
         truth: as :func:`write_page` takes it.
-
-    Raises:
-        FaceDiffError: if the animations do not make a page.
-        MissingExtraError: for a heat map without OpenCV.
     """
     check_page(animations, truth)
     blobs = Blobs()

@@ -269,11 +269,6 @@ def pick_landmarks(
         host: address to listen at; by default nobody but this machine reaches it.
         port: to listen at; 0 for any free one.
         ready: called with the page's address as soon as it can be opened.
-
-    Raises:
-        FaceDiffError: if the landmarks to begin with do not fit the meshes, the file cannot be written, or the address
-            cannot be used.
-        MissingExtraError: if the server's packages are not installed.
     """
     require_server("picking landmarks", extra="serve")
     begin = start if start is not None else file if file.exists() else None

@@ -37,9 +37,6 @@ def read_array(path: Path, layout: str | None, frame_rate: float | None = None) 
         path: the file.
         layout: name of its layout.
         frame_rate: frames a second, for layouts and files that do not state it, and against those that do.
-
-    Raises:
-        FaceDiffError: without a layout, naming those that fit; or if the file does not have what the layout says.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz" or suffix in HDF5_SUFFIXES:
@@ -205,9 +202,6 @@ def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
         path: the ``.npy`` or ``.npz`` file.
         clip: with the layout's channels in its order; the coefficients of a person it does not have are zero.
         layout: name of the layout; the clip's own if empty.
-
-    Raises:
-        FaceDiffError: if the clip is not in the layout, or its person has another number of coefficients.
     """
     name = layout or clip.layout
     entry = find_layout(name, str(path))

@@ -29,9 +29,6 @@ def read_beat(path: Path) -> ParameterClip:
 
     Args:
         path: the file.
-
-    Raises:
-        FaceDiffError: if it is anything else.
     """
     content = load_json(path, remedy=REMEDY)
     names = content.get("names") if isinstance(content, dict) else None
@@ -97,9 +94,6 @@ def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> No
         path: the file.
         clip: in a space of ARKit's, whose order is kept.
         metadata: add frame rate and number of frames, as LAM does.
-
-    Raises:
-        FaceDiffError: if the clip is in another space.
     """
     if clip.space.kind != "arkit":
         raise FaceDiffError(f"{path}: the clip is in a space of {clip.space.kind}; expected ARKit's weights")

@@ -72,11 +72,7 @@ def even(clip: ParameterClip) -> ParameterClip:
 
 
 def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> Values:
-    """Values of a file (T, C) as float32, finite.
-
-    Raises:
-        FaceDiffError: naming the file, if they are not.
-    """
+    """Values of a file (T, C) as float32, finite."""
     check_number(path, "frame rate", frame_rate, *FRAME_RATES)
     if not len(values):
         raise FaceDiffError(f"{path}: holds no frames; record it again")
@@ -87,11 +83,7 @@ def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> 
 
 
 def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
-    """Where each channel of a space stands in a header, whatever its case.
-
-    Raises:
-        FaceDiffError: naming a channel that is missing.
-    """
+    """Where each channel of a space stands in a header, whatever its case."""
     folded = [name.strip().casefold() for name in header]
     lacking = [name for name in space.channels if name.casefold() not in folded]
     if lacking:

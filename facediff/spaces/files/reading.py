@@ -33,9 +33,6 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
         layout: name of the layout of a ``.npy``, ``.npz`` or ``.pt``, which does not say it; other files name their
             columns.
         frame_rate: frames a second of an array whose layout has no rate of its own.
-
-    Raises:
-        FaceDiffError: if it is none of these, or something in it is wrong.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -117,9 +117,6 @@ def read_live_link(path: Path) -> ParameterClip:
 
     Args:
         path: the table.
-
-    Raises:
-        FaceDiffError: if it is no such table, or a row's time or number cannot be read.
     """
     rows = read_table(path, remedy=REMEDY)
     header = next(rows, [])
@@ -189,9 +186,6 @@ def write_live_link(path: Path, clip: ParameterClip) -> None:
     Args:
         path: the table.
         clip: in a space of ARKit's; channels that it lacks or declares as absent are 0.
-
-    Raises:
-        FaceDiffError: if the clip is in another space.
     """
     with atomic(path) as temporary:
         write_table(temporary, [live_link_header(), *live_link_rows(clip)])
@@ -214,9 +208,6 @@ def read_audio2face(path: Path) -> ParameterClip:
 
     Args:
         path: the table.
-
-    Raises:
-        FaceDiffError: if it is no such table, or a number cannot be read.
     """
     rows = read_table(path, remedy=REMEDY)
     header = next(rows, [])
