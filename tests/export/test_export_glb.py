@@ -23,7 +23,7 @@ from facediff.mesh.glb import Glb
 from facediff.utils.colours import to_linear, to_srgb
 from tests.fakes.glb_reader import COMPONENTS, WIDTHS, Reader
 from tests.fakes.glb_targets import pack
-from tests.fakes.small_face import M2, small_shapes
+from tests.fakes.small_face import small_shapes, write_small_shapes
 
 
 @pytest.mark.parametrize("unit", ["m", "mm", "normalised (about 185 mm)"])
@@ -223,12 +223,13 @@ def test_glb_of_the_same_animation_has_the_same_bytes(animation: Animation, tmp_
 @pytest.mark.parametrize("key_tolerance", [0.0, 0.05])
 def test_named_shapes_give_named_targets_and_curves(tmp_path: Path, key_tolerance: float) -> None:
     """Targets, their normals, and weights at the keys are those of the shapes' own face."""
-    neutral, faces, shapes = small_shapes(M2)
+    neutral, faces, shapes = small_shapes()
+    write_small_shapes(tmp_path / "shapes")
     time = np.arange(40) / 25
     goal = {"jawOpen": 0.4 + 0.4 * np.sin(3 * time), "eyeBlinkLeft": np.clip(1 - 8 * np.abs(time - 0.8), 0, 1)}
     moved = neutral + sum(curve[:, None, None] * (shapes[name] - neutral) for name, curve in goal.items())
     made = Animation("a", np.float32(moved), np.float32(neutral), 25.0, faces=faces)
-    options = ExportOptions(shapes=Path("puppet"), key_tolerance=key_tolerance)
+    options = ExportOptions(shapes=tmp_path / "shapes", key_tolerance=key_tolerance)
     write_animations(tmp_path / "a.glb", [made], options)
     read = Reader(tmp_path / "a.glb")
     names = read.gltf.meshes[0].extras["targetNames"]

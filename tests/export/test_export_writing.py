@@ -319,7 +319,7 @@ def test_format_of_an_installed_package_is_reached_by_its_suffix(animation: Anim
 
 
 def test_weights_of_the_built_in_face_need_no_shapes(tmp_path: Path) -> None:
-    rest, faces, shapes = built_in_shapes("F1", 2)
+    rest, faces, shapes = built_in_shapes("F1")
     opened = np.linspace(0, 0.5, 6, dtype=np.float32)
     motion = (rest + opened[:, None, None] * (shapes["jawOpen"] - rest)).astype(np.float32)
     animation = Animation(
