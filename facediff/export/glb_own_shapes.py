@@ -22,7 +22,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.glb import gltf_rotations
 from facediff.export.glb_added import open_to_add, parts_of
 from facediff.export.glb_writer import GlbWriter
-from facediff.mesh.glb import POSITIONS, Glb, open_glb, whole
+from facediff.mesh.glb import DAMAGED, POSITIONS, Glb, open_glb, whole
 from facediff.mesh.glb_scene import node_matrix, placed_nodes
 from facediff.mesh.glb_shapes import target_names
 from facediff.spaces.arkit import ARKIT, arkit_name, plain
@@ -106,7 +106,7 @@ def own_shapes(target: Path) -> OwnShapes:
     """
     try:
         return _own_shapes(open_glb(target))
-    except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
+    except DAMAGED as error:
         raise _unreadable(target, error) from error
 
 
@@ -142,7 +142,7 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
         if named and _looks_back(glb) and weights.head is not None:  # solved for, it is in the avatar's axes already
             weights = replace(weights, head=weights.head * ROUND_ABOUT)
         _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
-    except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
+    except DAMAGED as error:
         raise _unreadable(target, error) from error
     writer.write(path)
 

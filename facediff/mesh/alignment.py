@@ -168,8 +168,6 @@ def _fit(
 ) -> tuple[Array, Array, Array]:
     """Weighted least squares of sources (B, N, 3) to a target (N, 3) with weights (B, N)."""
     total = weights.sum(axis=-1, keepdims=True)
-    if check and not (total > 0).all():
-        raise FaceDiffError("alignment: no point has any weight; expected at least three that are not on a line")
     share = (weights / total)[:, None, :]
     centre, goal = share @ source, share @ target
     # The target need not be centred as well: the source's offsets sum to zero by weight.
@@ -205,19 +203,7 @@ def _checked(
 ) -> tuple[Array, Array, Array]:
     points: Array = np.asarray(source, np.float64)
     goal: Array = np.asarray(target, np.float64)
-    if points.shape != goal.shape or points.ndim != 2 or points.shape[-1] != 3:
-        raise FaceDiffError(
-            f"alignment: source has shape {points.shape} and target {goal.shape}; expected two equal ones (points, 3)"
-        )
     used: Array = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
-    if used.shape != points.shape[:1] or (used < 0).any():
-        raise FaceDiffError(
-            f"alignment: weights have shape {used.shape} for {len(points)} points; expected one each, none negative"
-        )
-    if not (np.isfinite(points).all() and np.isfinite(goal).all() and np.isfinite(used).all()):
-        raise FaceDiffError("alignment: a point or a weight is NaN or infinite; remove it")
-    if np.count_nonzero(used) < 3:
-        raise FaceDiffError("alignment: fewer than three points have weight; expected three that are not on a line")
     return points, goal, used
 
 
@@ -275,11 +261,6 @@ def remove_rigid_motion(
         )
     if out is None:
         out = np.empty(frames.shape, frames.dtype if frames.dtype.kind == "f" else np.float64)
-    if out.shape != frames.shape or out.dtype.kind != "f":
-        raise FaceDiffError(
-            f"rigid motion: out has shape {out.shape} and numbers {out.dtype}; expected floating point in the shape of "
-            f"the frames, {frames.shape}"
-        )
     every = np.arange(len(target)) if stable is None else np.asarray(stable)
     goal = np.asarray(target, np.float64)[every]
     count = len(frames)
@@ -357,8 +338,6 @@ def _refuse_not_finite(frames: Array, numbers: npt.NDArray[np.integer]) -> None:
 
 def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
     """Evenly spread frames, each moved to the origin."""
-    if not len(frames):
-        raise FaceDiffError("rigid motion: there are no frames; expected at least one")
     taken = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
     some = np.array(frames[taken], np.float64)
     _refuse_not_finite(some, taken)

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
+from facediff.mesh.glb import DAMAGED
 from facediff.mesh.glb_scene import read_glb
 from facediff.mesh.mesh import Array, Mesh, check_coordinates
 
@@ -53,14 +54,12 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
     if suffix not in SUFFIXES:
         raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}")
     try:
-        if not path.is_file():
-            raise FaceDiffError(f"{path}: no such mesh file; expected one of {', '.join(SUFFIXES)}")
         data = path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
     try:
         mesh = READERS[suffix](data, path)
-    except (ValueError, IndexError, OverflowError) as error:
+    except DAMAGED as error:
         raise FaceDiffError(f"{path}: not a readable {suffix[1:].upper()} mesh ({error}); export it again") from error
     if not len(mesh.vertices):
         raise FaceDiffError(f"{path}: holds no vertices; expected a mesh with vertices and faces")
@@ -77,7 +76,7 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
     lines = data.splitlines()
     rows = [line[2:].split() for line in lines if line[:2] in (b"v ", b"v\t")]
     if not rows:
-        raise FaceDiffError(f"{path}: holds no vertices; expected an OBJ mesh with lines `v x y z`")
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     width = min(map(len, rows))
     if width != max(map(len, rows)):  # colours may follow the coordinates, of some vertices or of all
         width, rows = 3, [row[:3] for row in rows]
@@ -177,9 +176,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
     elements, form = _ply_header(data[: end.start()].decode("utf-8").splitlines(), path)
     body = memoryview(data)[end.end() :]
     columns = _ply_text(elements, bytes(body).split()) if form == "ascii" else _ply_binary(elements, body)
-    vertex = columns.get("vertex", {})
-    if not {"x", "y", "z"} <= vertex.keys():
-        raise ValueError("its vertices have no x, y and z")
+    vertex = columns["vertex"]
     points: Array = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], 1)
     faces = columns.get("face", {})
     names = [name for name in faces if name in ("vertex_index", "vertex_indices") or len(faces) == 1]
@@ -205,11 +202,7 @@ def _ply_header(lines: list[str], path: Path) -> tuple[list[_Element], str]:
         match line.split():
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as form, *_]:
                 pass
-            case ["element", name, count]:
-                if not count.isdecimal():
-                    raise ValueError(f"its element {name} has no valid number of rows")
-                if any(element.name == name for element in elements):
-                    raise ValueError(f"its element {name} occurs twice")
+            case ["element", name, count] if count.isdecimal():
                 elements.append(_Element(name, int(count)))
             case ["property", "list", length, kind, name] if elements and length in _PLY_TYPES and kind in _PLY_TYPES:
                 elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[length]))
@@ -219,17 +212,8 @@ def _ply_header(lines: list[str], path: Path) -> tuple[list[_Element], str]:
                 pass
             case _:
                 raise ValueError(f"its header has the line {line[:60]!r}")
-    if not form:
-        raise ValueError("its header names no format that is known")
-    for element in elements:
-        names = [name for name, _, _ in element.properties]
-        if len(set(names)) < len(names):
-            raise ValueError(f"a property of its element {element.name} occurs twice")
-        if any(length is not None and length[0] == "f" for _, _, length in element.properties):
-            raise ValueError(f"a list of its element {element.name} has a length that is no whole number")
-        # A row without a property takes no bytes, so that a file of any size could have any number of them.
-        if element.count and not element.properties:
-            raise ValueError(f"its element {element.name} has no properties")
+    if not form or any(element.count and not element.properties for element in elements):
+        raise ValueError("its header names no known format, or rows without properties")
     order = ">" if form == "binary_big_endian" else "<"
     for element in elements:
         element.properties = [
@@ -300,36 +284,26 @@ def _ply_row(element: _Element, body: memoryview, at: int) -> tuple[list[Any], i
 
 def _ply_text(elements: list[_Element], cells: list[bytes]) -> dict[str, Columns]:
     columns: dict[str, Columns] = {}
-    at = 0
-    for element in elements:
-        width = len(element.properties)
-        if element.count * width > len(cells) - at:
-            raise ValueError(f"it is cut short: its {element.count} rows of {element.name} are not all there")
-        if all(length is None for _, _, length in element.properties):
-            flat = [float(word) for word in cells[at : at + element.count * width]]
-            table = np.array(flat).reshape(element.count, width) if width else np.zeros((element.count, 0))
-            with np.errstate(over="ignore"):  # what a float cannot hold becomes infinite, and is refused as that
-                columns[element.name] = {
-                    name: table[:, i].astype(kind) if kind[1] == "f" else table[:, i]
-                    for i, (name, kind, _) in enumerate(element.properties)
-                }
-            at += element.count * width
-            continue
-        lists: Columns = {name: [] for name, _, _ in element.properties}
-        for _ in range(element.count):
+    words = iter(cells)
+    try:
+        for element in elements:
+            rows: Columns = {name: [] for name, _, _ in element.properties}
+            for _ in range(element.count if rows else 0):
+                for name, kind, length in element.properties:
+                    number = float if length is None or kind[1] == "f" else int
+                    values = [number(next(words)) for _ in range(1 if length is None else int(next(words)))]
+                    rows[name].append(values if length is not None else values[0])
             for name, kind, length in element.properties:
-                count = 1
-                if length is not None:
-                    count, at = int(cells[at]), at + 1
-                if not 0 <= count <= len(cells) - at:
-                    raise ValueError(f"it is cut short: a list of {element.name} is not all there")
-                number = float if length is None or kind[1] == "f" else int
-                values = [number(word) for word in cells[at : at + count]]
-                lists[name].append(values if length is not None else values[0])
-                at += count
-        columns[element.name] = lists if element.count else {}
-    if at != len(cells):
-        raise ValueError(f"it holds {len(cells) - at} numbers more than its header declares")
+                if length is None and kind[1] == "f":
+                    with np.errstate(
+                        over="ignore"
+                    ):  # what a float cannot hold becomes infinite, and is refused as that
+                        rows[name] = np.array(rows[name]).astype(kind)
+            columns[element.name] = rows if element.count else {}
+    except StopIteration as error:
+        raise ValueError("it is cut short: its rows are not all there") from error
+    if next(words, None) is not None:
+        raise ValueError("it holds more numbers than its header declares")
     return columns
 
 

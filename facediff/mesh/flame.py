@@ -182,8 +182,6 @@ class FlameArrays:
 
 def read_flame_arrays(path: Path) -> FlameArrays:
     """Read a model file as :meth:`Flame.read` does."""
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; {HELP}")
     match path.suffix.lower():
         case ".npz":
             content: object = read_arrays(path, KEYS, remedy=HELP)
@@ -191,10 +189,8 @@ def read_flame_arrays(path: Path) -> FlameArrays:
             content = read_tensors(path)
         case _:
             content = load_pickle(path, stand_ins=PACKAGES)
-    if not isinstance(content, Mapping):
-        raise FaceDiffError(f"{path}: holds a {type(content).__name__}, no FLAME model; {HELP}")
-    absent = [key for key in KEYS if key not in content]
-    if absent:
+    absent = [key for key in KEYS if not isinstance(content, Mapping) or key not in content]
+    if not isinstance(content, Mapping) or absent:
         raise FaceDiffError(f"{path}: has no {', '.join(absent)}, so it is no FLAME model; {HELP}")
     template = _numbers(content, "v_template", path, (None, 3))
     count = len(template)
@@ -203,13 +199,12 @@ def read_flame_arrays(path: Path) -> FlameArrays:
     if np.abs(weights.sum(axis=1) - 1).max() > 1e-3:
         raise FaceDiffError(f"{path}: the weights of a vertex do not add up to 1; {HELP}")
     faces = _numbers(content, "f", path, (None, 3))
-    if faces.min() < 0 or faces.max() >= count:
-        raise FaceDiffError(f"{path}: f names vertices that do not exist; {HELP}")
     parents = _numbers(content, "kintree_table", path, (2, JOINTS))[0].astype(np.int64)
     parents[0] = -1  # the files have 2³² − 1 there
     # A parent comes before its children, so that one pass over the joints places all of them.
-    if (parents[1:] < 0).any() or (parents >= np.arange(JOINTS)).any():
-        raise FaceDiffError(f"{path}: kintree_table has the parents {parents.tolist()}; {HELP}")
+    ordered = (parents[1:] >= 0).all() and (parents < np.arange(JOINTS)).all()
+    if not ordered or faces.min() < 0 or faces.max() >= count:
+        raise FaceDiffError(f"{path}: f or kintree_table name vertices or joints that do not exist; {HELP}")
     return FlameArrays(
         template=template,
         directions=_numbers(content, "shapedirs", path, (count, 3, SHAPES + EXPRESSIONS)),
@@ -241,12 +236,10 @@ def _numbers(
         length == expected if expected is not None else length
         for length, expected in zip(values.shape, shape, strict=True)
     )
-    if not fits:
-        lengths = ", ".join("any" if length is None else str(length) for length in shape)
-        raise FaceDiffError(f"{path}: {key} has shape {values.shape}, expected ({lengths}); {HELP}")
     numbers = values.astype(np.float64)
-    if not np.isfinite(numbers).all():
-        raise FaceDiffError(f"{path}: {key} holds NaN or infinity; download the file again")
+    if not fits or not np.isfinite(numbers).all():
+        lengths = ", ".join("any" if length is None else str(length) for length in shape)
+        raise FaceDiffError(f"{path}: {key} has shape {values.shape}, expected finite numbers ({lengths}); {HELP}")
     return numbers
 
 
@@ -306,12 +299,10 @@ def _dense(state: Mapping[Any, Any], kind: str, where: str) -> Values:
     else:
         ends = np.asarray(state["indptr"], np.int64)
         minor = np.asarray(state["indices"], np.int64)
-        if not ends[-1] == len(minor) == len(data):
-            raise ValueError("ends that do not fit the data")
         major = np.searchsorted(ends, np.arange(len(minor)), side="right") - 1  # of the data's size in any case
         row, column = (minor, major) if kind == "csc" else (major, minor)
-    if len(data) and min(row.min(), column.min()) < 0:
-        raise ValueError("negative index")
+    if len(row) != len(data) or (len(data) and min(row.min(), column.min()) < 0):
+        raise ValueError("indices that do not fit the data")
     dense = np.zeros((rows, columns))
     np.add.at(dense, (row, column), data)
     return dense

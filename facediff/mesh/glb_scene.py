@@ -159,28 +159,27 @@ def placed_nodes(glb: Glb) -> dict[int, Array | None]:
         roots = glb.entry("scenes", glb.content.get("scene", 0)).get("nodes", [])
     else:
         # A file without scenes shows its roots: the nodes that are below no other one.
-        below = {child for node in nodes for child in _list(node.get("children", [])) if type(child) is int}
+        below = {child for node in nodes for child in node.get("children", []) if type(child) is int}
         roots = [index for index in range(len(nodes)) if index not in below]
     if not nodes:
         return {}
     placed: dict[int, Array | None] = {}
-    queue: list[tuple[object, Array | None]] = [(root, None) for root in _list(roots)]
+    queue: list[tuple[object, Array | None]] = [(root, None) for root in roots]
     while queue:
         index, parent = queue.pop()
         node = glb.entry("nodes", index)
-        assert isinstance(index, int)  # noqa: S101 - for type checkers: glb.entry refuses anything else
         if index in placed:
             raise ValueError(f"its node {index} is below two others, or below itself")
         own = node_matrix(node)
         placed[index] = own if parent is None else parent if own is None else parent @ own
-        queue += [(child, placed[index]) for child in _list(node.get("children", []))]
+        queue += [(child, placed[index]) for child in node.get("children", [])]
     return placed
 
 
 def _stands(glb: Glb, index: int, nodes: dict[int, Array | None]) -> Array:
     """(J, 4, 4) where the joints of a skin put its vertices; (0, 4, 4) if they are not in the scene."""
     skin = glb.entry("skins", index)
-    joints = _list(skin.get("joints", []))
+    joints = skin.get("joints", [])
     if not joints or not all(type(joint) is int and joint in nodes for joint in joints):
         return np.zeros((0, 4, 4))
     # A joint's matrix times its inverse bind matrix is the identity in the pose that the skin was bound in.
@@ -218,24 +217,16 @@ def _skinned(glb: Glb, stands: Array, primitive: dict[str, Any], count: int) -> 
     return np.asarray(placed / total[:, None, None])
 
 
-def _list(value: object) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError("has a list of nodes that is none")
-    return value
-
-
 def node_matrix(node: dict[str, Any]) -> Array | None:
     """A node's transform (4, 4); None if it has none."""
     if not {"matrix", "translation", "rotation", "scale"} & node.keys():
         return None
 
     def given(key: str, default: list[float]) -> Array:
-        values = node.get(key, default)
-        if not isinstance(values, list) or len(values) != len(default):
+        values = np.array(node.get(key, default), np.float64)
+        if values.shape != (len(default),):
             raise ValueError(f"a node's {key} has not {len(default)} numbers")
-        if not all(type(value) in (int, float) for value in values):
-            raise ValueError(f"a node's {key} holds no numbers")
-        return np.array(values, np.float64)
+        return values
 
     matrix = given("matrix", np.eye(4).ravel().tolist()).reshape(4, 4).T.copy()
     rotation = given("rotation", [0, 0, 0, 1])

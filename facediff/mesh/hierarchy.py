@@ -161,14 +161,9 @@ def mesh_hierarchy(
             corner elsewhere are dropped.
         cache: folder of the files; ``topology`` in facediff's cache if None.
     """
-    template = checked_template(np.asarray(template, np.float32))
+    template = np.asarray(np.asarray(template, np.float32), np.float64)
     faces = checked_faces(faces, len(template))
-    if levels < 0 or factor < 1 or spiral_length < 1 or dilation < 1 or pooling not in ("select", "mean"):
-        raise FaceDiffError(
-            f"mesh hierarchy: levels {levels}, factor {factor}, spiral_length {spiral_length}, dilation {dilation}, "
-            f'pooling "{pooling}"; expected levels from 0, the other numbers from 1, and pooling select or mean'
-        )
-    chosen = None if vertices is None else _checked_vertices(vertices, len(template))
+    chosen = None if vertices is None else np.unique(vertices)
     key = _key(template, faces, chosen, [levels, factor, spiral_length, dilation, pooling])
     # Three levels of a dense mesh take some seconds, and every training on its corpus needs the same ones.
     path = (cache or cache_dir() / "topology") / f"{key}.npz"
@@ -191,28 +186,6 @@ def mesh_hierarchy(
     with suppress(FaceDiffError), atomic(path) as temporary:  # a hierarchy that cannot be cached is computed again
         np.savez(temporary, allow_pickle=False, **hierarchy.arrays())
     return hierarchy
-
-
-def checked_template(template: Points) -> Array:
-    """Positions as float64; refuses what is not (V, 3) with at least one vertex, or not finite."""
-    points = np.asarray(template, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise FaceDiffError(f"template: shape {points.shape}; expected (V, 3) with at least one vertex")
-    if not np.isfinite(points).all():
-        raise FaceDiffError("template: holds values that are not finite; expected a position for every vertex")
-    return points
-
-
-def _checked_vertices(vertices: npt.NDArray[np.integer], n_vertices: int) -> Indices:
-    chosen = np.asarray(vertices)
-    if chosen.ndim != 1 or not len(chosen) or chosen.dtype.kind not in "iu":
-        raise FaceDiffError(f"vertices: {chosen.dtype} of shape {chosen.shape}; expected a list of vertex indices")
-    chosen = np.unique(chosen.astype(np.int64))
-    if chosen[0] < 0 or chosen[-1] >= n_vertices:
-        raise FaceDiffError(
-            f"vertices: indices from {chosen[0]} to {chosen[-1]}, but the template has {n_vertices} vertices"
-        )
-    return chosen
 
 
 def _key(template: Points, faces: Indices, vertices: Indices | None, options: list[int | str]) -> str:

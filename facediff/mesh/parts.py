@@ -37,7 +37,7 @@ def mesh_parts(path: Path) -> list[MeshPart]:
             named = []
     except OSError as error:
         raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
-    except ValueError as error:
+    except DAMAGED as error:
         raise FaceDiffError(f"{path}: not a readable {suffix[1:].upper()} mesh ({error}); export it again") from error
     parts, before = [], 0
     for names, count in named:

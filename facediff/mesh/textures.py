@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-from facediff.mesh.glb import Glb, attributes, open_glb, whole
+from facediff.mesh.glb import DAMAGED, Glb, attributes, open_glb, whole
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
 from facediff.utils.files import holds_glb
@@ -71,7 +71,7 @@ def has_textures(path: Path) -> bool:
     if not path.is_file():
         return False
     if path.suffix.lower() == ".glb":
-        with suppress(ValueError):  # the reader of meshes says what is wrong
+        with suppress(*DAMAGED):  # the reader of meshes says what is wrong
             return _has_picture(open_glb(path))
     if path.suffix.lower() != ".obj":
         return False
@@ -94,7 +94,7 @@ def read_textures(path: Path, n_triangles: int) -> Textures:
     reader = {".glb": _read_glb, ".obj": _read_obj}.get(path.suffix.lower()) if path.is_file() else None
     try:
         surface = None if reader is None else reader(path)
-    except (ValueError, IndexError) as error:
+    except DAMAGED as error:
         kind = path.suffix[1:].upper()
         raise FaceDiffError(f"{path}: not a readable {kind} mesh ({error}); export it again") from error
     if surface is None:
@@ -245,8 +245,6 @@ def _read_glb(path: Path) -> Textures | None:
         of_face.append(np.full(len(part.faces), numbers[index]))
         before += len(part.local)
     table = np.concatenate(uvs)
-    if not np.isfinite(table).all():
-        raise ValueError("its texture coordinates are not finite")
     left_out = sorted({word for material in glb.entries("materials") for word in ELSEWHERE if word in material})
     if left_out:
         lost.append(f"colours and their pictures are carried over, and {', '.join(left_out)} of {path.name} left out")
@@ -270,7 +268,7 @@ def _material(glb: Glb, material: dict[str, Any], path: Path, lost: list[str]) -
     if not texture:
         return Material(name, (red, green, blue))
     data = b""
-    with suppress(ValueError):  # of a kind that glTF itself does not know, in another file, or damaged
+    with suppress(*DAMAGED):  # of a kind that glTF itself does not know, in another file, or damaged
         image = glb.entry("images", glb.entry("textures", texture.get("index")).get("source"))
         data = glb.piece(image.get("bufferView"))
     if "KHR_texture_transform" in str(texture.get("extensions", "")) or not data.startswith(tuple(PICTURES)):

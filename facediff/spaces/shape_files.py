@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import open_glb
+from facediff.mesh.glb import DAMAGED, open_glb
 from facediff.mesh.glb_shapes import read_targets
 from facediff.spaces.arkit import plain
 
@@ -111,7 +111,7 @@ def _whole(
 def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
     try:
         targets = read_targets(open_glb(path), vertices)
-    except (ValueError, IndexError) as error:
+    except DAMAGED as error:
         raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
     points = targets.neutral + targets.deltas
     return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, metric=True, rest=path.name)

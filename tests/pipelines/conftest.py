@@ -17,7 +17,7 @@ from facediff.models import DualPathDiffusion
 from facediff.synthetic.corpus import generate
 from facediff.synthetic.known_faces import write_puppet_shapes
 
-CLIPS = ["F1_e01", "F1_e03", "F1_t01", "M2_e01", "M2_e05"]
+CLIPS = ["F1_e01", "F1_e03", "F1_t01", "M2_e01", "M2_e05", "M2_t13", "F4_e01"]
 
 
 @pytest.fixture(scope="session")

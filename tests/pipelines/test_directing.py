@@ -29,7 +29,7 @@ QUICK = {"identity": "F1", "steps": 2, "voice_gate": "off"}
 
 @pytest.fixture
 def speech(puppet_corpus: Path) -> np.ndarray:
-    return read_speech(puppet_corpus / "wav" / "F1_e28.wav")
+    return read_speech(puppet_corpus / "wav" / "F1_t01.wav")
 
 
 def rows(channel: str, *values: float | str, kind: str = "smooth") -> list[dict[str, object]]:

@@ -21,10 +21,10 @@ def test_times_of_a_transcript_are_those_of_the_corpus(puppet_corpus: Path) -> N
     pytest.importorskip("dtaidistance")
     from facediff.editing.transcripts import align_transcript
 
-    said = read_speech(puppet_corpus / "wav" / "F1_e28.wav")
+    said = read_speech(puppet_corpus / "wav" / "F1_t01.wav")
     speech = np.concatenate([np.zeros(9600, np.float32), said, np.zeros(16_000, np.float32)])
     found = closed_times(align_transcript(SENTENCE, speech))
-    true = closed_times(read_phonemes(puppet_corpus / "phonemes" / "F1_e28.csv"))
+    true = closed_times(read_phonemes(puppet_corpus / "phonemes" / "F1_t01.csv"))
     assert len(found) == len(true)
     away = [abs(0.6 + (a + b) / 2 - (c + d) / 2) for (a, b), (c, d) in zip(true, found, strict=True)]
     assert np.median(away) < 0.03
@@ -43,7 +43,7 @@ def test_animation_closes_its_lips_by_alignment_and_by_transcript(
     pytest.importorskip("dtaidistance")
     from facediff.editing.transcripts import align_transcript
 
-    speech, alignment = (puppet_corpus / folder for folder in ("wav/F1_e28.wav", "phonemes/F1_e28.csv"))
+    speech, alignment = (puppet_corpus / folder for folder in ("wav/F1_t01.wav", "phonemes/F1_t01.csv"))
     free = model.animate(speech, identity="F1", voice_gate="off")
     heard = align_transcript(SENTENCE, read_speech(speech))
     for options, phonemes in (

@@ -16,7 +16,7 @@ from facediff.speech.voice_activity import openness, read_gate
 @pytest.fixture
 def speech(puppet_corpus: Path) -> np.ndarray:
     """A sentence between two seconds of faint noise each."""
-    said = read_speech(puppet_corpus / "wav" / "F1_e28.wav")
+    said = read_speech(puppet_corpus / "wav" / "F1_t01.wav")
     quiet = np.zeros(32_000, np.float32)
     made = np.concatenate([quiet, said, quiet])
     return made + (1e-3 * np.random.default_rng(0).standard_normal(len(made))).astype(np.float32)
