@@ -107,44 +107,27 @@ class Animation:
 
     def __post_init__(self) -> None:
         shape = self.vertices.shape
-        if len(shape) != 3 or shape[2] != 3:
-            raise FaceDiffError(f"{self.name}: has shape {shape}; expected (frames, vertices, 3)")
-        if not shape[0]:
-            raise FaceDiffError(f"{self.name}: holds no frames; give a motion of at least one")
-        if self.template.shape != shape[1:]:
+        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
+            raise FaceDiffError(f"{self.name}: has shape {shape}; expected (frames, vertices, 3), one frame at least")
+        frames, count = shape[:2]
+        width = 0 if self.channels is None else len(self.channels.space.channels)
+        for name, array, expected in (
+            ("template", self.template, (count, 3)),
+            ("colours", self.colours, (count, 3)),
+            ("head", self.head, (frames, 6)),
+            ("values", self.values, (frames, width)),
+            ("deltas", self.deltas, (len(self.space.face), count, 3)),
+        ):
+            if array is not None and (array.shape != expected or not in_range(array)):
+                raise FaceDiffError(
+                    f"{self.name}: its {name} are {array.shape}, or hold {OUT_OF_RANGE}; expected {expected}: give the "
+                    f"mesh that the motion was made for"
+                )
+        if self.faces is not None and len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < count:
             raise FaceDiffError(
-                f"{self.name}: has {shape[1]} vertices and its template {len(self.template)}; give the mesh that the "
+                f"{self.name}: its triangles name vertex {int(self.faces.max())} of {count}; give the mesh that the "
                 f"motion was made for"
             )
-        if self.faces is not None and len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < shape[1]:
-            raise FaceDiffError(
-                f"{self.name}: its triangles name vertex {int(self.faces.max())} of {shape[1]}; give the mesh that the "
-                f"motion was made for"
-            )
-        if self.colours is not None and self.colours.shape != (shape[1], 3):
-            raise FaceDiffError(
-                f"{self.name}: has {shape[1]} vertices and colours of shape {self.colours.shape}; give the mesh that "
-                f"the motion was made for"
-            )
-        if self.head is not None and (self.head.shape != (shape[0], 6) or not in_range(self.head)):
-            raise FaceDiffError(
-                f"{self.name}: has {shape[0]} frames and the motion of its head the shape {self.head.shape}; expected "
-                f"finite numbers (frames, 6)"
-            )
-        if self.values is not None and self.channels is not None:
-            expected = (shape[0], len(self.channels.space.channels))
-            if self.values.shape != expected or not in_range(self.values):
-                raise FaceDiffError(
-                    f"{self.name}: its values have the shape {self.values.shape}; expected finite numbers {expected}"
-                )
-        if self.deltas is not None:
-            moved = (len(self.space.face), *shape[1:])
-            if self.deltas.shape != moved or not in_range(self.deltas):
-                raise FaceDiffError(
-                    f"{self.name}: its deltas have the shape {self.deltas.shape}; expected finite numbers {moved}"
-                )
-        if not in_range(self.template):
-            raise FaceDiffError(f"{self.name}: its template holds {OUT_OF_RANGE}; give another one")
         if self.speech is not None and not np.isfinite(self.speech).all():
             raise FaceDiffError(f"{self.name}: its speech holds NaN or infinity; give another recording")
         check_number(self.name, "frame rate", self.frame_rate, *FRAME_RATES)

@@ -239,10 +239,8 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
 
     ``up`` writes each vertex as a point of the coarse face nearest to it, among those around its cluster.
     """
-    points = checked_template(template)
+    points = np.asarray(template, np.float64)
     faces = checked_faces(faces, len(points))
-    if not 1 <= n_vertices <= len(points):
-        raise FaceDiffError(f"coarsen: {n_vertices} vertices asked for; expected 1 to {len(points)}")
     labels = _clusters(points, faces, n_vertices)
     # The vertex nearest to the mean stands for its cluster: the simplifier's own positions lie off the surface.
     square = np.square(points - _means(labels, n_vertices).apply(points)[labels]).sum(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, OptionError, choices
-from facediff.mesh.glb import open_glb
+from facediff.mesh.glb import DAMAGED, open_glb
 from facediff.mesh.glb_scene import placed_parts
 
 NAMING = {b"o": 0, b"g": 1, b"usemtl": 2}

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import EXPRESSIONS, Flame
 from facediff.spaces.arkit import ARKIT, arkit_name, plain
+from facediff.spaces.operations import check_values
 from facediff.spaces.rotations import convert
 from facediff.spaces.shape_files import ICT_NEUTRAL, ShapeFiles, read_shape_files
 from facediff.spaces.space import Form, Space
@@ -67,8 +68,6 @@ class LinearRig:
             raise FaceDiffError(f"{files.path}: has the shape {twice} in two spellings; keep one of them")
         neutral = np.asarray(files.neutral, np.float64)
         deltas = np.asarray(files.shapes, np.float64) - neutral
-        if not (np.isfinite(neutral).all() and np.isfinite(deltas).all()):
-            raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it again")
         centimetres = plain(Path(files.rest).stem) == ICT_NEUTRAL
         unit = "m" if files.metric else "cm" if centimetres else ""
         return cls(names, neutral, deltas, files.faces, unit, files.path.name)
@@ -116,8 +115,6 @@ class LinearRig:
             values: in the order of the rig's names.
             neutral: (V, 3) another face at rest; the rig's own if None.
         """
-        if values.ndim != 2 or values.shape[1] != len(self.names):
-            raise FaceDiffError(f"motion: has shape {values.shape}; expected (frames, {len(self.names)}) for the rig")
         moved = np.asarray(values, np.float64) @ self.deltas.reshape(len(self.names), -1)
         rest = self.neutral if neutral is None else np.asarray(neutral, np.float64)
         return moved.reshape(len(values), *self.neutral.shape) + rest
@@ -167,11 +164,7 @@ def decode_flame(flame: Flame, values: Values, space: Space, shape: Values | Non
         space: their space, of the kind ``flame``.
         shape: (S,) the person's coefficients; the mean face if None.
     """
-    if space.kind != "flame" or values.ndim != 2 or values.shape[1] != len(space.channels):
-        raise FaceDiffError(
-            f"motion: has shape {values.shape} in a space of {space.kind} with {len(space.channels)} channels; "
-            f"expected FLAME's coefficients (frames, channels)"
-        )
+    check_values(values, space)
     expression = np.zeros((len(values), EXPRESSIONS))
     for column, name in enumerate(space.channels):
         family, _, index = name.rpartition("_")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError
 from facediff.spaces.space import WIDTHS, Form
 
 Array = npt.NDArray[np.float64]
@@ -34,9 +34,6 @@ def convert(values: npt.NDArray[np.floating], source: Form, target: Form) -> Arr
         >>> convert(np.array([[0.0, 0.0, np.pi / 2]]), "axis_angle", "six_d").round(6) + 0.0
         array([[ 0.,  1.,  0., -1.,  0.,  0.]])
     """
-    for form in (source, target):
-        if form not in WIDTHS:
-            raise FaceDiffError(f'rotation: there is no form "{form}"; {choices(form, WIDTHS)}')
     numbers = np.asarray(values, np.float64)
     if numbers.shape[-1:] != (WIDTHS[source],):
         raise FaceDiffError(f"rotation: has shape {numbers.shape}; expected (..., {WIDTHS[source]}) for {source}")

@@ -88,34 +88,24 @@ class Space:
     identity: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse fields that do not fit each other."""
-        if self.kind not in get_args(Kind):
-            raise _wrong("kind", self.kind, f"one of {', '.join(get_args(Kind))}")
-        for name in ("channels", "absent"):
-            names = getattr(self, name)
-            unique = len({text.casefold() for text in names if isinstance(text, str)}) == len(names)
-            if len(names) > MOST_CHANNELS or not all(map(is_name, names)) or not unique:
-                raise _wrong(name, names, "different names that can be printed, whatever their case")
-        if (self.kind == "vertices") != (not self.channels):
-            raise _wrong("channels", self.channels, f"{'none' if self.is_vertices else 'names'} with {self.kind}")
-        if self.is_vertices and (self.rotations or self.valid_range or self.absent):
-            raise FaceDiffError("space: vertices have no rotations, range or absent channels; leave them out")
-        for name in ("version", "rig", "rig_hash", "identity"):
-            text = getattr(self, name)
-            if text and not is_name(text):
-                raise _wrong(name, text, "a short text that can be printed")
-        taken: set[int] = set()
-        for rotation in self.rotations:
-            fits = rotation.joint in get_args(Joint) and rotation.form in WIDTHS and isinstance(rotation.start, int)
-            if not fits or not 0 <= rotation.start <= len(self.channels) - len(rotation.channels):
-                raise _wrong("rotations", rotation, "a joint, a form, and channels that exist")
-            if taken & set(rotation.channels):
-                raise _wrong("rotations", rotation, "channels that no other rotation takes")
-            taken |= set(rotation.channels)
-        if self.valid_range is not None:
-            low, high = self.valid_range
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise _wrong("valid_range", self.valid_range, "a finite number and a larger one")
+        """Refuse fields that do not fit each other; records come from files."""
+        count, taken = len(self.channels), [channel for turn in self.rotations for channel in turn.channels]
+        named = (*self.channels, *self.absent, *filter(None, (self.version, self.rig, self.rig_hash, self.identity)))
+        low, high = self.valid_range or (0.0, 1.0)
+        unfit = [
+            name
+            for name, fits in (
+                ("kind", self.kind in get_args(Kind) and self.is_vertices == (not count)),
+                ("channels", count <= MOST_CHANNELS and len({name.casefold() for name in self.channels}) == count),
+                ("names", all(map(is_name, named))),
+                ("rotations", all(turn.start >= 0 and turn.joint in get_args(Joint) for turn in self.rotations)),
+                ("rotations", len(set(taken)) == len(taken) and max(taken, default=-1) < count),
+                ("valid_range", math.isfinite(low) and math.isfinite(high) and low < high),
+            )
+            if not fits
+        ]
+        if unfit:
+            raise FaceDiffError(f"space: {' and '.join(unfit)} do not fit; expected a record of a motion's channels")
 
     @property
     def is_vertices(self) -> bool:
@@ -182,36 +172,15 @@ class Space:
     @classmethod
     def from_state(cls, state: object) -> Space:
         """The inverse of :meth:`state`; what it is given may come from anybody."""
-        names = {attribute.name for attribute in fields(cls)}
-        if not isinstance(state, dict) or state.keys() != names:
-            odd = sorted(map(str, names ^ state.keys())) if isinstance(state, dict) else state
-            raise _wrong("record", odd, f"exactly the fields {', '.join(sorted(names))}")
-        for name in names - {"channels", "rotations", "valid_range", "absent"}:
-            if not isinstance(state[name], str):
-                raise _wrong(name, state[name], "a text")
-        for name in ("channels", "rotations", "absent"):
-            if not isinstance(state[name], list | tuple):
-                raise _wrong(name, state[name], "a list")
-        span = state["valid_range"]
-        if span is not None and not (_is_list(span, 2) and all(map(_is_number, span))):
-            raise _wrong("valid_range", span, "two numbers, or null")
-        rotations = []
-        for turn in state["rotations"]:
-            keys = {attribute.name for attribute in fields(Rotation)}
-            if not isinstance(turn, dict) or turn.keys() != keys or type(turn["start"]) is not int:
-                raise _wrong("rotations", turn, "a list of joint, start and form")
-            if not isinstance(turn["joint"], str) or not isinstance(turn["form"], str):
-                raise _wrong("rotations", turn, "a list of joint, start and form")
-            rotations.append(Rotation(**turn))
-        return cls(
-            **{
-                **state,
-                "channels": tuple(state["channels"]),
-                "absent": tuple(state["absent"]),
-                "rotations": tuple(rotations),
-                "valid_range": None if span is None else (float(span[0]), float(span[1])),
-            }
-        )
+        try:
+            state = {name: state[name] for name in (attribute.name for attribute in fields(cls))}  # type: ignore[index]
+            rotations = tuple(Rotation(turn["joint"], int(turn["start"]), turn["form"]) for turn in state["rotations"])
+            low, high = state["valid_range"] or (0.0, 0.0)
+            span = (float(low), float(high)) if state["valid_range"] else None
+            lists = {name: tuple(state[name]) for name in ("channels", "absent")}
+            return cls(**{**state, **lists, "rotations": rotations, "valid_range": span})
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise FaceDiffError(f"space: is {quoted(state)}; expected the record of a motion's channels") from error
 
 
 VERTICES = Space()
@@ -220,18 +189,6 @@ VERTICES = Space()
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - a field of the record
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _is_list(value: object, length: int) -> bool:
-    return isinstance(value, list | tuple) and len(value) == length
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-
-
-def _wrong(name: str, value: object, expected: str) -> FaceDiffError:
-    return FaceDiffError(f"space: {name} is {quoted(value)}; expected {expected}")
 
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,76 +106,12 @@ def test_defaults_never_override_a_file(animation: Animation, tmp_path: Path) ->
     assert (read.faces, read.frame_rate, read.regions) == (None, 60, {})
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"vertices": np.zeros((0, 6, 3), np.float32)}, "holds no frames"),
-        ({"vertices": np.zeros((5, 7, 3), np.float32)}, "has 7 vertices and its template 6"),
-        ({"vertices": np.zeros((5, 18), np.float32)}, "expected (frames, vertices, 3)"),
-        ({"faces": np.array([[0, 1, 6]], np.int32)}, "name vertex 6 of 6"),
-        ({"frame_rate": 0.0}, "frame rate is 0.0; expected a number from 0.1"),
-        ({"unit": "parsec"}, 'unit "parsec"'),
-        ({"unit": "normalised (about 0 mm)"}, "metres from 1e-09"),
-        ({"unit": "about 1.2.3 mm"}, "metres from 1e-09"),
-        ({"sample_rate": 0}, "sample rate is 0; expected a whole number from 1000"),
-    ],
-)
-def test_animation_refuses_parts_that_do_not_fit(
-    animation: Animation, change: dict[str, object], sentence: str
-) -> None:
-    with pytest.raises(FaceDiffError) as caught:
-        replace(animation, **change)  # type: ignore[arg-type]
-    assert sentence in str(caught.value)
-    assert "hello" in str(caught.value) or "unit" in change
-
-
 def test_archive_is_never_written_with_motion_that_is_not_finite(animation: Animation, tmp_path: Path) -> None:
     vertices = animation.vertices.copy()
     vertices[3, 2, 1] = np.nan
     with pytest.raises(FaceDiffError, match="frame 3 holds NaN"):
         write_archive(tmp_path / "a.npz", replace(animation, vertices=vertices))
     assert not list(tmp_path.iterdir())
-
-
-def test_archive_refuses_files_that_are_no_animations(tmp_path: Path) -> None:
-    (tmp_path / "a.npz").write_text("no")
-    with pytest.raises(FaceDiffError, match="not a readable .npz"):
-        read_archive(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", x=np.zeros(3))
-    (tmp_path / "cut.npz").write_bytes((tmp_path / "b.npz").read_bytes()[:-30])
-    with pytest.raises(FaceDiffError, match="not a readable .npz"):
-        read_archive(tmp_path / "cut.npz")
-    with pytest.raises(FaceDiffError, match="has no vertices, template, about"):
-        read_archive(tmp_path / "b.npz")
-    np.save(tmp_path / "c.npy", np.array([{"a": 1}], object), allow_pickle=True)
-    with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
-        read_animation(tmp_path / "c.npy")
-    np.save(tmp_path / "plain.npy", np.zeros((2, 6, 3), np.float32))
-    whole = (tmp_path / "plain.npy").read_bytes()
-    for header in (whole.replace(b"}", b"{"), whole.replace(b"(2,", b"(02")):  # a NumPy header is Python
-        (tmp_path / "d.npy").write_bytes(header)
-        with pytest.raises(FaceDiffError, match="not a readable NumPy array"):
-            read_animation(tmp_path / "d.npy")
-    (tmp_path / "plain.npy").rename(tmp_path / "plain.npz")
-    with pytest.raises(FaceDiffError, match="not a readable .npz"):
-        read_archive(tmp_path / "plain.npz")
-    (tmp_path / "b.npz").rename(tmp_path / "b.npy")
-    with pytest.raises(FaceDiffError, match="name it .npz"):
-        read_animation(tmp_path / "b.npy")
-    for name, shape in (("flat", (4, 0)), ("deep", (4, 0, 3))):
-        np.save(tmp_path / f"{name}.npy", np.zeros(shape, np.float32))
-        with pytest.raises(FaceDiffError, match=rf"{name}\.npy: holds no numbers"):
-            read_animation(tmp_path / f"{name}.npy")
-    with zipfile.ZipFile(tmp_path / "words.npz", "w") as archive:
-        archive.writestr("vertices", "no numbers")
-    with pytest.raises(FaceDiffError, match="entry 'vertices'"):
-        read_archive(tmp_path / "words.npz")
-    np.savez_compressed(tmp_path / "spoilt.npz", vertices=np.arange(3000.0).reshape(10, 100, 3))
-    spoilt = bytearray((tmp_path / "spoilt.npz").read_bytes())
-    spoilt[100:200] = bytes(100)
-    (tmp_path / "spoilt.npz").write_bytes(spoilt)
-    with pytest.raises(FaceDiffError, match="not a readable .npz"):
-        read_archive(tmp_path / "spoilt.npz")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 
 from facediff.editing.acting import Acting, acted, gesture, read_acting
 from facediff.editing.controlled import ACTED
-from facediff.errors import FaceDiffError
 from tests.speech.test_prosody import RATE, SECONDS, SILENCE, voice
 
 FRAMES = 100
@@ -98,9 +97,3 @@ def test_frames_do_not_depend_on_speech_long_after_them(speech: np.ndarray) -> N
 def test_gestures_begin_and_end_at_rest() -> None:
     shape = (0.2, 0.1, 0.4)
     assert [gesture(after, shape) for after in (-0.2, 0, 0.1, 0.5, 9)] == pytest.approx([0, 1, 1, 0, 0])
-
-
-@pytest.mark.parametrize("words", ["mime", "prosody:brow=1", "prosody:strength=3", "prosody:nods=much"])
-def test_words_that_are_none_are_refused(words: str) -> None:
-    with pytest.raises(FaceDiffError, match="acting"):
-        read_acting(words)

@@ -9,7 +9,6 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.closures import RAMP, close_lips, closure_weights
-from facediff.errors import FaceDiffError
 
 CLOSURES = [(0.96, 1.08), (2.0, 2.04)]
 
@@ -90,8 +89,3 @@ def test_closed_mouth_and_no_closures_stay_as_they_are(animation: Animation) -> 
     still = replace(animation, vertices=np.repeat(animation.template[None], 75, 0))
     assert close_lips(still, CLOSURES) is still
     assert close_lips(animation, []) is animation
-
-
-def test_face_without_lip_pairs_is_named(animation: Animation) -> None:
-    with pytest.raises(FaceDiffError, match="inner lips"):
-        close_lips(replace(animation, inner_lip_pairs=None), CLOSURES)

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 import facediff
 from facediff.animation import Animation
 from facediff.cli.app import main
-from facediff.errors import FaceDiffError
 from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
@@ -57,12 +56,6 @@ def test_names_in_another_case_move_the_face_too(tmp_path: Path) -> None:
     assert np.ptp(usual.vertices, axis=0).max() > 0.01
     np.testing.assert_array_equal(other.vertices, usual.vertices)
     assert other.space.channels == ("jawOpen", "mouthPucker")
-
-
-def test_other_parameters_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "take.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(FaceDiffError, match=r"take\.csv"):
-        facediff.read(tmp_path / "take.csv")
 
 
 def take_of(path: Path, frames: int = 30) -> ParameterClip:

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facediff.animation import Animation
-from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
 from facediff.export.format import normals_of, outward
 from facediff.export.glb import compress
@@ -206,12 +205,6 @@ def test_glb_of_more_vertices_than_short_indices_can_count(
     reader = Reader(tmp_path / "a.glb")
     assert set(reader.values(reader.primitive.indices).tolist()) == {65_599, 0, 65_535}
     assert reader.primitive.attributes.COLOR_0 is None
-
-
-def test_glb_of_a_mesh_without_faces_is_refused(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="comes without a mesh"):
-        write_animations(tmp_path / "a.glb", [make_animation(faces=None)])
-    assert not list(tmp_path.iterdir())
 
 
 def test_glb_of_the_same_animation_has_the_same_bytes(animation: Animation, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import soundfile
 from pxr import Usd, UsdGeom, UsdMedia, UsdShade, UsdValidation
 
 from facediff.animation import Animation
-from facediff.errors import MissingExtraError
 from facediff.export import ExportOptions, write_animations
 
 
@@ -96,13 +94,3 @@ def test_usd_in_another_unit_with_z_up(make_animation: Callable[..., Animation],
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # +90 degrees about x
     np.testing.assert_allclose(points, animation.vertices[3] @ turn.T / 10, rtol=1e-6)
     assert not stage.GetDefaultPrim().GetChild("speech")
-
-
-def test_usd_without_usd_core_names_the_extra(
-    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pxr" else find(name))
-    with pytest.raises(MissingExtraError, match=r'"pxr", which is not installed: run  pip install "facediff\[usd\]"'):
-        write_animations(tmp_path / "a.usdc", [animation])
-    assert not list(tmp_path.iterdir())

@@ -12,7 +12,6 @@ import numpy.typing as npt
 import pytest
 
 from facediff.animation import Animation
-from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, video, write_animations
 from facediff.export.video import drawn_frames
 
@@ -72,14 +71,6 @@ def test_faces_of_one_unit_compare_in_size(make_animation: Callable[..., Animati
     picture = pictures(tmp_path / "a.mp4")[0, -64:].astype(int)
     covered = (np.abs(picture - picture[:1, :1]).sum(-1) > 60).reshape(64, 2, 64).sum((0, 2))
     assert covered[1] < 0.5 * covered[0]
-
-
-def test_animations_of_different_frame_rates_are_refused(
-    make_animation: Callable[..., Animation], tmp_path: Path
-) -> None:
-    with pytest.raises(FaceDiffError, match=r"differ in frame rate \(Hello Zoë 30, b 25\)"):
-        write_animations(tmp_path / "a.mp4", [make_animation(), make_animation(name="b", frame_rate=25.0)], SMALL)
-    assert not list(tmp_path.iterdir())
 
 
 def test_procedural_motion_is_named_below_the_video(animation: Animation) -> None:

@@ -17,7 +17,6 @@ from facediff.cli.app import main
 from facediff.cli.retarget import surface_notes
 from facediff.errors import FaceDiffError
 from facediff.export import fbx, write_animations
-from facediff.mesh import read_mesh
 from facediff.spaces import layout
 from tests.fakes.avatar import avatar_parts, write_avatar
 from tests.fakes.clicks import clicks
@@ -138,8 +137,3 @@ def test_blender_embeds_an_avatars_pictures_and_leaves_out_its_helpers(tmp_path:
     (written, *_) = write_animations(tmp_path / "x.fbx", [animation], into=tmp_path / "avatar.glb", own_shapes=True)
     assert b"\x89PNG" in written.read_bytes()
     assert b"Icosphere" not in written.read_bytes()
-
-
-def test_a_target_in_fbx_is_refused_with_the_conversion(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"import_scene\.fbx\(filepath='me\.fbx'\).*me\.glb"):
-        read_mesh(tmp_path / "me.fbx")

@@ -340,13 +340,6 @@ def posed_at_rest(path: Path) -> dict[str, np.ndarray]:
     return {glb.content["nodes"][part.node]["name"]: part.points for part in placed_parts(glb)}
 
 
-@pytest.mark.parametrize("extensions", [[], {"VRM": []}, {"VRMC_vrm": {"expressions": 1}}])
-def test_extensions_of_another_form_are_damage(extensions: Any, tmp_path: Path) -> None:  # noqa: ANN401
-    (tmp_path / "a.glb").write_bytes(pack({"asset": {"version": "2.0"}, "extensions": extensions}, b""))
-    with pytest.raises(FaceDiffError, match=r"a\.glb"):
-        own_shapes(tmp_path / "a.glb")
-
-
 @pytest.mark.slow
 def test_a_figures_head_turns_by_its_bone_where_shapes_are_solved_for(
     tmp_path: Path, parts: dict[str, AvatarPart]

@@ -69,27 +69,11 @@ def test_the_rotation_is_proper_even_for_a_mirror_image() -> None:
     np.testing.assert_allclose(align(flat, flat @ turn([1.0, 2, 3]).T).rotation, turn([1.0, 2, 3]), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("points", "sentence"),
-    [
-        (np.linspace(0, 1, 9)[:, None] * [1.0, 2, 3], "do not determine a rotation"),
-        (np.ones((9, 3)), "do not determine a rotation"),
-        (np.eye(3)[:2], "fewer than three points"),
-        (np.full((9, 3), np.nan), "NaN"),
-        (np.zeros((9, 2)), r"expected two equal ones \(points, 3\)"),
-    ],
-)
-def test_points_that_determine_nothing(points: Array, sentence: str) -> None:
+@pytest.mark.parametrize("points", [np.linspace(0, 1, 9)[:, None] * [1.0, 2, 3], np.ones((9, 3)), np.eye(3)[:2]])
+def test_points_that_determine_nothing(points: Array) -> None:
     for how in (align, robust_align):
-        with pytest.raises(FaceDiffError, match=sentence):
+        with pytest.raises(FaceDiffError, match="do not determine a rotation"):
             how(points, points)
-
-
-def test_weights_that_are_none() -> None:
-    with pytest.raises(FaceDiffError, match="none negative"):
-        align(face(), face(), weights=-np.ones(len(face())))
-    with pytest.raises(FaceDiffError, match="expected two equal ones"):
-        align(face(), face()[:-1])
 
 
 def angle(rotation: Array) -> float:
@@ -187,24 +171,6 @@ def test_chunks_do_not_show_and_memory_stays_small(tmp_path: Path) -> None:
     inplace = seen[:5].copy()
     assert remove_rigid_motion(inplace, 1000 * face(), out=inplace).frames is inplace
     np.testing.assert_allclose(inplace, whole[:5], atol=1e-9)
-
-
-def test_frames_that_cannot_be_laid() -> None:
-    frames = np.repeat(face()[None], 5, 0)
-    frames[3, 7, 1] = np.nan
-    with pytest.raises(FaceDiffError, match="frame 3 .counted from 0. holds NaN"):
-        remove_rigid_motion(frames, face(), chunk_bytes=1)
-    with pytest.raises(FaceDiffError, match="frame 3"):
-        stable_vertices(frames)
-    with pytest.raises(FaceDiffError, match="the target"):
-        remove_rigid_motion(frames, face()[1:])
-    with pytest.raises(FaceDiffError, match="out has shape"):
-        remove_rigid_motion(frames, face(), out=np.empty((4, *face().shape)))
-    with pytest.raises(FaceDiffError, match="out has .*int64"):
-        remove_rigid_motion(frames, face(), out=np.empty(frames.shape, np.int64))
-    for function in (stable_vertices, median_face):
-        with pytest.raises(FaceDiffError, match="no frames"):
-            function(frames[:0])
 
 
 def test_frames_of_whole_numbers_are_not_rounded() -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.hierarchy import Coarse, Operator, Pooling, coarsen, project
 from facediff.mesh.mesh import surface_area
 from tests.fakes.biwi import faces_of
@@ -174,25 +173,3 @@ def test_projection_against_a_search_over_points_of_the_triangle() -> None:
     assert (found >= best - 0.06).all()
     assert (weights.min(1) > 0).any()
     assert (weights.min(1) == 0).any()
-
-
-@pytest.mark.parametrize("count", [0, 65, -3])
-def test_impossible_numbers_are_refused(count: int) -> None:
-    with pytest.raises(FaceDiffError, match=f"{count} vertices asked for; expected 1 to 64"):
-        coarsen(*flat(), count)
-
-
-def test_broken_templates_are_refused() -> None:
-    points, faces = flat()
-    with pytest.raises(FaceDiffError, match="not finite"):
-        coarsen(np.where(points == 3, np.nan, points), faces, 8)
-    with pytest.raises(FaceDiffError, match=r"expected \(V, 3\)"):
-        coarsen(points[:, :2], faces, 8)
-    with pytest.raises(FaceDiffError, match="has 10 vertices"):
-        coarsen(points[:10], faces, 8)
-
-
-def test_a_missing_simplifier_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    with pytest.raises(MissingExtraError, match=r"facediff\[mesh\]"):
-        coarsen(*flat(), 16)

@@ -176,26 +176,6 @@ def test_a_face_without_its_eyeballs(tmp_path: Path) -> None:
     assert same(mesh_hierarchy(points, faces, vertices=chosen, cache=tmp_path), part)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"levels": -1}, "levels -1"),
-        ({"factor": 0}, "factor 0"),
-        ({"spiral_length": 0}, "spiral_length 0"),
-        ({"pooling": "max"}, 'pooling "max"'),
-        ({"vertices": np.array([0, 288])}, "indices from 0 to 288"),
-        ({"vertices": np.zeros(0, int)}, "expected a list of vertex indices"),
-        ({"vertices": np.zeros(288, bool)}, "bool"),
-        ({"faces": np.array([[0, 1, 288]])}, "has 288 vertices"),
-        ({"template": MESH[0] * np.inf}, "not finite"),
-    ],
-)
-def test_what_does_not_fit_is_refused(tmp_path: Path, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(FaceDiffError, match=message):
-        mesh_hierarchy(**{"template": MESH[0], "faces": MESH[1], "cache": tmp_path, **options})
-    assert not list(tmp_path.iterdir())
-
-
 def test_arrays_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     arrays = mesh_hierarchy(*MESH, cache=tmp_path).arrays()
     wrong = [

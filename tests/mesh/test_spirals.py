@@ -114,19 +114,3 @@ def test_meshes_that_are_no_surface_keep_all_neighbours(faces: list[list[int]]) 
     for vertex, row in enumerate(table.tolist()):
         joined = {corner for face in faces if vertex in face and len(set(face)) == 3 for corner in face} - {vertex}
         assert set(row[1 : 1 + len(joined)]) == joined
-
-
-@pytest.mark.parametrize(
-    ("faces", "options", "message"),
-    [
-        (np.array([[0, 1, 9]]), {}, "indices from 0 to 9, but the template has 7 vertices"),
-        (np.array([[0, 1, -1]]), {}, "indices from -1"),
-        (np.zeros((2, 4), int), {}, r"expected integers of shape \(F, 3\)"),
-        (np.zeros((2, 3)), {}, r"float64 of shape \(2, 3\)"),
-        (FAN, {"length": 0}, "length 0"),
-        (FAN, {"dilation": 0}, "dilation 0"),
-    ],
-)
-def test_what_does_not_fit_is_refused(faces: np.ndarray, options: dict[str, int], message: str) -> None:
-    with pytest.raises(FaceDiffError, match=message):
-        spirals(faces, 7, **{"length": 3, **options})

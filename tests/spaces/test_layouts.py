@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
-from facediff.errors import FaceDiffError
 from facediff.spaces import Space, layout
 from facediff.spaces.arkit import ARKIT
-from facediff.spaces.layouts import LAYOUTS, find_layout, layouts_of_width
+from facediff.spaces.layouts import LAYOUTS, layouts_of_width
 
 
 def test_every_layout_is_a_space_that_survives_its_plain_form() -> None:
@@ -40,8 +37,3 @@ def test_layouts_of_a_width_include_the_pairs_that_are_mixed_up() -> None:
     assert layout("flame_dualtalk_truth").head == (50, 51, 52)
     assert set(layouts_of_width(103)) == {"flame_emote", "flame_beat2"}
     assert layouts_of_width(403) == ("flame_3dmead",)
-
-
-def test_find_layout_names_the_nearest() -> None:
-    with pytest.raises(FaceDiffError, match="flame_artalk"):
-        find_layout("flame_artalc")

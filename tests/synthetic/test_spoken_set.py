@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.spaces.rotations import convert, matrices
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import TimedPhoneme, closures, read_phonemes
@@ -69,8 +68,3 @@ def test_speech_for_other_programs_is_what_was_spoken(tmp_path: Path) -> None:
     written = read_phonemes(folder / "phonemes" / f"{clips[0].name}.csv")
     assert [p.ipa for p in written] == [p.ipa for p in clips[0].phonemes]
     assert (folder / "clips.csv").read_text(encoding="utf-8").count(clips[0].text) == 1
-
-
-def test_an_unknown_language_is_refused() -> None:
-    with pytest.raises(FaceDiffError, match="--languages tlh"):
-        spoken_set(["tlh"], 1, 1)

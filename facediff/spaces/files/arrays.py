@@ -103,16 +103,11 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     parts = []
     for key, columns in (entry.arrays or {}).items():
         array = _frames(path, key, content[key])
-        if array.shape[1] < columns.stop:
-            raise FaceDiffError(
-                f"{path}: {key} has {array.shape[1]} columns; expected at least {columns.stop} in {layout}: was it "
-                f"written with fewer coefficients?"
-            )
         # Exact for what belongs to the layout alone; SMPL-X's poses have the body's joints around the jaw.
-        if columns.start == 0 and array.shape[1] != columns.stop:
+        if array.shape[1] < columns.stop or (columns.start == 0 and array.shape[1] != columns.stop):
             raise FaceDiffError(
-                f"{path}: {key} has {array.shape[1]} columns; expected {columns.stop} in {layout}; cut the leading "
-                f"coefficients with facediff.spaces.operations.truncated"
+                f"{path}: {key} has {array.shape[1]} columns; expected {columns.stop} in {layout}; cut more of them to "
+                f"the leading ones with facediff.spaces.operations.truncated"
             )
         parts.append(array[:, columns])
     lengths = {len(part) for part in parts}
@@ -121,10 +116,6 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     person = None
     if entry.identity_array in content:
         shape = content[entry.identity_array]
-        if shape.dtype.kind not in "fiu" or not shape.size:
-            raise FaceDiffError(
-                f"{path}: {entry.identity_array} holds {shape.dtype} {shape.shape}; expected numbers of a person"
-            )
         shape = np.asarray(shape, np.float64)
         # A reconstruction has a shape for each frame, which is one person's all the same.
         rows = shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape
@@ -205,22 +196,20 @@ def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
     """
     name = layout or clip.layout
     entry = find_layout(name, str(path))
-    if clip.space.channels != entry.space.channels:
-        raise FaceDiffError(f"{path}: the clip has not the channels of {name}; change its order or rotations first")
+    archive = path.suffix.lower() == ".npz"
+    if clip.space.channels != entry.space.channels or not (entry.arrays if archive else entry.flat):
+        raise FaceDiffError(
+            f"{path}: {name} has other channels, or {'.npy' if archive else '.npz'} files only; change the clip's "
+            f"order or rotations first, or the suffix"
+        )
     person = np.zeros(entry.identity, np.float32) if clip.identity is None else clip.identity
-    if path.suffix.lower() == ".npz":
-        if entry.arrays is None:
-            raise FaceDiffError(f"{path}: {name} has no archive; expected .npy")
+    if archive:
         content = dict(_archive(clip, entry))
         if entry.identity_array and clip.identity is not None:
             content[entry.identity_array] = clip.identity
         with atomic(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **content)
         return
-    if not entry.flat:
-        raise FaceDiffError(f"{path}: {name} is no flat array; expected .npz")
-    if len(person) != entry.identity:
-        raise FaceDiffError(f"{path}: the clip's person has {len(person)} coefficients; {name} has {entry.identity}")
     leading = np.broadcast_to(person, (len(clip.values), entry.identity))
     with atomic(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, np.concatenate([leading, clip.values], axis=1), allow_pickle=False)

@@ -31,19 +31,12 @@ def read_beat(path: Path) -> ParameterClip:
         path: the file.
     """
     content = load_json(path, remedy=REMEDY)
-    names = content.get("names") if isinstance(content, dict) else None
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(names, list) or not isinstance(frames, list) or not all(isinstance(name, str) for name in names):
-        raise FaceDiffError(f"{path}: has no names and frames; {REMEDY}")
-    space = _space(path, names)
-    values = np.empty((len(frames), len(names)))
-    for number, frame in enumerate(frames):
-        weights = frame.get("weights") if isinstance(frame, dict) else None
-        if not isinstance(weights, list) or len(weights) != len(names):
-            raise FaceDiffError(f"{path}: frame {number} has not the {len(names)} weights of its names; {REMEDY}")
-        if not all(isinstance(weight, int | float) and not isinstance(weight, bool) for weight in weights):
-            raise FaceDiffError(f"{path}: frame {number} has a weight that is no number; {REMEDY}")
-        values[number] = weights
+    try:
+        names, frames = content["names"], content["frames"]
+        values = np.array([frame["weights"] for frame in frames], np.float64).reshape(len(frames), len(names))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FaceDiffError(f"{path}: has no names and frames of as many weights ({error}); {REMEDY}") from error
+    space = _space(path, list(map(str, names)))
     metadata = content.get("metadata")
     stated = metadata.get("fps") if isinstance(metadata, dict) else None
     if stated is not None:
@@ -95,8 +88,6 @@ def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> No
         clip: in a space of ARKit's, whose order is kept.
         metadata: add frame rate and number of frames, as LAM does.
     """
-    if clip.space.kind != "arkit":
-        raise FaceDiffError(f"{path}: the clip is in a space of {clip.space.kind}; expected ARKit's weights")
     turning = {*clip.space.head, *clip.space.eyes}
     shapes = [
         index

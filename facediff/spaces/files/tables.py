@@ -260,9 +260,11 @@ def write_audio2face(path: Path, clip: ParameterClip) -> None:
 
 def _numbers(path: Path, number: int, row: list[str], columns: list[int], width: int) -> list[float]:
     """Cells of a row as numbers."""
-    if len(row) != width:
-        raise FaceDiffError(f"{path}: row {number} has another number of cells than the header; write it again")
     try:
+        if len(row) != width:
+            raise ValueError(f"{len(row)} cells for {width} columns")
         return [float(row[column]) for column in columns]
     except ValueError as error:
-        raise FaceDiffError(f"{path}: row {number} has a cell that is no number ({quoted(str(error))})") from error
+        raise FaceDiffError(
+            f"{path}: row {number} holds no numbers of the header's columns ({quoted(str(error))})"
+        ) from error

@@ -259,21 +259,3 @@ def test_a_motion_that_stands_still_has_no_share() -> None:
     assert not found.residual_share.any()
     assert found.absent[0] == "eyeBlinkLeft"
     assert found.extra == ("mine",)
-
-
-def test_bad_motion_is_refused() -> None:
-    made = shapes()
-    animation = animation_of(made, np.zeros((3, 5)))
-    animation.vertices[1, 4, 2] = np.nan
-    with pytest.raises(FaceDiffError, match="a: frame 1 holds NaN"):
-        solve(animation, made)
-    with pytest.raises(FaceDiffError, match="has 40 vertices and the shapes 39.*carry"):
-        solve(animation, ShapeSet(made.names, made.neutral[:39], made.deltas[:, :39]))
-    with pytest.raises(FaceDiffError, match="no shape moves"):
-        solve(animation_of(made, np.zeros((3, 5))), ShapeSet(made.names, made.neutral, 0 * made.deltas))
-
-
-@pytest.mark.parametrize("wrong", [{"smoothness": -1}, {"ridge": np.nan}, {"lower": 1, "upper": 0}, {"tolerance": 0}])
-def test_impossible_options_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(FaceDiffError, match="expected"):
-        SolveOptions(**wrong)  # type: ignore[arg-type]

@@ -15,7 +15,6 @@ from facediff.editing.blendshapes import SolveOptions, solve, vertex_areas
 from facediff.editing.bounded import Pivoting, Problem
 from facediff.editing.live_weights import FrameSolver
 from facediff.editing.shapes import ShapeSet
-from facediff.errors import FaceDiffError
 
 NO_PRIOR = SolveOptions(smoothness=0.0, sparsity=0.0, ridge=0.0, area_weighted=False)
 
@@ -150,9 +149,3 @@ def test_shapes_without_effect_keep_weight_zero_and_what_is_left_is_measured() -
     away = np.zeros_like(shapes.deltas[0])
     away[:, 0] = 3.0
     assert solver.residual_mm(away, np.zeros(3)) == pytest.approx(30.0)
-
-
-@pytest.mark.parametrize("offsets", [np.zeros((59, 3)), np.full((60, 3), np.nan)])
-def test_a_frame_that_is_none_is_refused(offsets: np.ndarray) -> None:
-    with pytest.raises(FaceDiffError, match="frame"):
-        FrameSolver(some_shapes(), 30.0).solve(offsets)

@@ -97,22 +97,6 @@ def test_without_a_neutral_face_the_template_is_it(tmp_path: Path) -> None:
         read_shapes(tmp_path, GRID + 0.005 * np.sin(100 * GRID[:, :1]))
 
 
-def test_wrong_folders_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="no such folder"):
-        read_shapes(tmp_path / "absent", GRID)
-    with pytest.raises(FaceDiffError, match=r"Neutral.obj: has 36 vertices .* 35; .*carry"):
-        read_shapes(folder, GRID[:35])
-    with pytest.raises(FaceDiffError, match="another order"):
-        read_shapes(folder, RNG.permutation(GRID))
-    write_obj(folder / "jaw_open.obj", GRID)
-    with pytest.raises(FaceDiffError, match='"jawOpen" and "jaw_open" are both jawOpen'):
-        read_shapes(folder, GRID)
-    (folder / "jaw_open.obj").unlink()
-    write_obj(folder / "basis.obj", GRID)
-    with pytest.raises(FaceDiffError, match="both the face at rest"):
-        read_shapes(folder, GRID)
-
-
 def test_shapes_that_differ_among_themselves_are_refused(folder: Path) -> None:
     write_obj(folder / "fancy.obj", GRID[:30], FACES[:40])
     with pytest.raises(FaceDiffError, match=r"fancy.obj: has 30 vertices and Neutral.obj 36"):
@@ -158,38 +142,6 @@ def edited(change: dict[tuple[str | int, ...], Any]) -> bytes:
             at = at[step]
         at[path[-1]] = value
     return pack(gltf, binary)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {("accessors", 0, "count"): 10**9},
-        {("accessors", 0, "count"): -1},
-        {("accessors", 0, "count"): 1.5},
-        {("accessors", 0, "byteOffset"): -8},
-        {("accessors", 0, "bufferView"): -1},
-        {("accessors", 0, "componentType"): 5122},
-        {("accessors", 2, "count"): 10**12},
-        {("accessors", 2, "sparse", "count"): 10**9},
-        {("accessors", 2, "sparse", "indices", "bufferView"): 99},
-        {("bufferViews", 0, "byteLength"): 10**9},
-        {("bufferViews", 0, "byteOffset"): 10**9},
-        {("bufferViews", 0, "byteStride"): 1},
-        {("bufferViews", 0, "buffer"): 1},
-        {("buffers", 0): {"uri": "other.bin", "byteLength": 9}},
-        {("meshes", 0, "extras", "targetNames"): ["one"]},
-        {("meshes", 0, "primitives", 0, "targets"): []},
-        {("meshes", 0, "primitives", 0, "mode"): 1},
-        {("meshes", 0, "primitives", 0, "indices"): 0},
-        {("extensionsRequired",): ["KHR_draco_mesh_compression"]},
-        {("meshes",): {}},
-        {("accessors",): None},
-    ],
-)
-def test_damaged_glbs_are_refused(tmp_path: Path, change: dict[tuple[str | int, ...], Any]) -> None:
-    (tmp_path / "a.glb").write_bytes(edited(change))
-    with pytest.raises(FaceDiffError, match=r"a\.glb: .*(export|not a readable glb|declares)"):
-        read_shapes(tmp_path / "a.glb", GRID)
 
 
 def test_no_bytes_of_a_glb_do_more_than_fail(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import pytest
 from facediff.animation import Animation
 from facediff.editing.eyes import Eyes
 from facediff.editing.procedural import add_blinks, blink_curve
-from facediff.errors import FaceDiffError
 from facediff.synthetic.head.parts import build_head
 
 
@@ -96,16 +95,3 @@ def test_an_eye_that_is_shut_already_stays_as_it_is(make_animation: Callable[...
 @pytest.mark.parametrize("frames", [0, 1, 5])
 def test_animations_too_short_for_a_blink_have_none(frames: int) -> None:
     assert not blink_curve(frames, 25.0, rate=40).any()
-
-
-@pytest.mark.parametrize("rate", [0.0, -3.0, 41.0, float("nan")])
-def test_impossible_rates(rate: float) -> None:
-    with pytest.raises(FaceDiffError, match=r"blink_curve.rate .* from 1 to 40"):
-        blink_curve(100, 25.0, rate=rate)
-
-
-def test_eyes_whose_lids_are_not_known(make_animation: Callable[..., Animation]) -> None:
-    with pytest.raises(FaceDiffError, match="flame: does not say how the lids shut; give eyes"):
-        add_blinks(make_animation(9), Eyes(None, (np.arange(9),), "flame"))
-    with pytest.raises(FaceDiffError, match="moves nothing"):
-        Eyes(np.zeros((9, 3), np.float32), (), "flame")

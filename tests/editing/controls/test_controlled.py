@@ -75,25 +75,6 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
         apply_controls(made, parsed("--blinks"))
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["--expressiveness", "a lot"], "expressiveness a lot: expected a factor"),
-        (["--blinks", "0"], "--blinks 0: "),
-        (["--blinks", "speech.wav"], "--blinks speech.wav: "),
-        (["--gaze", "50"], "--gaze 50: "),
-        (["--sway", "0"], "--sway 0: "),
-        (["--eyes", "none.json"], "eyes none.json: no such file"),
-        (["--controls-seed", "-1"], "--controls-seed -1: "),
-        (["--controls-seed", "1"], "acting"),
-    ],
-)
-def test_words_are_checked_before_anything_is_made(words: list[str], sentence: str) -> None:
-    with pytest.raises(FaceDiffError) as caught:
-        parsed(*words)
-    assert sentence in str(caught.value)
-
-
 def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable[..., Animation]) -> None:
     animation = replace(make_animation(2), faces=None)
     for option in ("--blinks", "--gaze"):
@@ -104,13 +85,6 @@ def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable
         .metadata["procedural"]
         .startswith("head sway")
     )
-
-
-def test_a_folder_of_keys_is_refused_where_no_recording_chooses(
-    make_animation: Callable[..., Animation], tmp_path: Path
-) -> None:
-    with pytest.raises(FaceDiffError, match=f"direction {tmp_path}: is a folder"):
-        apply_controls(make_animation(2), AnimationControls(direction=tmp_path))
 
 
 def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[..., Animation], tmp_path: Path) -> None:

@@ -74,16 +74,6 @@ def test_landmarks(tmp_path: Path, text: str) -> None:
     assert read_landmarks(tmp_path / "a.csv").nearest_vertices.tolist() == [[1, 2], [3, 4]]
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [("", "holds no pairs"), ("1,2\n3\n", "line 2 is 3"), ("1,2\n-3,4\n", "line 2"), ("1,2,3\n", "line 1")],
-)
-def test_wrong_landmarks(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(FaceDiffError, match=says):
-        read_landmarks(tmp_path / "a.csv")
-
-
 def test_a_correspondence_of_another_face_is_refused_and_a_sculpted_one_kept() -> None:
     own = np.random.default_rng(0).uniform(-1, 1, (100, 3))
     nose = own.copy()

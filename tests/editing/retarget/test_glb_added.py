@@ -162,15 +162,6 @@ def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
     assert new.content["scenes"][new.content["scene"]]["nodes"] == [1, 0]
 
 
-def test_another_file_is_refused(tmp_path: Path) -> None:
-    avatar(tmp_path / "avatar.glb")
-    points, faces = relief(5, 5)
-    animation = Animation("x", points[None].astype("f4"), points.astype("f4"), 25.0, faces=faces.astype("i4"))
-    with pytest.raises(FaceDiffError, match=r"avatar\.glb: has 144 vertices"):
-        add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.05)
-    assert not (tmp_path / "out.glb").exists()
-
-
 def test_a_compressed_file_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
     avatar(tmp_path / "avatar.glb")
     content = opened(tmp_path / "avatar.glb").content | {"extensionsRequired": ["EXT_meshopt_compression"]}

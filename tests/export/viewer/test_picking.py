@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,8 +22,7 @@ import uvicorn
 
 from facediff.animation import write_archive
 from facediff.editing.landmarks import NAMES, read_landmarks
-from facediff.errors import FaceDiffError
-from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, pick_landmarks, picking_page
+from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, picking_page
 from facediff.mesh import Mesh
 from facediff.mesh.parts import MeshPart
 from facediff.utils.server import LOOPBACK, names_of
@@ -152,23 +150,6 @@ def test_other_pages_other_bodies_and_other_paths_are_refused(serve: Serve, pick
         assert response.headers["Server"] is None
     assert names_of("0.0.0.0") is None  # noqa: S104
     assert "10.0.0.7" in (names_of("10.0.0.7") or ())
-
-
-def test_a_port_that_is_taken_and_landmarks_of_other_meshes_are_refused(
-    picking: Picking, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("facediff.export.viewer.picking.picking_page", lambda _: ["page"])
-
-    def pick(**options: Any) -> None:  # noqa: ANN401 - passed on
-        pick_landmarks(picking.source, picking.target, picking.file, names=("a", "b"), **options)
-
-    taken = socket.create_server(("127.0.0.1", 0))
-    port = taken.getsockname()[1]
-    with taken, pytest.raises(FaceDiffError, match=f"--port {port}"):
-        pick(port=port)
-    picking.file.write_text(json.dumps(pairs(landmarks=[{"name": "a", "source": 1, "target": 4000}])))
-    with pytest.raises(FaceDiffError, match="target vertices"):
-        pick()
 
 
 @pytest.mark.slow

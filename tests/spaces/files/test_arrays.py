@@ -54,32 +54,6 @@ def test_an_archive_needs_a_layout_and_its_widths(tmp_path: Path) -> None:
         read_parameters(path, layout="flame_diffposetalk")
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("fps", np.array("fast"), "frame rate is 'fast'"),
-        ("fps", np.array(25j), "frame rate"),
-        ("shape", np.array(["a", "b"]), "shape holds"),
-        ("shape", np.zeros((0, 100)), "shape holds"),
-    ],
-)
-def test_a_rate_and_a_person_that_are_no_numbers_are_named(
-    tmp_path: Path, name: str, value: np.ndarray, message: str
-) -> None:
-    path = tmp_path / "a.npz"
-    np.savez(path, exp=np.zeros((4, 50)), pose=np.zeros((4, 6)), **{"fps": np.array("25"), name: value})
-    with pytest.raises(FaceDiffError, match=message):
-        read_parameters(path, layout="flame_diffposetalk")
-
-
-def test_pickles_are_never_loaded(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    np.savez(tmp_path / "a.npz", exp=np.array([{"a": 1}], dtype=object), pose=np.zeros((1, 6)))
-    for suffix in (".npy", ".npz"):
-        with pytest.raises(FaceDiffError, match=f"a{suffix}"):
-            read_parameters(tmp_path / f"a{suffix}", layout="flame_diffposetalk")
-
-
 def motion(head: bool = False) -> np.ndarray:
     """Turns (200, 3) of a head, or of a jaw, which opens about x alone."""
     wave = np.sin(np.linspace(0, 40, 200))[:, None]
