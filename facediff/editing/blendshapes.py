@@ -187,8 +187,6 @@ class Weights:
                 within so much of a weight. The table has a row for each frame.
         """
         path = Path(path)
-        if path.suffix.lower() != ".csv":
-            raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
         (write_weights if plain else write_live_link)(path, self, key_tolerance)
         return path
 

@@ -203,17 +203,12 @@ def placed(
 def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Surface:
     points: Array = np.ascontiguousarray(vertices, np.float64)
     corners: Indices = np.ascontiguousarray(faces, np.int64)
-    if points.ndim != 2 or points.shape[-1] != 3 or corners.ndim != 2 or corners.shape[-1] != 3:
-        raise FaceDiffError(
-            f"{name}: has vertices {points.shape} and faces {corners.shape}; expected (vertices, 3) and triangles"
-        )
-    if len(points) < 4 or len(corners) < 4 or not 0 <= corners.min() <= corners.max() < len(points):
+    check_coordinates(points, f"{name}:")
+    fits = len(points) and len(corners) and 0 <= corners.min() <= corners.max() < len(points)
+    if not fits or np.count_nonzero(triangle_areas(points, corners)) < 4:
         raise FaceDiffError(
             f"{name}: {len(points)} vertices and {len(corners)} triangles make no face; give a whole mesh"
         )
-    check_coordinates(points, f"{name}:")
-    if np.count_nonzero(triangle_areas(points, corners)) < 4:
-        raise FaceDiffError(f"{name}: its {len(corners)} triangles have no area; give the mesh of a face")
     return Surface(points, corners)
 
 
@@ -288,20 +283,11 @@ def refuse_other_mesh(
     # Rows in an order that does not depend on that of the vertices, rounding aside.
     both = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
     first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in both)
-    if np.abs(first - second).max() > 2 * ROUNDED * extent:
-        raise FaceDiffError(
-            f"{name}: has as many vertices as the correspondence's mesh and other triangles; give the mesh that it was "
-            f"made for, or make a new correspondence"
-        )
-    moved = int(np.count_nonzero(np.abs(vertices - expected_vertices).max(axis=1) > 2 * ROUNDED * extent))
-    if moved:
-        raise FaceDiffError(
-            f"{name}: {moved} of its {len(vertices)} vertices are where others were: they were reordered, as exporters "
-            f"do; write the mesh with the order of its vertices kept, or make a new correspondence"
-        )
+    reordered = np.abs(first - second).max() <= 2 * ROUNDED * extent
+    reason = "its vertices were reordered, as exporters do" if reordered else "it is another mesh"
     raise FaceDiffError(
-        f"{name}: has its vertices where they were and other triangles; give the mesh that the correspondence was made "
-        f"for, or make a new one"
+        f"{name}: has other triangles than the correspondence's mesh: {reason}; give the mesh that it was made for "
+        f"with the order of its vertices kept, or make a new correspondence"
     )
 
 

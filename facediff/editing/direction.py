@@ -123,9 +123,7 @@ class Key:
 
     def __post_init__(self) -> None:
         _number("time", self.time, TIMES)
-        if not isinstance(self.channel, str):
-            raise FaceDiffError(f"channel {shown(self.channel)}: expected a name, such as expressiveness")
-        limits = channel_of(self.channel).range
+        limits = channel_of(str(self.channel)).range
         if limits is not None:
             _number("value", self.value, limits)
         elif not isinstance(self.value, str) or not self.value.strip():
@@ -135,8 +133,6 @@ class Key:
             raise FaceDiffError(f"interpolation {shown(self.interpolation)}: {remedy}")
         if self.slope is not None:
             _number("slope", self.slope, SLOPES)
-            if limits is None:
-                raise FaceDiffError(f"slope {shown(self.slope)}: {self.channel} is no number; omit it")
         # Numbers are floats from here on, also where a whole number or one of NumPy's was given.
         for name in ("time", "value", "slope"):
             number = getattr(self, name)
@@ -171,10 +167,8 @@ class Direction:
     instead_of: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        if not self.keys:
-            raise FaceDiffError(f"{self.source}: holds no keys; give at least one")
-        if len(self.keys) > MOST_KEYS:
-            raise FaceDiffError(f"{self.source}: holds {len(self.keys)} keys; expected at most {MOST_KEYS}")
+        if not 0 < len(self.keys) <= MOST_KEYS:
+            raise FaceDiffError(f"{self.source}: holds {len(self.keys)} keys; expected 1 to {MOST_KEYS}")
         ordered = sorted(self.keys, key=lambda key: key.time)
         taken: set[tuple[str, float]] = set()
         for key in ordered:
@@ -292,14 +286,13 @@ class Direction:
             content = {"keys": content}
         if not isinstance(content, dict) or not isinstance(content.get("keys"), list):
             raise FaceDiffError(f'{source}: keys: expected an object with a list of rows called "keys"')
-        fields = ("format", "version", "frame_rate", "instead_of", "keys")
-        for name in content:
-            if name not in fields:
-                raise FaceDiffError(f"{source}: {shown(name)}: {choices(str(name), fields)}")
-        if content.get("format", FORMAT) != FORMAT:
-            raise FaceDiffError(f'{source}: format {shown(content["format"])}: expected "{FORMAT}"')
-        if content.get("version", VERSION) != VERSION:
-            raise FaceDiffError(f"{source}: version {shown(content['version'])}: this facediff reads {VERSION}")
+        stated = (content.get("format", FORMAT), content.get("version", VERSION))
+        unknown = sorted(content.keys() - {"format", "version", "frame_rate", "instead_of", "keys"})
+        if unknown or stated != (FORMAT, VERSION):
+            raise FaceDiffError(
+                f"{source}: is {' '.join(map(shown, stated))} with {quoted(unknown)}; expected {FORMAT} {VERSION} with "
+                f"format, version, frame_rate, instead_of and keys alone"
+            )
         frame_rate = content.get("frame_rate", frame_rate)
         if frame_rate is not None and frame_rate not in Range(*FRAME_RATES):
             raise FaceDiffError(
@@ -367,8 +360,6 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
     if not path.is_file():
         raise FaceDiffError(f"{path}: no such file; expected keys over time, .json or .csv, or {', '.join(MOODS)}")
     suffix = path.suffix.lower()
-    if suffix == ".json":
-        return Direction.parse(load_json(path), str(path), frame_rate)
     if suffix == ".csv":
         return Direction(tuple(_read_keys(_csv_rows(path), str(path), frame_rate)), str(path))
     if suffix == ".npz":
@@ -378,7 +369,7 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
         if text is None:
             raise FaceDiffError(f"{path}: was made without a direction; give keys over time, .json or .csv")
         return Direction.parse(text, str(path), frame_rate)
-    raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected .json, .csv or .npz')
+    return Direction.parse(load_json(path), str(path), frame_rate)
 
 
 def direction_of(animation: Animation) -> Direction | None:
@@ -403,12 +394,8 @@ def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     remedy = "expected a table with the columns time (or frame), channel, value and interpolation"
     rows = read_table(path, remedy=remedy)
     header = [name.strip().lower() for name in next(rows, [])]
-    for name in header:
-        if name not in COLUMNS or header.count(name) > 1:
-            raise FaceDiffError(f"{path}: row 1: column {quoted(name)}: {choices(name, COLUMNS)}, each once")
-    for name in ("channel", "value"):
-        if name not in header:
-            raise FaceDiffError(f"{path}: row 1: has no column {name}; {remedy}")
+    if not {"channel", "value"} <= set(header) <= set(COLUMNS) or len(set(header)) < len(header):
+        raise FaceDiffError(f"{path}: row 1: has the columns {quoted(header)}; {remedy}, each once")
     for number, row in enumerate(rows, 2):
         if len(row) > len(header) and any(cell.strip() for cell in row[len(header) :]):
             raise FaceDiffError(f"{path}: row {number}: has {len(row)} cells for {len(header)} columns; quote commas")
@@ -419,31 +406,17 @@ def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 def _read_keys(rows: Iterable[tuple[int, object]], source: str, frame_rate: float | None) -> Iterator[Key]:
     """Keys of rows with their numbers; texts that stand for numbers are read."""
-    at: dict[tuple[str, float], int] = {}
     for number, row in rows:
         try:
-            key = _read_key(row, frame_rate)
+            yield _read_key(row, frame_rate)
         except FaceDiffError as error:
             raise FaceDiffError(f"{source}: row {number}: {error}") from error
-        if (before := at.setdefault((key.channel, key.time), number)) != number:
-            raise FaceDiffError(
-                f"{source}: row {number}: time {key.time:g}: {key.channel} has a key then in row {before} already; "
-                f"keep one of them"
-            )
-        yield key
 
 
 def _read_key(row: object, frame_rate: float | None) -> Key:
-    if not isinstance(row, Mapping):
-        raise FaceDiffError(f"is {shown(row)}; expected an object with time, channel and value")
-    for name in row:
-        if name not in COLUMNS:
-            raise FaceDiffError(f"{shown(name)}: {choices(str(name), COLUMNS)}")
-    for name in ("channel", "value"):
-        if name not in row:
-            raise FaceDiffError(f"{name}: is missing")
-    if ("time" in row) == ("frame" in row):
-        raise FaceDiffError("time: expected either a time or a frame")
+    fits = isinstance(row, Mapping) and {"channel", "value"} <= row.keys() <= set(COLUMNS)
+    if not isinstance(row, Mapping) or not fits or ("time" in row) == ("frame" in row):
+        raise FaceDiffError(f"is {shown(row)}; expected {', '.join(COLUMNS)}, with either a time or a frame")
     channel, value, slope = row["channel"], row["value"], row.get("slope")
     if isinstance(channel, str):
         limits = channel_of(channel).range

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.arrays import open_array, read_arrays
-from facediff.utils.limits import quoted
 from facediff.utils.numerics import smooth_step
 from facediff.utils.plain_files import load_json
 
@@ -93,20 +92,14 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
     ``.npz`` holds the same as arrays: ``closing`` (V, 3), ``neutral`` (V, 3), and ``brows`` and any ``eyeball…`` with
     indices.
     """
-    if not path.is_file():
-        raise OptionError.naming(
-            f"{{eyes}} {path}: no such file; expected .json or .npz that says where lids and eyeballs are"
-        )
     if path.suffix.lower() == ".npz":
         arrays = read_arrays(path, name=f"eyes {path}")
         names = sorted(name for name in arrays if name.startswith("eyeball"))
         balls = tuple(_checked(path, arrays[name], len(template)) for name in names)
         closing, neutral = arrays.get("closing"), arrays.get("neutral")
         brows = _checked(path, arrays["brows"], len(template)) if "brows" in arrays else None
-    elif path.suffix.lower() == ".json":
-        closing, neutral, balls, brows = _read_json(path, template)
     else:
-        raise OptionError.naming(f"{{eyes}} {path}: expected .json or .npz")
+        closing, neutral, balls, brows = _read_json(path, template)
     if closing is None and not balls and brows is None:
         raise OptionError.naming(
             f"{{eyes}} {path}: says nothing of lids or eyeballs, nor of brows; known are {', '.join(KEYS)}"
@@ -131,12 +124,13 @@ def _read_json(
 ) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...], Indices | None]:
     """How the lids shut, by shapes or by edges; the open face; eyeballs; brows. None where the file does not say."""
     content = load_json(path, name=f"eyes {path}")
-    fit = isinstance(content, dict) and all(isinstance(content.get(key, []), list) for key in KEYS[1:])
-    unknown = [key for key in content if key not in KEYS] if fit else []
-    if not fit or unknown or not isinstance(content.get("neutral", ""), str):
+    lids_fit = isinstance(content, dict) and all(
+        isinstance(lid, dict) and {"upper", "lower"} <= lid.keys() for lid in content.get("lids", [])
+    )
+    if not lids_fit or not content.keys() <= set(KEYS):
         raise OptionError.naming(
-            f"{{eyes}} {path}: expected an object with {', '.join(KEYS)}, all but the first of them lists"
-            + (f', not "{unknown[0]}"' if unknown else "")
+            f"{{eyes}} {path}: expected an object with {', '.join(KEYS)} alone, all but the first of them lists, and "
+            f'"lids" of {{"upper": …, "lower": …}}'
         )
     count = len(template)
     balls = tuple(_indices(path, listed, count) for listed in content.get("eyeballs", []))
@@ -149,39 +143,28 @@ def _read_json(
         total: Vertices = np.zeros((count, 3))
         for name in content["blinks"]:
             shape = _read_shape(path, name)
-            absolute = Path(str(name)).suffix.lower() != ".npy"
-            if absolute and neutral is None:
+            absolute = Path(name).suffix.lower() != ".npy"
+            if len(shape) != count or (absolute and (neutral is None or len(neutral) != count)):
                 raise OptionError.naming(
-                    f'{{eyes}} {path}: "{name}" is a whole face; give the open one as "neutral" as well'
+                    f'{{eyes}} {path}: "{name}" has {len(shape)} vertices and the face {count}; give the open face of '
+                    f'the same mesh as "neutral"'
                 )
-            if len(shape) != count or (neutral is not None and len(neutral) != count):
-                raise OptionError.naming(f'{{eyes}} {path}: "{name}" has {len(shape)} vertices, the face {count}')
             total = total + (shape - neutral if absolute and neutral is not None else shape)
         return total, neutral, balls, brows
     if content.get("lids"):
-        try:
-            sides = [(lid["upper"], lid["lower"]) for lid in content["lids"]]
-        except (TypeError, KeyError) as error:
-            raise OptionError.naming(
-                f'{{eyes}} {path}: expected "lids" as a list of {{"upper": …, "lower": …}}'
-            ) from error
-        edges = [(_indices(path, upper, count), _indices(path, lower, count)) for upper, lower in sides]
+        edges = [(_indices(path, lid["upper"], count), _indices(path, lid["lower"], count)) for lid in content["lids"]]
         return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls, brows
     return None, neutral, balls, brows
 
 
-def _read_shape(path: Path, name: object) -> Vertices:
+def _read_shape(path: Path, name: str) -> Vertices:
     """Vertices of a mesh, or displacements (V, 3) of a .npy file, that the eyes' file names."""
     from facediff.mesh import read_mesh
 
-    if not isinstance(name, str):
-        raise OptionError.naming(f"{{eyes}} {path}: {quoted(name)} is no file name; expected meshes or .npy files")
     file = path.parent / name
     if file.suffix.lower() != ".npy":
         return read_mesh(file).vertices
     array = open_array(file, kinds="f", name=f"eyes {path}: {file}")
-    if array.size % 3:
-        raise OptionError.naming(f"{{eyes}} {path}: {file} has shape {array.shape}; expected displacements (V, 3)")
     return np.asarray(array.reshape(-1, 3), np.float64)
 
 

@@ -89,10 +89,6 @@ class FrameSolver:
         Args:
             offsets: (V, 3) of the vertices from the neutral face.
         """
-        if offsets.shape != self.shapes.neutral.shape:
-            raise FaceDiffError(
-                f"frame: has offsets of shape {offsets.shape}; expected {self.shapes.neutral.shape} as the shapes have"
-            )
         used = offsets if self._all else offsets[self._used]
         right = self._projection @ used.reshape(-1).astype(np.float64)
         if not np.isfinite(right).all():

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.editing.bounded import Array, least_squares
-from facediff.errors import FaceDiffError
 
 TemporalTerm = Literal["published", "corrected"]
 """How a weight is held near the last frame's: ``published`` has its factor of 100 on the left side only, which shrinks
@@ -84,10 +83,6 @@ class RegularisedSolver:
         offsets: Sequence[float] | None = None,
     ) -> None:
         count = len(deltas)
-        if deltas.shape[1:] != neutral.shape or neutral.ndim != 2:
-            raise FaceDiffError(
-                f"shapes: have the shape {deltas.shape} and the face {neutral.shape}; expected one size"
-            )
         self.neutral, self.options = neutral, regularisation or Regularisation()
         self._rows: Any = slice(None) if mask is None or not len(mask) else np.asarray(mask, np.int64)
         used = np.ones(count, bool) if active is None else np.asarray(active, bool)
@@ -117,10 +112,6 @@ class RegularisedSolver:
 
     def solve(self, vertices: npt.NDArray[np.floating]) -> Array:
         """Weights (T, K) of a motion, absolute vertices (T, V, 3); the face at rest goes before the first frame."""
-        if vertices.ndim != 3 or vertices.shape[1:] != self.neutral.shape:
-            raise FaceDiffError(
-                f"vertices: have the shape {vertices.shape}; expected (frames, {len(self.neutral)}, 3) as the shapes"
-            )
         weights = np.zeros((len(vertices), len(self._factor)))
         last = np.zeros(len(self._used))
         towards = self._scale * self.options.temporal * (TEMPORAL if self.options.temporal_term == "corrected" else 1.0)

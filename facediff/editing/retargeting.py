@@ -84,15 +84,10 @@ def retarget(
         return upright(carried, correspondence), correspondence
 
     if correspondence_path is not None and correspondence_path.exists():
-        if landmarks_path is not None:
+        if landmarks_path is not None or parts:
+            option = "{landmarks}" if landmarks_path is not None else "{part}"
             raise OptionError.naming(
-                f"{{landmarks}} {landmarks_path}: {correspondence_path} exists and would be used without them; remove "
-                f"it, or omit the landmarks"
-            )
-        if parts:
-            raise OptionError.naming(
-                f"{{part}} {parts[0]}: {correspondence_path} exists and would be used without it; remove that file, or "
-                f"omit the part"
+                f"{option}: {correspondence_path} exists and would be used without it; remove that file, or omit it"
             )
         correspondence = load_correspondence(correspondence_path)
         refuse_other_mesh(
@@ -101,8 +96,6 @@ def retarget(
         refuse_other_face(str(mesh_path), mesh.vertices, correspondence.target_vertices)
         return judged(correspondence)
     if correspondence_path is not None:
-        if correspondence_path.suffix != ".npz":
-            raise OptionError.naming(f"{{correspondence}} {correspondence_path}: expected a name that ends in .npz")
         check_writable(correspondence_path)
     # Everything that can be wrong with the options is found before the meshes are compared, which takes seconds.
     landmarks = None
@@ -503,16 +496,11 @@ def save_correspondence(path: Path, correspondence: Correspondence) -> None:
 
 def load_correspondence(path: Path) -> Correspondence:
     """Read what :func:`save_correspondence` wrote."""
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected a correspondence that `facediff retarget` wrote")
     held = read_arrays(path)
-    if "format" not in held:
-        raise FaceDiffError(f"{path}: is no correspondence; expected one that `facediff retarget` wrote")
-    check_format(path, str(held["format"]), FORMAT)
+    check_format(path, str(held.get("format")), FORMAT)
     for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():
-        if name not in held:
-            raise FaceDiffError(f"{path}: has no {name}; make a new correspondence")
-        if held[name].dtype.kind != kind or held[name].ndim != axes or not np.isfinite(held[name]).all():
+        array = held.get(name, np.array(None))
+        if array.dtype.kind != kind or array.ndim != axes or not np.isfinite(array).all():
             raise FaceDiffError(f"{path}: its {name} are damaged; make a new correspondence")
     correspondence = Correspondence(
         **{name: held[name] for name in ARRAYS if name != "lids"},

@@ -76,18 +76,7 @@ def write_animations(
     options = options or ExportOptions()
     check_export(path, options, len(animations), weights=seeks_weights(path, options) and have_weights(animations))
     if path.suffix.lower() == ".fbx":
-        names = [path] if len(animations) == 1 else _targets(path, FORMATS[".glb"], len(animations))
-        sounds = [
-            _speech_file(name, FORMATS[".glb"], one, options) for name, one in zip(names, animations, strict=True)
-        ]
-        glb = partial(write_animations, options=options, into=into, own_shapes=own_shapes)
-        files: list[Path] = []
-        with scratch_folder(path) as hidden:
-            for name, animation, sound in zip(names, animations, sounds, strict=True):
-                files += write_fbx(name, hidden, animation, sound, partial(glb, animations=[animation]))
-            for file in files:
-                put_in_place(file, path.with_name(file.name))
-        return [path.with_name(file.name) for file in files]
+        return _write_fbx(path, animations, options, into, own_shapes)
     form = FORMATS[path.suffix]
     if z_up and options.up is None and "z" in form.up_axes:
         options = replace(options, up="z")
@@ -126,14 +115,30 @@ def write_animations(
             raise FaceDiffError(str(error).replace(str(hidden), str(path.parent))) from error
         written = sorted(hidden.iterdir())
         for file in written:
-            if (goal := path.with_name(file.name)).exists() and goal.is_dir() != file.is_dir():
-                raise FaceDiffError(f"{goal}: is in the way; move it, or choose another -o")
+            goal = path.with_name(file.name)
             if file.suffix in (*PICTURE_SUFFIXES, ".mtl") and file not in [hidden / target.name for target in targets]:
                 check_free(goal)  # a material and its picture have not been named by the user
         for file in written:
             put_in_place(file, path.with_name(file.name))
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]
     return [path.with_name(name) for name in [*first, *(file.name for file in written if file.name not in first)]]
+
+
+def _write_fbx(
+    path: Path, animations: Sequence[Animation], options: ExportOptions, into: Path | None, own_shapes: bool
+) -> list[Path]:
+    """Files that Blender makes of .glb ones; the arguments are those of :func:`write_animations`."""
+    form = FORMATS[".glb"]
+    names = _targets(path, form, len(animations))
+    sounds = [_speech_file(name, form, one, options) for name, one in zip(names, animations, strict=True)]
+    glb = partial(write_animations, options=options, into=into, own_shapes=own_shapes)
+    files: list[Path] = []
+    with scratch_folder(path) as hidden:
+        for name, animation, sound in zip(names, animations, sounds, strict=True):
+            files += write_fbx(name, hidden, animation, sound, partial(glb, animations=[animation]))
+        for file in files:
+            put_in_place(file, path.with_name(file.name))
+    return [path.with_name(file.name) for file in files]
 
 
 def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, weights: bool = False) -> None:
@@ -146,25 +151,18 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         weights: whether the animations have, or may have, weights of ARKit's shapes by themselves.
     """
     suffix = path.suffix
-    if not suffix:
-        raise FaceDiffError(f"{path}: has no suffix, which chooses the format; add one, such as {path.name}.glb")
     if suffix.lower() == ".fbx":
         refuse_without_blender(path)
         check_writable(path)
         path, suffix = path.with_suffix(".glb"), ".glb"
     if suffix not in FORMATS:
         raise FaceDiffError(f'{path}: there is no format "{suffix}": {choices(suffix.lower(), FORMATS)}')
-    if n_animations < 1:
-        raise FaceDiffError(f"{path}: there is no animation to write; give at least one")
     form = FORMATS[suffix]
     if options.output_unit is not None:
         metres = metres_per_unit(options.output_unit)
-        if form.units == "none":
-            raise FaceDiffError(f"{path}: {suffix} holds no lengths; omit the unit")
-        if form.units == "m" and metres != 1:
-            raise FaceDiffError(
-                f"{path}: {suffix} is in metres by its standard; omit the unit, and scale in the program that reads it"
-            )
+        if form.units == "none" or (form.units == "m" and metres != 1):
+            reason = "holds no lengths" if form.units == "none" else "is in metres by its standard"
+            raise FaceDiffError(f"{path}: {suffix} {reason}; omit the unit")
     if options.up is not None and options.up not in form.up_axes:
         reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
         raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")

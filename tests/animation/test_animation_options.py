@@ -14,13 +14,9 @@ from facediff.animation.options import (
     AnimationOptions,
     ExportKeywords,
     ExportOptions,
-    RecordingOptions,
-    TargetOptions,
     WindowOptions,
     option_texts,
 )
-from facediff.errors import OptionError
-from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_STEPS
 
 # The model is there already, where an animation is asked for.
 OF_THE_MODEL = {"checkpoint", "quiet", "device", "commercial_only", "threads"}
@@ -48,36 +44,6 @@ def test_every_option_has_a_text_and_belongs_to_one_group() -> None:
     names = [field.name for group in GROUPS for field in dataclasses.fields(group)]
     assert len(names) == len(set(names))
     assert {*option_texts(AnimationOptions)} == {*names, "checkpoint", "quiet"}
-
-
-def test_low_latency_is_described_by_its_figures() -> None:
-    text = option_texts(WindowOptions)["low_latency"]
-    assert f"{LOW_LATENCY.after:g} s of look-ahead" in text
-    assert LOW_LATENCY_STEPS == 2
-    assert "two denoising steps" in text
-
-
-@pytest.mark.parametrize(
-    ("group", "options", "option"),
-    [
-        (WindowOptions, {"low_latency": True, "window": 1.0}, "low_latency"),
-        (WindowOptions, {"window": "long"}, "window"),
-        (RecordingOptions, {"alignment": "a.csv", "transcript": "hello"}, "alignment"),
-        (RecordingOptions, {"closure_budget": 3.0}, "closure_budget"),
-        (RecordingOptions, {"denoise": "yes"}, "denoise"),
-        (RecordingOptions, {"voice_shift": 13}, "voice_shift"),
-        (TargetOptions, {"correspondence": "map.npz"}, "correspondence"),
-        (AnimationControls, {"blinks": 1000}, "blinks"),
-        (ExportOptions, {"view": "back"}, "view"),
-    ],
-)
-def test_wrong_options_are_carried_by_the_error(group: type, options: dict[str, object], option: str) -> None:
-    with pytest.raises(OptionError) as caught:
-        group(**options)
-    assert caught.value.option == option
-    assert str(caught.value).startswith(option)
-    assert caught.value.on_command_line.startswith(f"--{option.replace('_', '-')}")
-    assert "{" not in str(caught.value)
 
 
 def test_groups_are_merged_and_know_what_was_changed() -> None:

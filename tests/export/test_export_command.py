@@ -12,7 +12,6 @@ import trimesh
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
-from facediff.export import FORMATS
 
 
 def test_archive_needs_no_further_options(
@@ -66,40 +65,3 @@ def test_animations_of_one_recording_are_named_after_their_files(animation: Anim
     page = tmp_path / "page.html"
     assert main(["export", str(tmp_path / "mine.npz"), str(tmp_path / "theirs.npz"), "-o", str(page)]) == 0
     assert "<title>mine · theirs – facediff</title>" in page.read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["a.npz", "-o", "a.fbx"], "glb_to_fbx.py"),
-        (["a.npz", "-o", "a.abc"], 'there is no format ".abc"'),
-        (["a.npz", "-o", "a.csv"], "give --shapes"),
-        (["a.npz", "-o", "a.usdc", "--shapes", "."], "--shapes: has no effect on .usdc"),
-        (["a.npz", "-o", "a.glb", "--shapes", "none"], "--shapes none: no such"),
-        (
-            ["a.npz", "-o", "a.glb", "--shapes", "puppet", "--tolerance", "1"],
-            "--tolerance: has no effect with --shapes",
-        ),
-        (["a.npz", "-o", "a.glb", "--key-tolerance", "0.1"], "--key-tolerance: has no effect without --shapes"),
-        (["missing.npz", "-o", "a.npy"], "missing.npz: no such file"),
-        (["a.npz", "-o", "a.mp4", "--up", "z"], ".mp4 holds no axes"),
-    ],
-)
-def test_refusals_are_one_sentence(
-    words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.npz").touch()
-    assert main(["export", *words]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert sentence in said.err
-    assert len(said.err.splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
-
-
-def test_the_help_lists_the_formats(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["export", "--help"])
-    said = capsys.readouterr().out
-    assert all(f"  {suffix} " in said and made.help in said for suffix, made in FORMATS.items())

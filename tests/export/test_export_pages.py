@@ -44,12 +44,6 @@ def test_commands_are_understood(command: str) -> None:
     assert output.suffix in FORMATS or "$" in command
 
 
-def test_links_lead_somewhere() -> None:
-    for page in PAGES:
-        for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-            assert (page.parent / link).exists(), f"{page.name}: {link}"
-
-
 def test_the_picture_is_drawn_from_the_file_alone(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

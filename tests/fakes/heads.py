@@ -22,7 +22,6 @@ from tests.fakes.small_face import CONTROLS, LANDMARKS, Shape, build_face, build
 
 Mesh = tuple[np.ndarray, np.ndarray]
 INTERIOR = ("lip_roll", "mouth_bag", "mouth_back")
-TEETH = ("teeth_upper_0", "teeth_upper_1", "teeth_lower_0", "teeth_lower_1")
 
 
 @dataclass

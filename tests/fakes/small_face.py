@@ -14,7 +14,6 @@ import numpy as np
 
 from facediff.synthetic.head.people import Face
 
-N_VERTICES = 1008
 FILE = Path(__file__).with_suffix(".npz")
 SOFT_CONTACT = 0.0004  # Metres by half of which the lips press into one another
 

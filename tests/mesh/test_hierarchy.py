@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.mesh import hierarchy as module
 from facediff.mesh.hierarchy import MeshHierarchy, coarsen, mesh_hierarchy
 from facediff.mesh.spirals import spirals
 from tests.fakes.meshes import relief, sphere, together
 
-ROOT = Path(__file__).parents[2]
 MESH = relief(16, 18)
 
 
@@ -141,28 +137,6 @@ def test_the_usual_folder_and_none_to_write_to(
     assert len(count) == 6
 
 
-def test_two_processes_write_one_file(tmp_path: Path) -> None:
-    program = (
-        "import sys; from pathlib import Path\n"
-        "from facediff.mesh.hierarchy import mesh_hierarchy\n"
-        "from tests.fakes.meshes import relief\n"
-        "made = mesh_hierarchy(*relief(16, 18), cache=Path(sys.argv[1]))\n"
-        "assert [level.n_vertices for level in made.levels] == [288, 72, 18, 5]"
-    )
-    runs = [
-        subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stderr=subprocess.PIPE)
-        for _ in range(3)
-    ]
-    for run in runs:
-        _, error = run.communicate(timeout=100)
-        assert run.returncode == 0, error
-    [file] = tmp_path.iterdir()  # one file, nothing half-written next to it
-    here = mesh_hierarchy(*MESH, cache=tmp_path / "here")
-    assert file.read_bytes() == next((tmp_path / "here").iterdir()).read_bytes()
-    with np.load(file, allow_pickle=False) as stored:
-        assert same(MeshHierarchy.from_arrays(dict(stored)), here)
-
-
 def test_a_face_without_its_eyeballs(tmp_path: Path) -> None:
     ball, corners = sphere(5, 6)
     points, faces = together((0.1 * ball, corners), MESH, (0.1 * ball + 3, corners))
@@ -174,16 +148,3 @@ def test_a_face_without_its_eyeballs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(part.vertices, chosen)
     np.testing.assert_equal([asdict(level) for level in part.levels], [asdict(level) for level in alone.levels])
     assert same(mesh_hierarchy(points, faces, vertices=chosen, cache=tmp_path), part)
-
-
-def test_arrays_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    arrays = mesh_hierarchy(*MESH, cache=tmp_path).arrays()
-    wrong = [
-        arrays | {"n_vertices": np.array(5)},
-        arrays | {"1.spirals": arrays["1.spirals"] + 60},
-        arrays | {"0.up.weights": arrays["0.up.weights"][:-1]},
-        {},
-    ]
-    for named in wrong:
-        with pytest.raises(FaceDiffError, match="mesh hierarchy: its arrays"):
-            MeshHierarchy.from_arrays(named)

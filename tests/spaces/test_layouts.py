@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from facediff.spaces import Space, layout
 from facediff.spaces.arkit import ARKIT
-from facediff.spaces.layouts import LAYOUTS, layouts_of_width
+from facediff.spaces.layouts import LAYOUTS
 
 
 def test_every_layout_is_a_space_that_survives_its_plain_form() -> None:
@@ -26,14 +26,3 @@ def test_arkit_orders_are_one_alphabet() -> None:
     assert layout("arkit").channels[-1] == "tongueOut"
     assert layout("mediapipe").channels[0] == "_neutral"
     assert layout("live_link").head == (52, 53, 54)
-
-
-def test_layouts_of_a_width_include_the_pairs_that_are_mixed_up() -> None:
-    widths = {54: "flame_diffposetalk_model", 106: "flame_artalk", 108: "flame_unils", 413: "unitalker_d5"}
-    for width, name in widths.items():
-        assert layouts_of_width(width) == (name,)
-    assert {"flame_dualtalk", "flame_dualtalk_truth", "flame_diffposetalk"} <= set(layouts_of_width(56))
-    assert layout("flame_dualtalk").head == (53, 54, 55)
-    assert layout("flame_dualtalk_truth").head == (50, 51, 52)
-    assert set(layouts_of_width(103)) == {"flame_emote", "flame_beat2"}
-    assert layouts_of_width(403) == ("flame_3dmead",)

@@ -82,25 +82,6 @@ def test_ipa_is_taken_as_it_is(tmp_path: Path) -> None:
     assert [p.ipa for p in phones_of(path)] == ["", "y", "tʃ"]  # the ARPAbet's y would be j
 
 
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        (short_format(("words", WORDS)), "no tier of phones .its tiers: words"),
-        (short_format(("phones", [*PHONES[:3], (0.7, 1.4, "M")])), "tier phones goes back in time at 0.7"),
-        (short_format(("phones", [*PHONES[:5], (1.1, 1.4, "QX")])), '"QX"'),
-        (short_format(("phones", PHONES))[:-30], "tier phones is cut short"),
-        (short_format(("phones", [(0.0, 1.4, "")])), "pauses only"),
-        ('File type = "ooTextFile"\nObject class = "PitchTier"\n', "no TextGrid"),
-    ],
-)
-def test_errors_name_file_and_tier(content: str, named: str, tmp_path: Path) -> None:
-    path = tmp_path / "spoilt.TextGrid"
-    path.write_text(content)
-    with pytest.raises(FaceDiffError, match=named) as caught:
-        phones_of(path)
-    assert "spoilt.TextGrid" in str(caught.value)
-
-
 def test_a_recording_is_a_voice(people: Path) -> None:
     voice = open_voice(f"aligned:{people / '174' / 'a-1'}")
     spoken = voice.speak("whatever", Delivery(rate=2.0))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.errors import FaceDiffError
 from facediff.synthetic.voices import Delivery, coloured_speech, installed_voices, open_voice
 
 FLITE = """#!{python}
@@ -84,15 +83,6 @@ def test_festivals_voices_speak_in_the_phones_of_their_language(
     assert [phoneme.ipa for phoneme in italian] == ["", "tʃ", "ɛ", "7", "b", ""]
     assert [phoneme.ipa for phoneme in finnish] == ["", "tS", "E", "ø", "b", ""]
     assert [phoneme.end for phoneme in italian] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-
-
-@pytest.mark.parametrize(
-    ("name", "named"),
-    [("flite:nobody", "slt"), ("flite", "SYNTHESISER:VOICE"), ("festival:kal_diphone", "install"), ("nope:x", "nope")],
-)
-def test_a_voice_that_is_not_there_is_named(flite: Path, name: str, named: str) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        open_voice(name)
 
 
 def test_espeak_speaks_alike_and_faster_on_demand() -> None:

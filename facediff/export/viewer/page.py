@@ -121,20 +121,14 @@ def check_page(animations: Sequence[Animation], truth: int | None) -> None:
         raise FaceDiffError(
             f"a page shows 1 to {MOST_ANIMATIONS} animations side by side, not {len(animations)}; choose among them"
         )
-    if truth is not None and not 0 <= truth < len(animations):
-        raise FaceDiffError(f"truth is number {truth} of {len(animations)} animations; number them from 0")
     first = animations[0]
     for animation in animations:
         name, count = animation.name, len(animation.template)
-        if animation.frame_rate != first.frame_rate:
+        if animation.frame_rate != first.frame_rate or len(animation.vertices) != len(first.vertices):
             raise FaceDiffError(
-                f"{name}: has {animation.frame_rate:g} frames a second and {first.name} {first.frame_rate:g}; "
-                f"animations on one page need the same frame rate"
-            )
-        if len(animation.vertices) != len(first.vertices):
-            raise FaceDiffError(
-                f"{name}: has {len(animation.vertices)} frames and {first.name} {len(first.vertices)}; animations on "
-                f"one page need the same length: cut them, as `facediff view --shortest` does"
+                f"{name}: has {len(animation.vertices)} frames at {animation.frame_rate:g} a second and {first.name} "
+                f"{len(first.vertices)} at {first.frame_rate:g}; animations on one page need the same length and frame "
+                f"rate: cut them, as `facediff view --shortest` does"
             )
         check_animation(animation)
         pairs = animation.inner_lip_pairs

@@ -112,15 +112,6 @@ def test_the_picture_of_the_worst_frame_leaves_the_heads_motion_out(
     assert f"0 to {weights.residual_max_mm[weights.residual_rms_mm.argmax()]:.2g} mm" in residual.label
 
 
-def test_a_plain_table_within_other_bounds(folder: Path, archive: Path, tmp_path: Path) -> None:
-    out = tmp_path / "weights.csv"
-    words = ["blendshapes", str(archive), "-o", str(out), "--shapes", str(folder), "--plain", "--bounds", "0", "0.5"]
-    assert main([*words, "--symmetry", "0.1"]) == 0
-    table = np.genfromtxt(out, delimiter=",", names=True)
-    assert table["jawOpen"].max() == pytest.approx(0.5)
-    assert table["residual_max_mm"].max() > 1
-
-
 def test_rows_at_another_rate_lie_on_the_curve(
     folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path
 ) -> None:

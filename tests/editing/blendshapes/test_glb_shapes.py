@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.cli.app import main
 from facediff.editing.blendshapes import SolveOptions, solve
 from facediff.editing.retargeting import retarget_shapes
 from facediff.editing.shapes import read_shapes
@@ -18,7 +17,6 @@ from facediff.spaces.shape_files import read_shape_files
 from tests.editing.retarget.test_avatar_round_trip import opened
 from tests.fakes.avatar import AvatarPart, avatar_parts, write_avatar
 from tests.fakes.heads import talking
-from tests.fakes.meshes import relief
 
 LOOK = "eyeLookUpLeft"
 
@@ -87,23 +85,3 @@ def test_an_avatars_shapes_are_carried_to_another_face(tmp_path: Path, parts: di
     weights = solve(animation, found, SolveOptions())
     assert weights.values[:4, weights.names.index("jawOpen")] == pytest.approx([0, 0.3, 0.7, 1], abs=0.1)
     assert (weights.residual_rms_mm[3] / weights.amplitude_mm) < 0.5
-
-
-def test_a_table_without_any_of_its_columns_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    points, faces = relief(8, 7)
-    bump = np.exp(-np.square(points / 0.4).sum(axis=1))[:, None] * [0, 0.1, 0.05]
-    some = {"viseme_aa": bump, "viseme_oo": bump[:, [1, 0, 2]]}
-    part = AvatarPart(points, faces, some)
-    write_avatar(tmp_path / "a.glb", {"Head": part}, unit=1.0, z_up=False, skinned=False, animated=False)
-    rest = read_mesh(tmp_path / "a.glb").vertices
-    np.save(tmp_path / "m.npy", (rest + np.array([0, 0.5, 1])[:, None, None] * bump).astype(np.float32))
-    monkeypatch.chdir(tmp_path)
-    words = ["blendshapes", "m.npy", "-o", "w.csv", "--shapes", "a.glb", "--mesh", "a.glb", "--frame-rate", "25"]
-    assert main(words) == 2
-    assert "viseme_aa" in capsys.readouterr().err
-    assert not (tmp_path / "w.csv").exists()
-    assert main([*words, "--plain"]) == 0
-    table = np.genfromtxt(tmp_path / "w.csv", delimiter=",", names=True)
-    assert table["viseme_aa"] == pytest.approx([0, 0.5, 1], abs=0.05)

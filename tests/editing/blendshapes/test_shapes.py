@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -81,11 +79,6 @@ def test_shapes_in_another_unit_and_with_z_up_are_laid_onto_the_template(folder:
     assert any("scaled by 0.01" in note for note in made.notes)
 
 
-def test_another_speakers_shapes_of_the_same_topology_are_used_as_they_are(folder: Path) -> None:
-    """A head that is a tenth larger does not scale the movements."""
-    check(read_shapes(folder, 1.1 * GRID))
-
-
 def test_without_a_neutral_face_the_template_is_it(tmp_path: Path) -> None:
     deltas = {f"shape{k}": np.where(np.arange(36)[:, None] % 9 == k, RNG.normal(0, 0.01, (36, 3)), 0) for k in range(9)}
     for name, delta in deltas.items():
@@ -131,33 +124,3 @@ def test_parts_of_one_mesh_are_put_together(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(pack(gltf, binary))
     made = read_shapes(tmp_path / "a.glb", np.concatenate([GRID, GRID]))
     assert made.deltas[:, :36] == pytest.approx(made.deltas[:, 36:])
-
-
-def edited(change: dict[tuple[str | int, ...], Any]) -> bytes:
-    gltf, binary = glb_with_targets(GRID, FACES, DELTAS, sparse=True)
-    gltf = copy.deepcopy(gltf)
-    for path, value in change.items():
-        at: Any = gltf
-        for step in path[:-1]:
-            at = at[step]
-        at[path[-1]] = value
-    return pack(gltf, binary)
-
-
-def test_no_bytes_of_a_glb_do_more_than_fail(tmp_path: Path) -> None:
-    """Cut anywhere, or with bytes of the JSON changed, a file is read or refused, and nothing else."""
-    whole = edited({})
-    file = tmp_path / "a.glb"
-    for length in range(0, len(whole), 97):
-        file.write_bytes(whole[:length])
-        with pytest.raises(FaceDiffError, match="a.glb"):
-            read_shapes(file, GRID)
-    for _ in range(300):
-        spoilt = bytearray(whole)
-        for place in RNG.integers(12, len(whole) // 2, 3):
-            spoilt[place] = RNG.choice(bytearray(b'0123456789-,:"[]{}e\xff'))
-        file.write_bytes(spoilt)
-        try:
-            read_shapes(file, GRID)
-        except FaceDiffError as error:
-            assert "a.glb" in str(error)  # noqa: PT017 - most of these files are refused, some are not

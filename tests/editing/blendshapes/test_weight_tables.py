@@ -149,12 +149,3 @@ def test_another_rate_keeps_the_curve(weights: Weights) -> None:
     assert (len(slower.values) - 1) / 25 <= 69 / 30 < len(slower.values) / 25
     with pytest.raises(FaceDiffError, match="frame_rate"):
         weights.at_rate(0.0)
-
-
-def test_both_files_or_none(tmp_path: Path, weights: Weights) -> None:
-    (tmp_path / "a.json").mkdir()
-    with pytest.raises(FaceDiffError, match=r"a\.json: is a folder"):
-        write_live_link(tmp_path / "a.csv", weights)
-    assert [file.name for file in tmp_path.iterdir() if file.is_file()] == []
-    with pytest.raises(FaceDiffError, match=r"expected a table \.csv"):
-        write_live_link(tmp_path / "a.txt", weights)

@@ -75,18 +75,6 @@ def test_all_options_in_their_order(make_animation: Callable[..., Animation], ey
         apply_controls(made, parsed("--blinks"))
 
 
-def test_a_topology_without_known_eyes_names_the_option(make_animation: Callable[..., Animation]) -> None:
-    animation = replace(make_animation(2), faces=None)
-    for option in ("--blinks", "--gaze"):
-        with pytest.raises(FaceDiffError, match=f"{option[2:]}: needs to know where lids and eyeballs are.*give eyes"):
-            apply_controls(animation, parsed(option))
-    assert (
-        apply_controls(animation, parsed("--sway", "--expressiveness", "1.2"))
-        .metadata["procedural"]
-        .startswith("head sway")
-    )
-
-
 def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     both = Direction([Key(0, "lids", 0.5)], instead_of=("acting", "blinks")).save(tmp_path / "both.json")
     blinks = Direction([Key(0, "lids", 0.5)], instead_of=("blinks",)).save(tmp_path / "blinks.json")

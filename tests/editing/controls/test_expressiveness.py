@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.expressiveness import FALL_OFF, read_factors, region_factors, scale_regions
+from facediff.editing.expressiveness import FALL_OFF, region_factors, scale_regions
 from facediff.editing.eyes import Eyes
 
 
@@ -39,12 +38,6 @@ def test_a_region_gets_its_own_factor_and_what_is_far_the_rest(make_animation: C
     far = np.linalg.norm(animation.template[:, None] - animation.template[both], axis=-1).min(1) > FALL_OFF * size
     assert far.sum() > 200
     np.testing.assert_allclose(after[far], 1.1 * before[far], atol=1e-7)
-
-
-def test_a_region_without_vertices_changes_nothing(make_animation: Callable[..., Animation]) -> None:
-    animation = make_animation(2, jawOpen=0.7)
-    bare = replace(animation, regions={**animation.regions, "upper_face": np.zeros(0, np.int64)})
-    np.testing.assert_allclose(scale_regions(bare, {"upper_face": 3.0}).vertices, animation.vertices, atol=1e-7)
 
 
 @pytest.mark.parametrize("factors", [{"lips": 4.0}, {"upper_face": 3.0, "lips": 0.0}, {"upper_face": 2.0, "all": 0.5}])
@@ -90,15 +83,3 @@ def test_a_blink_stays_a_blink_where_the_lids_are_known(make_animation: Callable
     ours = (seeing.vertices[0] - seeing.template)[lids]
     np.testing.assert_allclose(ours[strong], reference[strong], atol=3e-4)
     np.testing.assert_allclose((blind.vertices[0] - blind.template)[lids], reference + closing, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("words", "factors"),
-    [
-        ("1.2", {"all": 1.2}),
-        ("upper_face=1.5, lips=0.9", {"upper_face": 1.5, "lips": 0.9}),
-        ("lips=2,1.1", {"lips": 2.0, "all": 1.1}),
-    ],
-)
-def test_words(words: str, factors: dict[str, float]) -> None:
-    assert read_factors(words) == factors

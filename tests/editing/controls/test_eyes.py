@@ -135,33 +135,6 @@ def test_eyes_from_the_lids_edges_alone(eyes_folder: Path, make_animation: Calla
     assert np.linalg.norm(found.closing, axis=1).max() < 0.015
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ("no json", "not readable as JSON"),
-        ("[1]", "expected an object with neutral, blinks, lids, eyeballs"),
-        ('{"eyes": []}', 'not "eyes"'),
-        ("{}", "says nothing of lids or eyeballs"),
-        ('{"blinks": ["eyeBlinkLeft.obj"]}', 'give the open one as "neutral" as well'),
-        ('{"blinks": ["none.obj"], "neutral": "neutral.obj"}', "no such mesh file"),
-        ('{"eyeballs": [[1, 2, 99999]]}', "vertex indices from 0 to 5874"),
-        ('{"eyeballs": [[1, 2]]}', "an eyeball of less than four vertices"),
-        ('{"eyeballs": ["masks.pkl:left_eye"]}', 'has no mask "left_eye": did you mean "left_eyeball"'),
-        ('{"lids": [{"upper": [1, 2, 3]}]}', 'expected "lids" as a list'),
-        ('{"lids": [[1, 2], [3]]}', 'expected "lids" as a list'),
-    ],
-)
-def test_wrong_eyes_files_are_refused(
-    content: str, sentence: str, eyes_folder: Path, make_animation: Callable[..., Animation]
-) -> None:
-    path = eyes_folder / "bad.json"
-    path.write_text(content)
-    with pytest.raises(FaceDiffError) as caught:
-        read_eyes(path, make_animation(1).template)
-    assert sentence in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
-
-
 def test_blinks_in_another_unit_and_of_another_topology(
     eyes_folder: Path, make_animation: Callable[..., Animation], eyes: Eyes
 ) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import fast_simplification
 import numpy as np
 import pytest
 import trimesh
 
-from facediff.animation import Animation, write_archive
-from facediff.cli.app import main
+from facediff.animation import Animation
 from facediff.editing import face_features
 from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
@@ -170,32 +168,6 @@ def test_wrecks_of_eyes_and_forehead_are_named(animation: Animation) -> None:
     eyes = check_fit(blind, carry(blind, found, whole), found).eyes
     assert eyes is not None
     assert eyes.lid_gap is None  # an animation that does not blink says nothing of the lids
-
-
-@pytest.mark.slow
-def test_the_command_refuses_and_accepts(
-    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A puppet without a cut between its lips: refused, drawn, and written where that is asked for."""
-    monkeypatch.chdir(tmp_path)
-    write_archive(tmp_path / "a.npz", animation)
-    _, first, place = np.unique(
-        np.rint(1e6 * animation.template.astype(np.float64)), axis=0, return_index=True, return_inverse=True
-    )
-    faces = first[place.reshape(-1)][animation.triangles] + 1
-    text = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in animation.template] + [f"f {a} {b} {c}" for a, b, c in faces]
-    (tmp_path / "sealed.obj").write_text("\n".join(text) + "\n")
-    words = ["retarget", "a.npz", "--target-mesh", "sealed.obj", "-o", "out.npz", "--correspondence", "map.npz"]
-    assert main([*words, "--show", "p.png"]) == 2
-    said = capsys.readouterr().err
-    assert "sealed.obj" in said
-    assert "lips" in said
-    assert (tmp_path / "p.png").exists()
-    assert not (tmp_path / "out.npz").exists()
-    assert not (tmp_path / "map.npz").exists()
-    assert main([*words, "--accept-poor"]) == 0
-    assert "WARNING" in capsys.readouterr().out
-    assert (tmp_path / "out.npz").exists()
 
 
 def test_a_beard_over_the_mouth_is_not_the_face(animation: Animation) -> None:

@@ -139,40 +139,6 @@ def test_names_stand_for_vertices_where_the_topology_is_known(tmp_path: Path) ->
     assert read_landmarks(tmp_path / "a.json", known).nearest_vertices.tolist() == [[tip, 4034]]
 
 
-def test_landmarks_of_other_meshes_and_names_that_are_none_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "marks.json"
-    write_landmarks(path, some(), 1008, 42)
-    assert len(read_landmarks(path, counts=(1008, 42))) == 2
-    for counts, mesh in (((1008, 43), "target mesh of 42"), ((42, 42), "source mesh of 1008")):
-        with pytest.raises(FaceDiffError, match=mesh):
-            read_landmarks(path, counts=counts)
-    (tmp_path / "a.csv").write_text("source,target\nnose_tpi,4\n")
-    with pytest.raises(FaceDiffError, match="nose_tip"):
-        read_landmarks(tmp_path / "a.csv", known_topology(FACE.vertices))
-
-
-WRONG = {
-    "no object": [1],
-    "no format": {"landmarks": []},
-    "a later format": {"format": "facediff landmarks 2", "landmarks": []},
-    "no landmarks": {"format": "facediff landmarks 1"},
-    "none of them": {"format": "facediff landmarks 1", "landmarks": []},
-    "no name": {"format": "facediff landmarks 1", "landmarks": [{"source": 1, "target": 2}]},
-    **{
-        words: {"format": "facediff landmarks 1", "landmarks": [{"name": "a", "source": 1, "target": place}]}
-        for words, place in {
-            "a negative vertex": -1,
-            "half a vertex": 0.5,
-            "yes": True,
-            "no place": None,
-            "two corners": {"corners": [1, 2], "weights": [0.5, 0.5]},
-            "weights beyond the triangle": {"corners": [1, 2, 3], "weights": [2.0, -0.5, -0.5]},
-            "weights of another sum": {"corners": [1, 2, 3], "weights": [0.1, 0.1, 0.1]},
-        }.items()
-    },
-}
-
-
 # What they do.
 
 
@@ -266,8 +232,3 @@ def test_pairs_that_contradict_each_other_are_refused(pairs: list[tuple[int, int
     for name in ("a.json", "a.csv"):
         with pytest.raises(FaceDiffError, match=f"pairs 1 and {len(pairs)}"):
             read_landmarks(tmp_path / name)
-
-
-def test_a_pair_that_is_repeated_is_no_contradiction(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("1,2\n3,4\n1,2\n")
-    assert len(read_landmarks(tmp_path / "a.csv")) == 3

@@ -16,8 +16,6 @@ from facediff.mesh.glb import open_glb
 from facediff.render import Look
 from tests.fakes.avatar import File
 
-TARGET = ("--target-mesh", "face.obj")
-
 
 @pytest.fixture
 def animation(tmp_path: Path) -> Animation:
@@ -74,26 +72,6 @@ def test_retarget_writes_an_animation_on_another_mesh(
     assert (tmp_path / "map.npz").read_bytes() == kept
     assert np.array_equal(retarget(animation, face, tmp_path / "map.npz")[0].vertices, made.vertices)
     assert np.array_equal(retarget(animation, face)[0].vertices, made.vertices)
-
-
-def test_retarget_names_a_reordered_mesh(
-    animation: Animation,
-    face: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = ["retarget", "take.npz", "--target-mesh", "face.obj", "--correspondence", "map.npz", "-o"]
-    assert main([*words, "out.npz"]) == 0
-    mesh = trimesh.creation.icosphere(2)
-    order = np.random.default_rng(0).permutation(len(mesh.vertices))
-    write_obj(face, np.array(mesh.vertices)[order] * [80, 120, 100], np.argsort(order)[mesh.faces])
-    assert main([*words, "other.npz"]) == 2
-    said = capsys.readouterr().err
-    assert "face.obj: " in said
-    assert "reordered" in said
-    assert not (tmp_path / "other.npz").exists()
 
 
 def as_z_up(points: np.ndarray) -> np.ndarray:

@@ -240,36 +240,6 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
         assert keys_in(page).rows() == wanted.rows()
 
 
-def test_keys_are_added_and_moved_by_a_finger(show: Show) -> None:
-    page = show([directed(Direction([Key(1.0, "expressiveness", 2.0)]))], width=760, height=800)
-    page.send("Emulation.setTouchEmulationEnabled", enabled=True)
-
-    def touch(*points: tuple[float, float]) -> None:
-        """A finger is put down, goes from point to point, and is lifted."""
-        for k, (x, y) in enumerate(points):
-            page.send(
-                "Input.dispatchTouchEvent", type="touchMove" if k else "touchStart", touchPoints=[{"x": x, "y": y}]
-            )
-        page.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-
-    # A fingertip lies next to the key by more than a mouse would.
-    (left, top), end = at(page, "expressiveness", 1.0, 0.5), at(page, "expressiveness", 1.4, 0.75)
-    touch((left + 12, top), ((left + end[0]) / 2, (top + end[1]) / 2), end)
-    (key,) = keys_in(page).channels["expressiveness"]
-    assert key.time == pytest.approx(1.4)
-    assert key.value == pytest.approx(3.0, abs=0.1)
-    place = at(page, "expressiveness", 0.4, 0.25)
-
-    def added() -> bool:
-        """Tap twice: the browser takes taps that a busy machine brings late for single ones. On a key they add none."""
-        touch(place)
-        touch(place)
-        return len(keys_in(page).channels["expressiveness"]) > 1
-
-    wait_until(added)
-    assert [key.time for key in keys_in(page).channels["expressiveness"]] == [0.4, 1.4]
-
-
 def test_preview_of_changed_keys_is_what_a_new_run_makes(show: Show) -> None:
     """The page starts from the take that was made with old keys; the other way is from the bare motion."""
     bare = directed(Direction([Key(0, "head.roll", 0.0)]))
@@ -454,63 +424,6 @@ def test_shapes_brows_and_lids_are_previewed_and_acting_becomes_keys(show: Show,
     assert keys_in(page).rows() == read_direction("sad").rows()
     sad = bare.control(direction="sad", blinks=40, acting="prosody", controls_seed=3)
     assert furthest(sad, numbers[:2]) < 0.1
-
-
-@pytest.mark.slow  # a picture for every look
-def test_takes_are_compared_in_one_panel(show: Show) -> None:
-    green = np.repeat(np.array([[20, 20, 220], [20, 220, 20], [20, 220, 20]], np.uint8), 4, axis=0)
-    page = show([clicks(name="A"), clicks(name="a"), replace(clicks(name="B"), colours=green)], width=600, height=500)
-    page.evaluate("second.value = '2', second.dispatchEvent(new Event('change')), facediff.seek(1)")
-    see = """(async (x) => {
-      facediff.turn(0, 0);
-      await new Promise(requestAnimationFrame);
-      const gl = view.getContext("webgl2"), colour = new Uint8Array(4);
-      const [wide, high] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
-      gl.readPixels(Math.floor(x * wide), Math.floor(0.45 * high), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, colour);
-      return colour[0] > colour[1] ? "A" : "B";
-    })"""
-
-    def seen() -> list[str]:
-        return [page.evaluate(f"{see}({x})") for x in (0.45, 0.55)]
-
-    found = {}
-    for layout in ("switch", "wipe", "overlay"):
-        page.evaluate(f"facediff.compare('{layout}')")
-        before = seen()
-        page.press("x")
-        found[layout] = (before, seen())
-        page.press("x")
-    assert found == {
-        "switch": (["A", "A"], ["B", "B"]),
-        "wipe": (["A", "B"], ["B", "A"]),
-        "overlay": (["A", "A"], ["B", "B"]),
-    }
-    assert page.evaluate("[...document.querySelectorAll('.letter')].map((each) => each.textContent)")[::2] == ["A", "B"]
-    page.evaluate("(facediff.compare('wipe'), divider.focus())")
-    press(page, "End")
-    assert page.evaluate("divider.ariaValueNow") == "100"
-    assert seen() == ["A", "A"]
-    page.evaluate("facediff.compare('blink')")
-    page.wait_for("facediff.views[0].number === 2")
-    page.wait_for("facediff.views[0].number === 0")
-    page.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
-    page.wait_for("layout.value === 'switch'")
-    page.evaluate("facediff.compare('blink')")
-    assert page.evaluate("[layout.value, layout.querySelector('[value=blink]').disabled]") == ["switch", True]
-    still = page.evaluate("getComputedStyle(view).transitionDuration")
-    assert still == "0s"
-    count = """(async () => {
-      facediff.turn(0, 0);
-      await new Promise(requestAnimationFrame);
-      const gl = view.getContext("webgl2"), { width, height } = view, all = new Uint8Array(4 * width * height);
-      gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, all);
-      return all.reduce((sum, value) => sum + value, 0);
-    })()"""
-    plain = page.evaluate(count)
-    page.press("e")
-    assert page.evaluate(count) != plain
-    page.press("e")
-    assert page.evaluate(count) == plain
 
 
 def test_a_take_is_downloaded_as_an_archive_that_the_command_line_reads(show: Show, tmp_path: Path) -> None:

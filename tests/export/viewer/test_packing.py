@@ -238,37 +238,6 @@ def test_page_is_the_same_every_time(tmp_path: Path) -> None:
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
-def nan_at(animation: Animation, frame: int) -> Animation:
-    vertices = animation.vertices.copy()
-    vertices[frame, 2, 1] = np.nan
-    return replace(animation, vertices=vertices)
-
-
-@pytest.mark.parametrize(
-    ("animations", "words"),
-    [
-        ([], "1 to 4 animations side by side, not 0"),
-        ([random_animation(0)] * 5, "1 to 4 animations side by side, not 5"),
-        ([replace(random_animation(0), faces=None)], "random 0: comes without a mesh"),
-        ([nan_at(random_animation(0), 41)], "random 0: frame 41 holds NaN"),
-        ([random_animation(0), random_animation(1, frames=69)], "random 1: has 69 frames and random 0 70"),
-        (
-            [random_animation(0), replace(random_animation(1), frame_rate=25)],
-            "random 1: has 25 frames a second and random 0 30",
-        ),
-        ([replace(random_animation(0), inner_lip_pairs=np.array([[0, 9]]))], "go up to vertex 9 of 9"),
-        ([random_animation(0, unit="1000")], "away from its template; give the unit"),
-    ],
-)
-def test_page_that_cannot_be_shown_is_one_sentence_and_no_file(
-    tmp_path: Path, animations: list[Animation], words: str
-) -> None:
-    with pytest.raises(FaceDiffError, match=words) as error:
-        write_page(tmp_path / "a.html", animations)
-    assert "\n" not in str(error.value)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_page_above_the_limit_is_refused_and_the_old_one_stays(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     write_page(path, [random_animation(0)])

@@ -11,7 +11,6 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from facediff.animation import write_archive
 from facediff.editing.landmarks import NAMES, read_landmarks
 from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, picking_page
 from facediff.mesh import Mesh
-from facediff.mesh.parts import MeshPart
 from facediff.utils.server import LOOPBACK, names_of
 from tests.fakes.chromium import Chromium, Page
 from tests.fakes.heads import LONG, talking
@@ -255,65 +253,4 @@ def test_points_are_picked_mirrored_taken_back_and_saved(serve: Serve, picking: 
     for name, point in zip(saved.names, saved.target.points(rest), strict=True):
         if name != "point 1":
             assert np.linalg.norm(point - rest[own(name)]) < 2.0
-    page.close()
-
-
-@pytest.mark.slow
-def test_parts_can_be_hidden(serve: Serve, picking: Picking, browser: Chromium) -> None:
-    """A plate before the face takes the clicks until it is hidden."""
-    face = other_face()
-    x, y, z = face.vertices.T
-    plate = [[sign * 90, up * 120 + y.mean(), z.max() + 10] for sign, up in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    count = len(face.vertices)
-    faces = np.concatenate([face.faces, [[count, count + 1, count + 2], [count, count + 2, count + 3]]])
-    parts = [
-        MeshPart(("Face", "Skin"), np.arange(len(face.faces))),
-        MeshPart(("Plate",), len(face.faces) + np.arange(2)),
-    ]
-    mesh = Mesh(np.concatenate([face.vertices, plate]), faces.astype(np.int32))
-    both = replace(picking, target=mesh, shown=parts[0].triangles, parts=parts)
-    page = browser.open(f"{serve(''.join(picking_page(both)))}/", width=1100, height=800)
-    page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
-    boxes = "[...document.querySelectorAll('#target .parts input')]"
-    assert page.evaluate(f"{boxes}.map((box) => box.parentElement.textContent.trim())") == ["Face", "Plate"]
-
-    def corners() -> list[int]:
-        choose(page, "chin")
-        click(page, "target", own("chin"))
-        point = next(point for point in page.evaluate("facediffPicking.points") if point["name"] == "chin")
-        return list(point["target"]["corners"])
-
-    assert min(corners()) >= count
-    page.evaluate(f"{boxes}[1].click()")
-    assert max(corners()) < count
-    page.evaluate(f"{boxes}[1].click()")
-    assert min(corners()) >= count
-    assert page.problems == page.evaluate("facediffPicking.errors") == []
-    page.close()
-
-
-@pytest.mark.slow
-def test_the_box_around_a_face_turns_with_it(serve: Serve, picking: Picking, browser: Chromium) -> None:
-    """Where a face lies on its side, a wide picture has room for a larger one."""
-    page = browser.open(f"{serve(''.join(picking_page(picking)))}/", width=1700, height=500)
-    page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
-    target = "document.querySelector('#target {}')"
-
-    def mouth() -> float:
-        """Width of the mouth in pixels."""
-        ends = [3 * own(name) for name in ("mouth_corner_left", "mouth_corner_right")]
-        left, right = (
-            page.evaluate(f"facediffPicking.seen('target', facediffPicking.positions('target').slice({i}, {i} + 3))")
-            for i in ends
-        )
-        return float(np.hypot(left[0] - right[0], left[1] - right[1]))
-
-    before = mouth()
-    turn = target.format('[data-turn="2"]') + ".dispatchEvent(new MouseEvent('click', { shiftKey: true }))"
-    for _ in range(6):  # 15 degrees
-        page.evaluate(turn)
-    page.evaluate(f"{target.format('[data-action=whole]')}.click()")
-    assert page.evaluate(f"{target.format('.face')}.clientWidth > 1.3 * {target.format('.face')}.clientHeight")
-    assert 1.2 < mouth() / before < 1.9 / 1.5
-    assert page.problems == page.evaluate("facediffPicking.errors") == []
     page.close()

@@ -135,14 +135,3 @@ def test_a_style_of_artalk_is_one_tensor(tmp_path: Path) -> None:
     (tmp_path / "hostile.pt").write_bytes(b"\x80\x04cos\nsystem\n(S'true'\ntR.")
     with pytest.raises(FaceDiffError, match=r"hostile\.pt"):
         read_parameters(tmp_path / "hostile.pt", layout="flame_artalk")
-
-
-def test_a_layout_of_archives_is_not_written_as_one_array(tmp_path: Path) -> None:
-    space = LAYOUTS["flame_3dmead_release"].space
-    clip = ParameterClip("a", np.zeros((2, len(space.channels)), np.float32), space, 25.0)
-    with pytest.raises(FaceDiffError, match=r"expected \.npz"):
-        write_parameters(tmp_path / "a.npy", clip, layout="flame_3dmead_release")
-    assert not list(tmp_path.iterdir())
-    write_parameters(tmp_path / "a.npz", clip, layout="flame_3dmead_release")
-    again = read_parameters(tmp_path / "a.npz", layout="flame_3dmead_release")
-    np.testing.assert_array_equal(again.values, clip.values)
