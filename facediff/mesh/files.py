@@ -96,8 +96,7 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
 
 def _colours(shares: Array) -> npt.NDArray[np.uint8]:
     """Colours (V, 3) that a text says, from 0 to 1 or to 255."""
-    if not np.isfinite(shares).all():
-        raise ValueError("its colours are not finite")
+    shares = np.nan_to_num(shares)
     if shares.max(initial=0) >= 2:  # some tools write bytes; a little above 1 is a rounding
         shares = shares / 255
     return np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
@@ -110,8 +109,6 @@ def _triangles(lines: bytes, n_vertices: int) -> Triangles:
     triangles = []
     for line in lines.splitlines():
         corners = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
-        if len(corners) < 3:
-            raise ValueError("a face has fewer than three corners")
         corners = [corner - 1 if corner > 0 else n_vertices + corner for corner in corners]
         triangles += [(corners[0], b, c) for b, c in zip(corners[1:-1], corners[2:], strict=True)]
     return _checked(np.array(triangles, np.int64), n_vertices)
@@ -130,8 +127,6 @@ def _cut(polygons: npt.NDArray[Any] | Sequence[Sequence[int]], n_vertices: int) 
         lengths = np.full(len(polygons), polygons.shape[1], np.int64)
     else:
         lengths = np.array([len(polygon) for polygon in polygons], np.int64)
-    if lengths.size and lengths.min() < 3:
-        raise ValueError("a face has fewer than three corners")
     parts = [np.zeros((0, 3), np.int64)]
     for length in (3, 4):
         places = np.flatnonzero(lengths == length)
@@ -180,8 +175,6 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
     points: Array = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], 1)
     faces = columns.get("face", {})
     names = [name for name in faces if name in ("vertex_index", "vertex_indices") or len(faces) == 1]
-    if faces and not names:
-        raise ValueError("its faces have no vertex_indices")
     types = {name: kind for element in elements if element.name == "vertex" for name, kind, _ in element.properties}
     colours = None
     if {"red", "green", "blue"} <= vertex.keys():
@@ -189,9 +182,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
         kind = types["red"][1:]  # after the order of its bytes
         if kind == "u2" or (kind[0] == "f" and table.max(initial=0) <= 1):  # some tools write bytes as floats
             table *= 255 / (65535 if kind == "u2" else 1)
-        if table.size and not (table.min() >= 0 and table.max() <= 255):
-            raise ValueError("its colours are out of range")
-        colours = np.rint(table).astype(np.uint8)
+        colours = np.rint(table.clip(0, 255)).astype(np.uint8)
     return Mesh(points, _cut(faces[names[0]] if names else [], len(points)), colours)
 
 
@@ -354,8 +345,6 @@ def _read_off(data: bytes, path: Path) -> Mesh:
     if head is None:
         raise ValueError("it does not begin with OFF")
     lines = [cells for line in data[head.end() :].splitlines() if (cells := line.partition(b"#")[0].split())]
-    if not lines or len(lines[0]) < 2:
-        raise ValueError("it does not say how many vertices and faces it has")
     n_vertices, n_faces = int(lines[0][0]), int(lines[0][1])
     if len(lines) < 1 + n_vertices + n_faces:
         raise ValueError(f"it is cut short: its {n_vertices} vertices and {n_faces} faces are not all there")

@@ -299,9 +299,11 @@ def _dense(state: Mapping[Any, Any], kind: str, where: str) -> Values:
     else:
         ends = np.asarray(state["indptr"], np.int64)
         minor = np.asarray(state["indices"], np.int64)
+        if ends[-1] != len(minor):
+            raise ValueError("ends that do not fit the data")
         major = np.searchsorted(ends, np.arange(len(minor)), side="right") - 1  # of the data's size in any case
         row, column = (minor, major) if kind == "csc" else (major, minor)
-    if len(row) != len(data) or (len(data) and min(row.min(), column.min()) < 0):
+    if len(row) != len(data) or len(column) != len(data) or (len(data) and min(row.min(), column.min()) < 0):
         raise ValueError("indices that do not fit the data")
     dense = np.zeros((rows, columns))
     np.add.at(dense, (row, column), data)

@@ -164,7 +164,7 @@ def placed_nodes(glb: Glb) -> dict[int, Array | None]:
     if not nodes:
         return {}
     placed: dict[int, Array | None] = {}
-    queue: list[tuple[object, Array | None]] = [(root, None) for root in roots]
+    queue: list[tuple[Any, Array | None]] = [(root, None) for root in roots]
     while queue:
         index, parent = queue.pop()
         node = glb.entry("nodes", index)

@@ -165,6 +165,8 @@ def decode_flame(flame: Flame, values: Values, space: Space, shape: Values | Non
         shape: (S,) the person's coefficients; the mean face if None.
     """
     check_values(values, space)
+    if space.kind != "flame":
+        raise FaceDiffError(f"motion: is in a space of {space.kind}; expected FLAME's coefficients")
     expression = np.zeros((len(values), EXPRESSIONS))
     for column, name in enumerate(space.channels):
         family, _, index = name.rpartition("_")

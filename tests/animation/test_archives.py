@@ -66,10 +66,9 @@ def test_numbers_become_single_precision(held: dict[str, Any], tmp_path: Path, o
     assert np.array_equal(animation.faces, held["faces"])
 
 
-@pytest.mark.parametrize("name", ["vertices", "template"])
-def test_a_motion_that_is_not_finite_is_not_written(tmp_path: Path, name: str) -> None:
+def test_a_motion_that_is_not_finite_is_not_written(tmp_path: Path) -> None:
     animation = clicks()
-    getattr(animation, name)[..., 0] = np.nan
+    animation.vertices[1, 0] = np.nan
     with pytest.raises(FaceDiffError, match="NaN"):
         write_archive(tmp_path / "a.npz", animation)
     assert not (tmp_path / "a.npz").exists()

@@ -141,7 +141,6 @@ def test_frames_and_timecodes_are_seconds(tmp_path: Path) -> None:
         ({"frame": -1, "channel": LARGER, "value": 1}, "frame"),
         ({"time": 0, "channel": LARGER, "value": 1, "interpolation": "cubic"}, "interpolation"),
         ({"time": 0, "channel": LARGER, "value": 1, "slope": "steep"}, "slope"),
-        ({"time": 0, "channel": "style", "value": "a", "slope": 1}, "slope"),
         ({"time": 0, "channel": LARGER, "value": 1, "ease": 1}, "ease"),
         (3, "row 2"),
     ],
