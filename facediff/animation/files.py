@@ -17,7 +17,7 @@ from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
 from facediff.utils.hints import check_number
-from facediff.utils.limits import FRAME_RATES, SAMPLE_RATES, check_format, in_range, quoted
+from facediff.utils.limits import FRAME_RATES, SAMPLE_RATES, check_format, quoted
 from facediff.utils.plain_files import json_text, parse_json
 
 T = TypeVar("T")

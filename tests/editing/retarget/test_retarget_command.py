@@ -16,6 +16,8 @@ from facediff.mesh.glb import open_glb
 from facediff.render import Look
 from tests.fakes.avatar import File
 
+TARGET = ("--target-mesh", "face.obj")
+
 
 @pytest.fixture
 def animation(tmp_path: Path) -> Animation:
@@ -171,12 +173,12 @@ def test_plain_materials_of_a_glb_colour_what_is_no_glb(
     [
         (["take.npz", "--target-mesh", "flat.obj", "-o", "o.npz"], "flat.obj: target mesh: 3 vertices"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.csv"], "weights need shapes; write .npz"),
-        (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "take.npz"], "no correspondence"),
-        (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "frame 0 holds NaN"),
+        (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "take.npz"], "expected 'facediff correspondence"),
+        (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "hold NaN"),
         (["bare.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "error: bare: comes without"),
         (
             ["take.npz", *TARGET, "-o", "o.npz", "--landmarks", "l.csv", "--correspondence", "take.npz"],
-            "would be used without them",
+            "would be used without it",
         ),
     ],
 )
