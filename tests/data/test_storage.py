@@ -14,7 +14,6 @@ import torch
 from facediff.data.corpus import Corpus
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import quoted
-from tests.fakes.channels import TinyChannels, write_channels
 from tests.speech.test_audio import wave
 
 FACE = np.random.default_rng(0).normal(size=(9, 3))
@@ -75,21 +74,3 @@ def test_weights_are_averaged_and_projected_as_their_vertices_are(tmp_path: Path
     for read in (opened.mean_motion, lambda clip: opened.read_projected(clip, torch.relu, kept)):
         with pytest.raises(FaceDiffError, match=r"A_01\.npy: frame 7"):
             read(clip)
-
-
-@pytest.mark.parametrize("kind", ["c8", "?", "i4", "S4"])
-def test_motion_of_another_kind_is_refused(kind: str, tmp_path: Path) -> None:
-    opened = corpus(tmp_path)
-    np.save(tmp_path / "vertices_npy" / "A_01.npy", np.zeros((25, 27)).astype(kind))
-    with pytest.raises(FaceDiffError, match=r"A_01\.npy"):
-        opened.read_motion(opened.clips["A_01"])
-
-
-@pytest.mark.parametrize("values", [np.zeros((5, 4), "f4"), np.zeros(6, "f4"), np.full((5, 6), np.nan, "f4")])
-def test_channels_of_another_width_or_not_finite_are_refused_by_name(values: object, tmp_path: Path) -> None:
-    data = TinyChannels(root=str(write_channels(tmp_path / "channels")))
-    clip = data.corpus.clips["A_e01"]
-    assert data.corpus.read_motion(clip, 2, 5).shape == (3, 6, 1)
-    np.save(tmp_path / "channels" / "values_npy" / "A_e01.npy", values)
-    with pytest.raises(FaceDiffError, match=r"A_e01\.npy"):
-        data.corpus.read_motion(clip)

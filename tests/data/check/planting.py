@@ -69,24 +69,9 @@ def write_manifest(root: Path, **fields: object) -> None:
     (root / "manifest.json").write_text(json.dumps(fields))
 
 
-def swap_for_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
 def swap_for_pipe(path: Path) -> None:
     path.unlink()
     os.mkfifo(path)
-
-
-def swap_for_broken_link(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("nowhere")
-
-
-def swap_for_archive(path: Path) -> None:
-    with path.open("wb") as stream:
-        np.savez(stream, a=np.ones(3))
 
 
 def wide(array: np.ndarray) -> np.ndarray:

@@ -29,9 +29,6 @@ from tests.data.check.planting import (
     set_rows,
     silent_header,
     sound,
-    swap_for_archive,
-    swap_for_broken_link,
-    swap_for_folder,
     swap_for_pipe,
     wide,
     write_manifest,
@@ -60,37 +57,19 @@ Plant = Callable[[Path], object]
 ERRORS: list[tuple[str, Plant, set[str], str]] = [
     ("motion cut short", lambda r: cut_bytes(motion(r), 100), {"motion_unreadable"}, "not a readable"),
     ("motion of text", lambda r: motion(r).write_text("no motion\n" * 20), {"motion_unreadable"}, "not a readable"),
-    ("motion of no bytes", lambda r: motion(r).write_bytes(b""), {"motion_unreadable"}, "not a readable"),
-    (
-        "motion header only",
-        lambda r: motion(r).write_bytes(motion(r).read_bytes()[:60]),
-        {"motion_unreadable"},
-        "not a readable",
-    ),
-    ("motion is a folder", lambda r: swap_for_folder(motion(r)), {"motion_unreadable"}, "no regular file"),
     ("motion is a pipe", lambda r: swap_for_pipe(motion(r)), {"motion_unreadable"}, "no regular file"),
-    ("motion links nowhere", lambda r: swap_for_broken_link(motion(r)), {"motion_unreadable"}, "no regular file"),
-    ("motion is an archive", lambda r: swap_for_archive(motion(r)), {"motion_unreadable"}, "archive"),
     ("motion of whole numbers", lambda r: change(motion(r), lambda a: a.astype(int)), {"motion_dtype"}, "int64"),
-    ("motion without frames", lambda r: change(motion(r), lambda a: a[:0]), {"motion_empty"}, "no frame"),
     (
         "one clip of another topology",
         lambda r: change(motion(r), wide),
         {"motion_shape", "mixed_vertex_counts"},
         f"{VERTICES + 6} vertices",
     ),
-    ("motion of no vertices", lambda r: change(motion(r), lambda a: a[:, :71]), {"motion_shape"}, "(26, 71)"),
     (
         "NaN frames",
         lambda r: change(motion(r), lambda a: set_rows(a, [5, 9], np.nan)),
         {"motion_not_finite"},
         f"2 of {FRAMES} frames hold NaN or infinity, the first is frame 5",
-    ),
-    (
-        "infinite frame beyond the first chunk",
-        lambda r: change(motion(r), lambda a: set_rows(a, [20], np.inf)),
-        {"motion_not_finite"},
-        "1 of 26 frames hold NaN or infinity, the first is frame 20",
     ),
     ("still motion", lambda r: change(motion(r), lambda a: a[:1].repeat(FRAMES, 0)), {"motion_still"}, "never moves"),
     (
@@ -111,9 +90,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         {"motion_copied"},
         "vertices_npy/B_e07.npy",
     ),
-    ("sound of no bytes", lambda r: sound(r).write_bytes(b""), {"sound_empty"}, "empty"),
     ("sound of text", lambda r: sound(r).write_text("no sound\n" * 20), {"sound_unreadable"}, "not a readable"),
-    ("sound is a pipe", lambda r: swap_for_pipe(sound(r)), {"sound_unreadable"}, "no regular file"),
     ("sound cut short", silent_header, {"sound_truncated"}, "20000 bytes are missing"),
     ("silence", lambda r: change_sound(sound(r), np.zeros_like), {"sound_silent"}, "silent"),
     (
@@ -129,9 +106,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         {"template_missing"},
         "no template of B, needed by 7 clips",
     ),
-    ("no templates", lambda r: (r / "templates.pkl").unlink(), {"templates_unreadable"}, "no such file"),
     ("templates of text", lambda r: (r / "templates.pkl").write_text("x"), {"templates_unreadable"}, "not a pickle"),
-    ("templates in a list", lambda r: change_templates(r, lambda t: list(t)), {"templates_unreadable"}, "got list"),
     (
         "NaN in a template",
         lambda r: change_templates(r, lambda t: t["A"].__setitem__((3, 1), np.nan)),
@@ -139,27 +114,12 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         "1 coordinates",
     ),
     (
-        "template of another topology",
-        lambda r: change_templates(r, lambda t: t.update(A=t["A"][:20])),
-        {"template_broken"},
-        "(20, 3)",
-    ),
-    (
-        "template of words",
-        lambda r: change_templates(r, lambda t: t.update(A="face")),
-        {"template_broken"},
-        "expected finite floating-point numbers",
-    ),
-    ("mesh of text", lambda r: (r / "tiny.ply").write_text("ply\n"), {"mesh_broken"}, "not a readable PLY mesh"),
-    (
         "mesh of another topology",
         lambda r: trimesh.creation.box().export(r / "tiny.ply"),
         {"mesh_broken"},
         "has 8 vertices, expected 24",
     ),
     ("no region", lambda r: (r / "regions" / "lve.txt").unlink(), {"region_missing"}, "data.lips=all"),
-    ("region index too high", lambda r: write_region(r, "1, 2, 24"), {"region_broken"}, "the index 24"),
-    ("region of words", lambda r: write_region(r, "1, two"), {"region_broken"}, "'two'"),
     (
         "lip pair too high",
         lambda r: (r / "regions" / "inner_lip_pairs.txt").write_text("0, 24\n"),
@@ -167,12 +127,6 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         "below 24",
     ),
     ("table without clips", lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"), {"clips_table"}, "no column clip"),
-    (
-        "table of bytes",
-        lambda r: (r / "clips.csv").write_bytes(b"\xff\xfe" * 9),
-        {"clips_table"},
-        "save it as CSV UTF-8",
-    ),
     ("no training clip", remove_training_clips, {"no_training_clip"}, "nothing can be trained"),
     (
         "manifest of text",
@@ -180,15 +134,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         {"manifest_unreadable"},
         "not readable as JSON",
     ),
-    (
-        "manifest too deep",
-        lambda r: (r / "manifest.json").write_text("[" * 10**5),
-        {"manifest_unreadable"},
-        "not readable as JSON",
-    ),
-    ("manifest of a list", lambda r: (r / "manifest.json").write_text("[]"), {"manifest_unreadable"}, "no JSON object"),
     ("odd frame rate", lambda r: write_manifest(r, frame_rate=26), {"frame_rate"}, "frame_rate is 26"),
-    ("frame rate of words", lambda r: write_manifest(r, frame_rate="fast"), {"frame_rate"}, "frame_rate is 'fast'"),
     (
         "twice the frame rate",
         lambda r: write_manifest(r, frame_rate=50),
@@ -327,22 +273,3 @@ def test_damaged_headers_of_all_sorts_are_reported(root: Path, capsys: pytest.Ca
             assert status == (0 if report["sound"] else 1)
         path.write_bytes(data)
     assert examined(root, capsys)[0] == 0
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"frame_rate": 1e-320, "person": "A"},
-        {"frame_rate": float("inf"), "person": "A", "n_vertices": 24},
-        {"frame_rate": float("nan"), "n_vertices": True, "corpus": ["tiny"]},
-        {"person": "A", "frame_rate": 25, "n_vertices": 10**30},
-        {"corpus": {"a": 1}, "files": {"a\0b": {}, "x" * 5000: {"bytes": 1}}},
-        {"files": {"wav": {"bytes": 4096}, "clips.csv": {"bytes": [], "sha256": {}}}},
-        {"files": [], "failed": 3, "missing": [1], "facediff": {}, "unit": [], "frame_rate": False},
-    ],
-)
-def test_no_manifest_ends_the_check(root: Path, capsys: pytest.CaptureFixture[str], fields: dict[str, object]) -> None:
-    write_manifest(root, **fields)
-    for options in ([], ["--json"], ["--corpus", "tests.fakes.tiny.Tiny"]):
-        assert run("data check", [str(root), "--quiet", *options]) in (0, 1)
-        assert capsys.readouterr().out.strip()

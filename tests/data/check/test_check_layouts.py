@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -94,13 +93,6 @@ def test_a_folder_that_is_not_recognised(tmp_path: Path, capsys: pytest.CaptureF
     assert "--corpus" in out
 
 
-def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="no such folder"):
-        run("data check", [str(tmp_path / "nowhere")])
-    with pytest.raises(FaceDiffError, match="--workers"):
-        run("data check", [str(tmp_path), "--workers", "0"])
-
-
 def test_a_persons_folder(copies: Path) -> None:
     """As ``facediff data import-person`` writes it: the vertices and splits are in its own files."""
     root = copies / "tiny"
@@ -163,20 +155,6 @@ def test_the_table_groups_equal_findings_and_names_the_first(copies: Path, capsy
     assert lines[-1] == "not sound: 9 errors"
     train = next(line for line in lines if line.startswith("train "))
     assert train.split() == ["train", "-", "8", "-", "140", "5.6"]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="file names of any bytes")
-def test_names_with_control_characters_are_escaped(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = copies / "tiny"
-    (root / "wav" / "a\x1b[2Jb.wav").write_bytes(b"")
-    (root / "wav" / "\x07c.mp3").write_bytes(b"")
-    (root / "wav" / os.fsdecode(b"\xff_e01.wav")).write_bytes(b"")
-    for options in ([], ["--json"]):
-        assert run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet", *options]) in (0, 1)
-        out = capsys.readouterr().out
-        assert "\x1b" not in out
-        assert "\x07" not in out
-        out.encode()
 
 
 def test_several_processes_find_the_same(copies: Path) -> None:

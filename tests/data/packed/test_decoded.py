@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from facediff.data.packed.decoded import VARIABLE, DecodedChunks
-from facediff.errors import FaceDiffError
 from tests.fakes.tiny import Tiny
 
 CHUNK = np.arange(1000, dtype=np.uint8)
@@ -72,10 +71,3 @@ def test_windows_are_equal_with_and_without_the_cache(
         one, other = (data.corpus.read_motion(clip, start, start + 30) for data in (cached, plain))
         assert torch.equal(one, other)
     assert cached.packed._decoded_chunks.bytes > 0
-
-
-@pytest.mark.parametrize("text", ["-1", "much", "inf"])
-def test_a_bound_that_is_none_is_refused(packed: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setenv(VARIABLE, text)
-    with pytest.raises(FaceDiffError, match=VARIABLE):
-        _ = Tiny(root=str(packed)).corpus

@@ -8,11 +8,8 @@ from pathlib import Path
 import pytest
 
 from facediff.data.check import check
-from facediff.data.corpus import read_templates
 from facediff.data.packed.packing import pack
-from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.unpacking import unpack
-from facediff.data.prepare.runner import write_templates
 from facediff.errors import FaceDiffError
 from tests.data.packed.damage import RECORD, TINY, change, read_all
 from tests.fakes.tiny import write_tiny
@@ -28,52 +25,30 @@ def packed(sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     ("key", "field", "value"),
     [
         (RECORD, "format", "facediff packed corpus 2"),
-        (RECORD, "format", "something else"),
-        (RECORD, "n_vertices", 0),
         (RECORD, "n_vertices", 25),
         (RECORD, "step", "0.1"),
-        (RECORD, "step", float("nan")),
         (RECORD, "step", 0),
-        (RECORD, "step", 0.0001),
         (RECORD, "tolerance", 0),
         (RECORD, "tolerance", 0.02),
-        (RECORD, "unit", "parsec"),
         (RECORD, "unit", "cm"),
         (RECORD, "frame_rate", 60),
-        (RECORD, "chunk_seconds", 5),
-        (RECORD, "clips", {}),
-        (RECORD, "arrays", []),
-        (RECORD, "identities", [3]),
         (RECORD, "identities", ["A", "B"]),
         (RECORD, "identities", ["A", "B", "D"]),
-        (RECORD, "identities", ["A", "A", "A"]),
-        (RECORD, "identities", ["A", "B", "C", "D"]),
         (RECORD, "identities", ["../../evil", "A", "B"]),
         (f"{RECORD}.clips.0", "first", 1),
-        (f"{RECORD}.clips.0", "first", 10**9),
         (f"{RECORD}.clips.0", "frames", 10**5),
-        (f"{RECORD}.clips.0", "frames", -1),
         (f"{RECORD}.clips.0", "coding", "object"),
         (f"{RECORD}.clips.0", "name", "../../evil"),
-        (f"{RECORD}.clips.0", "identity", "../../evil"),
         (f"{RECORD}.clips.0", "identity", "D"),
-        (f"{RECORD}.clips.0", "name", "a\nb"),
-        (f"{RECORD}.clips.0", "sound", None),
         (f"{RECORD}.clips.0.sound", "pieces", [10**12]),
-        (f"{RECORD}.clips.0.sound", "samples", 10**15),
         (f"{RECORD}.clips.0.sound", "form", "/../../x"),
         (f"{RECORD}.clips.0.sound", "bits", 3),
         (f"{RECORD}.files.0", "path", "../evil"),
         (f"{RECORD}.files.0", "path", "/etc/evil"),
-        (f"{RECORD}.files.0", "path", ".ssh/evil"),
-        (f"{RECORD}.files.0", "path", "a/../../evil"),
-        (f"{RECORD}.files.0", "path", "c:\\evil"),
         (f"{RECORD}.files.0", "bytes", 10**12),
         (f"{RECORD}.files.0", "sha256", "0" * 64),
         (f"{RECORD}.arrays.motion_int16", "rows", 10**14),
-        (f"{RECORD}.arrays.motion_int16", "chunk", 10**9),
         (f"{RECORD}.arrays.motion_int16", "chunk", 0),
-        (f"{RECORD}.arrays.motion_int16", "chunks", 10**9),
         (f"{RECORD}.arrays.motion_int16", "shards", [2]),
         (f"{RECORD}.arrays.motion_int16", "dtype", "object"),
         (f"{RECORD}.arrays.motion_int16", "width", 10**9),
@@ -99,14 +74,6 @@ def test_lossless_motion_is_of_the_type_that_it_is_coded_as(tmp_path: Path) -> N
         read_all(tmp_path / "corpus.zarr")
 
 
-def test_identities_that_are_no_names_of_files_are_not_packed(tmp_path: Path) -> None:
-    root = write_tiny(tmp_path / "corpus", sentences=1)
-    faces = {name: face.numpy() for name, face in read_templates(root / "templates.pkl").items()}
-    write_templates(root / "templates.pkl", {**faces, "../x": faces["A"]})
-    with pytest.raises(FaceDiffError, match=r"templates\.pkl.*plain names"):
-        pack(root, tmp_path / "corpus.zarr", corpus=TINY, workers=1)
-
-
 @pytest.mark.parametrize("text", [b"", b"[]", b"{", b'{"attributes": 3}', b"\xff", b"[" * 10**5])
 def test_metadata_of_anything_else(packed: Path, text: bytes) -> None:
     (packed / "zarr.json").write_bytes(text)
@@ -130,8 +97,3 @@ def test_speech_that_is_not_what_the_record_says(packed: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"speech of clip A_e01"):
         read_all(packed)
     assert "sound_unreadable" in {finding.kind for finding in check(packed, TINY).findings}
-
-
-def test_a_folder_of_anything_else_is_no_packed_corpus(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="no packed corpus"):
-        PackedCorpus(tmp_path)

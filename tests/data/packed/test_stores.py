@@ -162,19 +162,3 @@ def test_the_cache_keeps_to_its_limit_and_drops_the_corpus_that_was_opened_longe
     assert cache_folder("next", 4000) is not None
     assert {path.parent.name for path in own_cache.rglob("chunks")} == {"new", "old", "next"}
     assert cache_folder("huge", 20_000) is None
-
-
-@pytest.mark.parametrize("text", ["-1", "much", "nan", "inf"])
-def test_a_limit_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", text)
-    with pytest.raises(FaceDiffError, match="FACEDIFF_PACKED_CACHE_GB"):
-        cache_folder("one", 1)
-
-
-def test_nothing_is_kept_without_a_limit(
-    served: tuple[Path, str], own_cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FACEDIFF_PACKED_CACHE_GB", "0")
-    corpus = Tiny(root=served[1]).corpus
-    corpus.read_motion(corpus.clips["A_e01"])
-    assert not list(own_cache.rglob("chunks"))

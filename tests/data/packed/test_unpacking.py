@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import shutil
 from functools import partial
@@ -17,7 +16,6 @@ from facediff.data.check import check
 from facediff.data.packed import packing
 from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.unpacking import unpack
-from facediff.errors import FaceDiffError
 from facediff.utils.checksums import describe_files
 from tests.data.packed.damage import TINY
 from tests.fakes.tiny import Tiny
@@ -74,18 +72,3 @@ def test_lossless_packing_gives_every_bit_back(corpus: Path, tmp_path: Path, dty
     assert same_content(tmp_path / "back" / "vertices_npy", source / "vertices_npy")
     plain, exact = (Tiny(root=str(place)).corpus for place in (source, tmp_path / "out.zarr"))
     assert torch.equal(plain.read_motion(plain.clips["B_e02"]), exact.read_motion(exact.clips["B_e02"]))
-
-
-def test_a_full_disk_ends_unpacking_in_one_sentence(
-    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(path: Path, content: bytes) -> int:
-        if path.suffix == ".wav":
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return original(path, content)
-
-    original = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises((FaceDiffError, OSError), match="No space left"):
-        unpack(packed, tmp_path / "back", workers=1)
-    assert not (tmp_path / "back").exists()

@@ -148,20 +148,6 @@ def test_flame_parameters_become_vertices_without_head_pose(tmp_path: Path, form
     assert read_manifest(tmp_path / "out")["report"]["has_head_motion"] is False
 
 
-def test_flame_of_another_topology(tmp_path: Path) -> None:
-    np.save(tmp_path / "p.npy", np.zeros((1, 90, 403), np.float32))
-    with pytest.raises(FaceDiffError, match=r"model\.npz: has 88 vertices, but the corpus has 80"):
-        import_person(
-            tmp_path / "p.npy",
-            audio=write_speech(tmp_path / "sound.wav", 3),
-            name="T",
-            corpus=flame_corpus(tmp_path / "corpus"),
-            output=tmp_path / "out",
-            frame_rate=RATE,
-            flame=write_flame(tmp_path / "model.npz", form="npz", vertices=88),
-        )
-
-
 def test_a_frame_s_faces_are_those_that_a_mesh_library_reads(tmp_path: Path) -> None:
     path = write_objs(tmp_path / "frames", face()[None]) / "frame_1.obj"
     mesh, theirs = read_mesh(path), trimesh.load(path, process=False, maintain_order=True)

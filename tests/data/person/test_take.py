@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ import soundfile
 from facediff.cli.app import main
 from facediff.data import LiveLink
 from facediff.data.person import import_take
-from facediff.errors import FaceDiffError
 from facediff.spaces import Space
 from facediff.spaces.files import ParameterClip, read_parameters, write_parameters
 from facediff.synthetic.corpus import perform_clip, performed_clips, speak_clip
@@ -88,17 +86,3 @@ def test_the_entry_is_in_step_and_a_data_module_reads_it(
     batch = next(iter(data.train_dataloader()))
     assert batch.motion.shape[2:] == (61, 1)
     assert main(["data", "check", str(tmp_path / "ann"), "--corpus", "LiveLink"]) == 0
-
-
-def test_what_is_no_take_is_refused(tmp_path: Path, spoken: tuple[np.ndarray, np.ndarray]) -> None:
-    take, sound = write_take(tmp_path, spoken, 0.2)
-    soundfile.write(tmp_path / "silent.wav", np.zeros(32_000), 16_000)
-    with pytest.raises(FaceDiffError, match=r"silent\.wav"):
-        import_take(take, tmp_path / "silent.wav", name="Ann", output=tmp_path / "ann")
-    with pytest.raises(FaceDiffError, match="overlap"):
-        import_take(take, sound, name="Ann", output=tmp_path / "ann", offset=100.0)
-    clip = replace(read_parameters(take), times=None)
-    write_parameters(tmp_path / "beat.json", clip)
-    with pytest.raises(FaceDiffError, match=r"beat\.json"):
-        import_take(tmp_path / "beat.json", sound, name="Ann", output=tmp_path / "ann")
-    assert not (tmp_path / "ann").exists()

@@ -6,7 +6,6 @@ import json
 import math
 import pickle
 import shutil
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -311,27 +310,9 @@ def test_a_mesh_of_another_size(raw: Path) -> None:
     assert "F2.obj" in said
 
 
-def test_obj_keeps_every_vertex_in_its_place(tmp_path: Path) -> None:
-    path = tmp_path / "scan.obj"
-    path.write_text(
-        "# é\nmtllib x.mtl\nv 0 0 0 0.5 0.5 0.5\nv 9 9 9\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n"
-        "f 1/1/1 3/1/1 4/1/1 5/1/1\nf -5//1 -3//1 -1//1\n",
-        encoding="latin-1",
-    )
-    obj = read_mesh(path)
-    assert obj.vertices.tolist() == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    assert obj.faces.tolist() == [[0, 2, 3], [0, 3, 4], [0, 2, 4]]
-
-
 def test_templates_open_without_facediff(raw: Path) -> None:
     """Other projects' loaders open the file just so."""
     out, _ = prepared(raw)
     with (out / "templates.pkl").open("rb") as stream:
         templates = pickle.load(stream, encoding="latin1")  # noqa: S301 - just written here
     assert templates["F2"].reshape(-1).shape == (3 * VERTICES,)
-
-
-def test_the_fake_is_what_the_format_says(raw: Path) -> None:
-    data = frame(raw, 1).read_bytes()
-    assert struct.unpack("<I3f", data[:16]) == (VERTICES, *raw_frames("F2", "e01", 1)[0, 0].tolist())
-    assert len(data) == 4 + 12 * VERTICES

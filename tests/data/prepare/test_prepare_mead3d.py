@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.data import options_of
-from facediff.cli.parsing import parse
 from facediff.data import Mead3D
 from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_recordings, find_sounds
@@ -190,18 +188,6 @@ def test_shared_files_next_to_the_clips(tmp_path: Path, flame: Path) -> None:
     assert sorted(data.assets().templates) == sorted({name[:4] for name in CLIPS})
 
 
-def test_masks_next_to_the_model_and_own_regions(raw: Path, flame: Path, tmp_path: Path) -> None:
-    model = shutil.copy(flame, tmp_path / "model.pkl")
-    (tmp_path / "FLAME_masks.pkl").write_bytes(python2_pickle(flame_masks(VERTICES)))
-    assert (prepared(raw, Path(model), "a")[0] / "FLAME_masks.pkl").is_file()
-    (tmp_path / "lists").mkdir()
-    (tmp_path / "lists" / "lve.txt").write_text("1,2")
-    out, report = prepared(raw, flame, "b", regions=tmp_path / "lists")
-    assert (out / "regions" / "lve.txt").read_text() == "1,2"
-    assert {"regions/fdd.txt", "FLAME_masks.pkl"} <= set(report.missing)
-    assert "regions/lve.txt" not in report.missing
-
-
 def test_the_fake_of_the_prepared_layout_serves_both_splits(tmp_path: Path) -> None:
     root = write_mead3d(tmp_path / "mead3d")
     by_sentence = MiniMead(root=str(root), split="sentence")
@@ -264,24 +250,6 @@ def test_sound_from_another_folder(tmp_path: Path, flame: Path) -> None:
     np.testing.assert_allclose(
         read_speech(out / "wav" / f"{CLIP}.wav")[1000:5000], speech_of(CLIP, 16_000)[1000:5000], atol=1e-3
     )
-
-
-def test_options_of_the_command_line(tmp_path: Path, flame: Path) -> None:
-    raw = write_raw_emote(tmp_path / "raw", audio="wav")
-    words = [str(raw), str(tmp_path / "out"), "--dtype", "float64", "--quiet", "--flame", str(flame)]
-    words += ["--shape", "clip", "--subjects", "M003, W040", "--audio", str(raw / "MEAD")]
-    values = parse(options_of(mead3d.plan), words, "facediff data prepare mead3d")
-    del values["out"], values["work"]
-    plan = mead3d.plan(**values)
-    assert {job.name[:4] for job in plan.jobs} == {"M003", "W040"}
-    assert plan.options["dtype"] == "float64"
-    assert plan.options["shape"] == "clip"
-    assert plan.options["subjects"] == ["M003", "W040"]
-    assert (plan.corpus, plan.frame_rate, plan.unit, plan.n_vertices) == ("mead3d", 25.0, "m", VERTICES)
-    assert all(job.frames == frames_of(job.name) for job in plan.jobs)
-    report = prepare(plan, tmp_path / "out", workers=1, quiet=True)
-    assert motion_of(tmp_path / "out", CLIP).dtype == np.float64
-    assert sorted(report.clips) == sorted(name for name in CLIPS if name[:4] in ("M003", "W040"))
 
 
 def test_several_processes_write_the_same(raw: Path, flame: Path) -> None:

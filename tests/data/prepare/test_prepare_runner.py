@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.app import main, run
-from facediff.cli.data import CORPORA, grouped, options_of
-from facediff.cli.parsing import Parameter, parse
+from facediff.cli.app import run
+from facediff.cli.data import CORPORA, options_of
+from facediff.cli.parsing import Parameter
 from facediff.data.prepare import biwi
 from facediff.data.prepare.runner import Job, PreparationPlan, prepare, write_motion, write_speech, write_templates
 from facediff.errors import FaceDiffError, MissingExtraError
@@ -121,15 +121,6 @@ def test_damaged_files_are_written_again(tmp_path: Path, flaw: str) -> None:
     assert contents(out) == whole
 
 
-@pytest.mark.parametrize(
-    "record", [[], {"corpus": "toy", "options": []}, {"corpus": "toy", "options": {}, "files": [1]}]
-)
-def test_a_manifest_of_another_form_is_named(tmp_path: Path, record: object) -> None:
-    (tmp_path / "manifest.json").write_text(json.dumps(record))
-    with pytest.raises(FaceDiffError, match=r"manifest\.json"):
-        prepare(toy_plan(), tmp_path, workers=1)
-
-
 def test_a_failing_clip_does_not_stop_the_others_and_can_be_repaired(tmp_path: Path) -> None:
     out = tmp_path / "out"
     works = {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
@@ -143,16 +134,6 @@ def test_a_failing_clip_does_not_stop_the_others_and_can_be_repaired(tmp_path: P
     assert repaired.written == 1
     prepare(toy_plan(works), tmp_path / "at once", workers=1)
     assert contents(out) == contents(tmp_path / "at once")
-
-
-def test_damaged_files_of_a_failing_clip_are_removed(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    prepare(toy_plan(), out, workers=1)
-    (out / "vertices_npy" / "A_e02.npy").write_bytes(b"half")
-    works = {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
-    report = prepare(toy_plan({**works, "A_e02": partial(raising, FaceDiffError("x.vl: bad"))}), out, workers=1)
-    assert list(report.failed) == ["A_e02"]
-    assert not list(out.rglob("*A_e02*"))
 
 
 def full_disk() -> FaceDiffError:
@@ -221,13 +202,6 @@ def test_foreign_folders_and_strays_are_refused(tmp_path: Path) -> None:
     prepare(toy_plan(), out, workers=1)
     with pytest.raises(FaceDiffError, match=r"A_e02\.npy: is no clip of the raw folder"):
         prepare(toy_plan({"A_e01": partial(write_toy, "A_e01", 3)}), out, workers=1)
-
-
-@pytest.mark.parametrize("where", ["file", "file/out"])
-def test_a_folder_that_cannot_be_written_gets_one_sentence(tmp_path: Path, where: str) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FaceDiffError, match="cannot be written"):
-        prepare(toy_plan(), tmp_path / where, workers=1)
 
 
 def test_two_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
@@ -380,25 +354,6 @@ def test_the_command_does_not_write_into_the_raw_folder(tmp_path: Path, out: str
     assert contents(raw) == before
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["biwy", "a", "b"],
-        ["biwi", "a"],
-        ["biwi", "a", "b", "--dtype", "float16"],
-        ["vocaset", "a", "b", "--frame-rate", "25"],
-    ],
-)
-def test_wrong_arguments_are_refused(arguments: list[str]) -> None:
-    assert main(["data", "prepare", *arguments]) == 2
-
-
-def test_lines_for_the_screen_are_grouped_by_subject_and_reason() -> None:
-    entries = {"F1_e01": "expected a/e01", "F1_e02": "expected a/e02", "F1_e03": "expected b/e03", "x.ply": "no"}
-    assert grouped(entries) == ["F1_e01 … F1_e02 (2 in all): expected a/e01", "F1_e03: expected b/e03", "x.ply: no"]
-
-
 @pytest.mark.parametrize("corpus", CORPORA)
 def test_every_option_of_a_corpus_is_explained_and_reaches_its_plan(corpus: str, tmp_path: Path) -> None:
     module = importlib.import_module(f"facediff.data.prepare.{corpus}")
@@ -409,14 +364,6 @@ def test_every_option_of_a_corpus_is_explained_and_reaches_its_plan(corpus: str,
         assert isinstance(option, Parameter)
         assert len(option.help) > 10
         assert option.default == signature[name].default
-
-
-def test_options_are_read_by_their_type(tmp_path: Path) -> None:
-    (tmp_path / "raw").mkdir()
-    words = [str(tmp_path / "raw"), str(tmp_path / "out"), "--subjects", "F2,F3", "--regions", "lists"]
-    values = parse(options_of(biwi.plan), [*words, "--dtype", "float64"], "facediff data prepare biwi")
-    expected = {"normalise": "codetalker", "dtype": "float64", "subjects": ["F2", "F3"], "regions": Path("lists")}
-    assert {name: values[name] for name in expected} == expected
 
 
 def test_equal_templates_give_equal_bytes_wherever_their_arrays_come_from(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import soundfile
 
-from facediff.cli.app import run
 from facediff.data.prepare import vocaset
 from facediff.data.prepare.runner import PreparationReport, prepare
 from facediff.data.prepare.vocaset import halved, read_samples
@@ -222,17 +221,6 @@ def test_a_pickle_that_would_run_code_does_not(raw: Path, monkeypatch: pytest.Mo
     assert not (raw.parent / "out").exists()
 
 
-@pytest.mark.parametrize("file", ["data_verts.npy", "subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"])
-def test_a_file_that_is_missing_or_truncated_is_named(raw: Path, file: str) -> None:
-    whole = (raw / file).read_bytes()
-    (raw / file).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FaceDiffError, match=f"{file}: (not a |is cut short)"):
-        prepared(raw)
-    (raw / file).unlink()
-    with pytest.raises(FaceDiffError, match=rf"{file}: no such file; expected data_verts\.npy"):
-        prepared(raw)
-
-
 def test_names_from_pickles_cannot_leave_the_folder(raw: Path) -> None:
     for name in ("subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"):
         content = load_pickle(raw / name)
@@ -253,11 +241,3 @@ def test_mesh_masks_and_regions_are_copied_if_they_are_there(raw: Path, tmp_path
     assert "VOCA repository" in report.missing["FLAME_sample.ply"]
     assert "flame.is.tue.mpg.de" in report.missing["FLAME_masks.pkl"]
     assert "regions/lve.txt" in report.missing
-
-
-def test_the_command_line(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = raw.parent / "out"
-    assert run("data prepare", ["vocaset", str(raw), str(out), "--frame-rate", "60", "--workers", "1"]) == 0
-    assert "1 clip, 25 frames" in capsys.readouterr().out
-    with pytest.raises(FaceDiffError, match="--frame-rate was 60 and is 30"):
-        run("data prepare", ["vocaset", str(raw), str(out), "--workers", "1"])
