@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from facediff.cli.options import File, OutputFolder
+from facediff.cli.options import File, NewFolder
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -16,7 +16,7 @@ from facediff.utils.option import Option
 def export_model(
     model: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
     *,
-    output: OutputFolder,
+    output: NewFolder,
     weights: Literal["float32", "float16", "int8"] = "float32",
     sampler: Annotated[str | None, Option(metavar="NAME")] = None,
     steps: Annotated[ranges.Steps | None, Option(metavar="N")] = None,
@@ -43,8 +43,6 @@ def export_model(
         speech: recording that the folder is compared with the model on; a made-up sound by default
         identities: whose faces and styles the folder has (default: all that the model knows)
     """
-    if output.exists():
-        raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
     if model is None or bundled_by_name(model) is BUNDLED:
         changed: dict[str, object] = {"sampler": sampler, "steps": steps, "quick-steps": quick_steps, "speech": speech}
         changed |= {"identities": identities, "weights": None if weights == "float32" else weights}

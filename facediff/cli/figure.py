@@ -13,6 +13,7 @@ from facediff.cli.options import (
     FrameRate,
     Output,
     Scheduler,
+    Truth,
     View,
     Workers,
     named_folders,
@@ -32,7 +33,6 @@ NOTES = 3
 """Notes that are printed at most."""
 
 Predictions = Annotated[str, Option(metavar="PREDICTIONS", reads=True)]
-Truth = Annotated[Path, Option(metavar="TRUTH", reads=True)]
 Clip = Annotated[str | None, Option(metavar="CLIP")]
 Highest = Annotated[ranges.Factor | None, Option(metavar="VALUE")]
 
@@ -72,8 +72,6 @@ class FileOptions:
     def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, FigureData]:
         """The page and what is drawn on it."""
         methods = named_folders([predictions, *(self.method or [])])
-        if not truth.is_dir() and str(truth) != "puppet":
-            raise FaceDiffError(f"{truth}: no such folder; expected a corpus, a folder of truths, or puppet")
         paper = page.paper()
         from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
         from facediff.evaluation.figures.gather import gather

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Output = Annotated[Path, Option(also="-o", metavar="OUT", writes="file")]
 OutputFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder")]
+NewFolder = Annotated[Path, Option(also="-o", metavar="OUT", writes="folder", new=True)]
 CheckpointFile = Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".ckpt",))]
 Picture = Annotated[Path | None, Option(metavar="PNG", writes="file", suffixes=(".png",))]
 Checkpoint = Annotated[Path, Option(metavar="C", reads=True)]
@@ -39,6 +40,15 @@ Size = Annotated[ranges.Pixels, Option(metavar="PIXELS")]
 Workers = Annotated[ranges.Workers | None, Option(metavar="N")]
 Scheduler = Annotated[str | None, Option(metavar="WHERE", check=check_scheduler)]
 Text = Annotated[str | None, Option(metavar="NAME")]
+
+
+def require_truth(path: Path | None) -> None:
+    """Refuse what is neither a folder nor the name of the built-in corpus."""
+    if path is not None and not path.is_dir() and str(path) != "puppet":
+        raise FaceDiffError(f"{path}: no such folder; expected a corpus, a folder of truths or animations, or puppet")
+
+
+Truth = Annotated[Path, Option(metavar="TRUTH", reads=True, check=require_truth)]
 
 
 @dataclass(frozen=True)

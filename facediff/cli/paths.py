@@ -83,7 +83,9 @@ def exists(text: str) -> bool:
 
 
 def check_output(option: Option, path: Path) -> None:
-    """Refuse a file or a folder that cannot be written."""
+    """Refuse a file or a folder that cannot be written, or has content that would be mixed with what is written."""
+    if option.new and path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FaceDiffError(f"{path}: exists already; choose another folder, or remove it")
     if option.writes == "folder" or (option.writes == "file or folder" and path.is_dir()):
         check_folder_writable(path)
     else:

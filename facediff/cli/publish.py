@@ -18,7 +18,7 @@ SCORES = "test_scores.csv"
 
 def publish(
     checkpoint: Annotated[Path, Option(metavar="CHECKPOINT", reads=True)],
-    folder: Annotated[Path, Option(metavar="FOLDER", writes="folder")],
+    folder: Annotated[Path, Option(metavar="FOLDER", writes="folder", new=True)],
     *,
     license: Annotated[str | None, Option(metavar="NAME")] = None,
     half: bool = False,
@@ -56,8 +56,6 @@ def publish(
     hub.check_model_source(checkpoint)
     if push is not None and not hub.is_hub_name(push):
         raise FaceDiffError(f"--push {push}: is no name of a model on the hub; expected user/name")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise FaceDiffError(f"{folder}: is not empty; choose a new folder, or remove this one")
 
     from facediff.models import load_model
     from facediff.models.pretrained import published_licences

@@ -16,7 +16,7 @@ from facediff.utils.server import require_server
 def serve(
     model: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None,
     *,
-    output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
+    output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder", new=True)] = None,
     runtime: Annotated[Path | None, Option(metavar="PACKAGE", reads=True)] = None,
     recordings: Annotated[list[Path] | None, Option(metavar="FILE", many=True, reads=True)] = None,
     page: PageServer,
@@ -37,8 +37,6 @@ def serve(
         recordings: that the page offers to try the model with
         page: where it is served.
     """
-    if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise FaceDiffError(f"--output {output}: exists already; choose another folder, or remove it")
     if output is None:
         require_server("serving a page", extra="serve")
     from facediff.runtime.folder import read_folder

@@ -13,6 +13,7 @@ from facediff.cli.options import (
     PageServer,
     Scheduler,
     Seed,
+    Truth,
     Workers,
     named_folders,
 )
@@ -27,7 +28,7 @@ def make(
     methods: Annotated[list[str], Option(metavar="NAME=FOLDER", reads=True)],
     *,
     output: OutputFolder,
-    truth: File = None,
+    truth: Truth | None = None,
     style_references: Folder = None,
     identity: Annotated[str, Option(metavar="NAME")] = "own",
     speech: Annotated[Path | None, Option(metavar="FOLDER", reads=True)] = None,
@@ -65,8 +66,6 @@ def make(
         options: what is asked.
     """
     folders = named_folders(methods)
-    if truth is not None and not truth.is_dir() and str(truth) != "puppet":
-        raise FaceDiffError(f"--truth {truth}: no such folder; expected a corpus, a folder of animations, or puppet")
     from facediff.study import plan_study
 
     plan = plan_study(

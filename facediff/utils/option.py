@@ -26,6 +26,7 @@ class Option:
         reads: for paths, and texts that hold paths: whether the file or folder is read.
         exists: for paths: what must be there, if it is known before the command begins.
         writes: for paths: what is written; with ``reads``, what exists is read instead.
+        new: for paths that are written: whether they must not exist, or be empty folders.
         suffixes: for paths: what their names may end in.
         dash: for paths: whether ``-`` stands for standard input or output.
         check: raises an error for a value that the command cannot use.
@@ -41,6 +42,7 @@ class Option:
     reads: bool = False
     exists: Literal["", "file", "folder", "file or folder"] = ""
     writes: Literal["", "file", "folder", "file or folder"] = ""
+    new: bool = False
     suffixes: tuple[str, ...] = ()
     dash: bool = False
     check: Callable[[Any], object] | None = None
