@@ -175,67 +175,36 @@ def cells_of(plan: BenchmarkPlan) -> list[Cell]:
 
 def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
     method = row.method
-    seeds = method.seeds or plan.seeds
-    scoring = {
-        "protocol": plan.protocol,
-        "metrics": list(plan.metrics),
-        "options": {**plan.test_options, **method.test_options},
-    }
+    seeds: tuple[int | None, ...] = method.seeds or plan.seeds
+    test_options = {**plan.test_options, **method.test_options}
+    scoring = {"protocol": plan.protocol, "metrics": list(plan.metrics), "options": test_options}
     data = None if corpus.data is None else config_content(corpus.data)
     shared = {"corpus": {"data": data, "manifest": _manifest(corpus.root)}}
+    facts: dict[str, Any] = {"test_options": test_options, "root": corpus.root, "data": corpus.data}
     if method.config is not None:
+        trainings = tuple(_trainings(plan, row, corpus))
+        steps = [
+            {"name": step.name, "config": config_content(step.config), "options": dict(step.options)}
+            for step in trainings
+        ]
         for seed in seeds:
-            trainings = tuple(_trainings(plan, row, corpus))
-            trained = {
-                **shared,
-                "seed": seed,
-                "threads": plan.threads,
-                "trainings": [
-                    {
-                        "name": training.name,
-                        "config": config_content(training.config),
-                        "options": dict(training.options),
-                    }
-                    for training in trainings
-                ],
-            }
+            trained = {**shared, "seed": seed, "threads": plan.threads, "trainings": steps}
             recipe = {"kind": "fit", "trained": trained, "weights": plan.weights, "test": scoring}
-            yield Cell(
-                *(row.name, corpus.name, seed, "fit", trainings),
-                test_options=scoring["options"],  # type: ignore[arg-type]
-                root=corpus.root,
-                data=corpus.data,
-                recipe=recipe,
-                trained=trained,
-            )
+            yield Cell(row.name, corpus.name, seed, "fit", trainings, recipe=recipe, trained=trained, **facts)
         return
     kind: Kind = "checkpoint" if method.checkpoint is not None else "predictions"
     text = method.checkpoint or method.predictions or ""
-    source_seeds: list[int | None] = [*seeds] if "{seed}" in text else [None]
-    for source_seed in source_seeds:
-        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(source_seed)))
-        if kind == "predictions" and corpus.data is None:
-            raise FaceDiffError(
-                f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
-                f"its config, such as configs/data/biwi.yaml, for the clips of its test splits"
-            )
-        recipe = {
-            **shared,
-            "kind": kind,
-            "source": _content(kind, source),
-            "test": scoring,
-            "options": dict(method.options),
-        }
-        yield Cell(
-            *(row.name, corpus.name, source_seed, kind),
-            source=source,
-            options=method.options,
-            test_options=scoring["options"],  # type: ignore[arg-type]
-            root=corpus.root,
-            data=corpus.data,
-            recipe=recipe,
-            trained=recipe,
+    if kind == "predictions" and corpus.data is None:
+        raise FaceDiffError(
+            f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
+            f"its config, such as configs/data/biwi.yaml, for the clips of its test splits"
         )
+    for seed in seeds if "{seed}" in text else (None,):
+        source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(seed)))
+        recipe = {**shared, "kind": kind, "source": _content(kind, source), "test": scoring}
+        recipe["options"] = dict(method.options)
+        facts |= {"source": source, "options": method.options}
+        yield Cell(row.name, corpus.name, seed, kind, recipe=recipe, trained=recipe, **facts)
 
 
 def _trainings(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Training]:
@@ -243,9 +212,9 @@ def _trainings(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[T
     variant = {} if row.variant is None else row.variant.options
     last = Before(str(method.config), {**plan.options, **method.options, **variant})
     for name, step in {**method.before, "fit": last}.items():
-        options = {**corpus.options, **step.options}
-        config = find_config(step.config.replace("{corpus}", corpus.name), f"methods.{method.name}.config", plan.file)
-        yield Training(name, config, options)
+        text = step.config.replace("{corpus}", corpus.name)
+        config = find_config(text, f"methods.{method.name}.config", plan.file)
+        yield Training(name, config, {**corpus.options, **step.options})
 
 
 def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:

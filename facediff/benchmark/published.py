@@ -65,11 +65,7 @@ class Shown:
 def published() -> dict[str, Published]:
     """All tables of papers that are known, by name."""
     content: dict[str, dict[str, Any]] = load_yaml(FILE, "it is part of the package; install it again")
-    tables = {}
-    for name, table in content.items():
-        rows = {row: {key: float(value) for key, value in scores.items()} for row, scores in table["rows"].items()}
-        tables[name] = Published(name, **{**table, "rows": rows})
-    return tables
+    return {name: Published(name, **table) for name, table in content.items()}
 
 
 def shown_tables(

@@ -181,15 +181,9 @@ def draw_heatmap(
     Returns:
         notes on what was left out.
     """
-    check_output(output)
-    material.mesh(clips)  # refuses before the work
-    maps, notes = motion_maps(material, clips, workers=workers, scheduler=scheduler)
-    rows: list[Row] = [
-        ("mean of motion", {name: vertex_map.mean for name, vertex_map in maps.items()}, highest[0]),
-        ("std of motion", {name: vertex_map.deviation for name, vertex_map in maps.items()}, highest[1]),
-    ]
-    _draw(material, clips, rows, output, paper or Paper(), view)
-    return notes
+    rows = {"mean of motion": "mean", "std of motion": "deviation"}
+    reading = partial(motion_maps, workers=workers, scheduler=scheduler)
+    return _draw_maps(material, clips, output, reading, rows, highest, paper or Paper(), view)
 
 
 @ranges.checked
@@ -210,15 +204,32 @@ def draw_error(
     Arguments, result and errors are those of :func:`draw_heatmap`; ``statistic`` is ``mean``, ``max``, or ``both``, a
     row each, and ``highest`` has the ends of the colour scales of mean and maximum.
     """
+    rows = {"mean error": "mean", "maximum error": "maximum"}
+    chosen = {label: name for label, name in rows.items() if label.startswith(statistic) or statistic == "both"}
+    ends = (highest[1], None) if statistic == "max" else highest
+    reading = partial(error_maps, workers=workers, scheduler=scheduler)
+    return _draw_maps(material, clips, output, reading, chosen, ends, paper or Paper(), view)
+
+
+def _draw_maps(
+    material: FigureData,
+    clips: Sequence[str],
+    output: Path,
+    reading: Callable[[FigureData, Sequence[str]], tuple[dict[str, VertexMap], list[str]]],
+    rows: Mapping[str, str],
+    highest: tuple[float | None, float | None],
+    paper: Paper,
+    view: str,
+) -> list[str]:
+    """Draw a row for each label and the attribute of the maps that it shows; notes on what was left out."""
     check_output(output)
     material.mesh(clips)  # refuses before the work
-    maps, notes = error_maps(material, clips, workers=workers, scheduler=scheduler)
-    rows: dict[str, Row] = {
-        "mean": ("mean error", {name: vertex_map.mean for name, vertex_map in maps.items()}, highest[0]),
-        "max": ("maximum error", {name: vertex_map.maximum for name, vertex_map in maps.items()}, highest[1]),
-    }
-    chosen = list(rows.values()) if statistic == "both" else [rows[statistic]]
-    _draw(material, clips, chosen, output, paper or Paper(), view)
+    maps, notes = reading(material, clips)
+    drawn: list[Row] = [
+        (label, {name: getattr(vertex_map, attribute) for name, vertex_map in maps.items()}, end)
+        for (label, attribute), end in zip(rows.items(), highest, strict=False)
+    ]
+    _draw(material, clips, drawn, output, paper, view)
     return notes
 
 
