@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ REFERENCE_LABELS = {
     "mean_face": "speaker's mean face",
     "shuffled": "{row}, shuffled speech",
 }
+SIGNS = {"lower": 1, "higher": -1}
 SPLIT_LABELS = {
     "test_a": "test A, seen speakers",
     "test_b": "test B, unseen speakers",
@@ -198,7 +199,7 @@ def _table(
     scored = _row_of(first, split, "model") or {}
     clips = {clip for row in rows for scores in row.scores.values() for clip in scores.clips}
     regions = dict(scored.get("regions") or {})
-    frames = sum(_frames(group, split) for group in [groups[compared_with]])
+    frames = int((_row_of(groups[compared_with][0], split, "model") or {"frames": 0})["frames"])
     manifests = {str(result.provenance.get("manifest")) for result in results if result.provenance}
     published = shown_tables(
         outline.published,
@@ -226,11 +227,6 @@ def _table(
         notes=[*_notes(rows, columns, len(clips), manifests), *_deaf(rows, columns, bootstrap)],
         published=published,
     )
-
-
-def _frames(group: Sequence[Result], split: str) -> int:
-    row = _row_of(group[0], split, "model")
-    return 0 if row is None else int(row["frames"])
 
 
 def _row_of(result: Result, split: str, method: str) -> Mapping[str, Any] | None:
@@ -318,40 +314,33 @@ def _with_comparisons(
     baseline: str,
     bootstrap: Bootstrap,
 ) -> list[TableRow]:
-    marks: dict[str, dict[str, str]] = {}
-    differences: dict[str, dict[str, tuple[Difference, float | None]]] = {}
+    marks: dict[str, dict[str, str]] = {row.name: {} for row in rows}
+    differences: dict[str, dict[str, tuple[Difference, float | None]]] = {row.name: {} for row in rows}
     for column, facts in columns.items():
-        all_rows = {row.name: row.scores[column] for row in rows if column in row.scores}
-        own = {row.name: row.scores[column] for row in rows if column in row.scores and not row.reference}
-        for name, mark in marked(own, facts.get("better"), bootstrap).items():
-            marks.setdefault(name, {})[column] = mark
-        if baseline in all_rows:
-            for name, difference in compared(all_rows, baseline, bootstrap, all_rows.keys() - own.keys()).items():
-                differences.setdefault(name, {})[column] = difference
-    return [
-        TableRow(
-            **{
-                **vars(row),
-                "marks": marks.get(row.name, {}),
-                "differences": differences.get(row.name, {}),
-            }
-        )
-        for row in rows
-    ]
+        scores = {row.name: row.scores[column] for row in rows if column in row.scores}
+        references = {row.name for row in rows if row.reference}
+        methods = {name: score for name, score in scores.items() if name not in references}
+        for name, mark in marked(methods, facts.get("better"), bootstrap).items():
+            marks[name][column] = mark
+        if baseline in scores:
+            for name, difference in compared(scores, baseline, bootstrap, references).items():
+                differences[name][column] = difference
+    return [replace(row, marks=marks[row.name], differences=differences[row.name]) for row in rows]
 
 
 def _deaf(rows: Sequence[TableRow], columns: Mapping[str, Mapping[str, str | None]], bootstrap: Bootstrap) -> list[str]:
     """Which methods another sentence's speech serves as well as the own one, score by score."""
-    shuffled = {row.name.removesuffix(".shuffled"): row for row in rows if row.name.endswith(".shuffled")}
+    shuffled = {row.name.removesuffix(".shuffled"): row.scores for row in rows if row.name.endswith(".shuffled")}
     notes = []
     for column, facts in columns.items():
-        sign = {"lower": 1, "higher": -1}.get(str(facts.get("better")))
-        pairs = [(row, shuffled[row.name]) for row in rows if row.name in shuffled]
-        pairs = [(own, other) for own, other in pairs if column in own.scores and column in other.scores]
+        sign = SIGNS.get(str(facts.get("better")))
         deaf = [
-            own.label
-            for own, other in pairs
-            if sign is not None and not hears(own.scores[column], other.scores[column], sign, bootstrap)
+            row.label
+            for row in rows
+            if sign is not None
+            and column in row.scores
+            and column in shuffled.get(row.name, {})
+            and not hears(row.scores[column], shuffled[row.name][column], sign, bootstrap)
         ]
         if deaf:
             notes.append(f"by {column}, another sentence's speech does as well as the own: {', '.join(deaf)}")
@@ -377,7 +366,7 @@ def _notes(
     if fewer:
         notes.append(f"not scored on all sentences; compare differences, not scores: {', '.join(fewer)}")
     for column, facts in columns.items():
-        sign = {"lower": 1, "higher": -1}.get(str(facts.get("better")))
+        sign = SIGNS.get(str(facts.get("better")))
         scored = [row for row in own if column in row.scores]
         if sign is None or not scored:
             continue

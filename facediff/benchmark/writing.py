@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from facediff.benchmark.plots import plots_of
-from facediff.benchmark.statistics import Difference
+from facediff.benchmark.statistics import Difference, RowScores
 from facediff.benchmark.tables import BenchmarkReport, Table, TableRow
 from facediff.errors import FaceDiffError
 from facediff.reporting.documents import (
@@ -340,38 +340,41 @@ NOTHING = Difference(0.0, None, None, None, None, None, None, 0)
 
 def csv_rows(report: BenchmarkReport) -> list[dict[str, Any]]:
     """One flat row for each table, row and score."""
-    return [row for table in report.tables for row in _csv_rows(table, report)]
+    return [
+        _csv_row(report, table, row, column, scores)
+        for table in report.tables
+        for row in table.rows
+        for column, scores in row.scores.items()
+    ]
 
 
-def _csv_rows(table: Table, report: BenchmarkReport) -> Iterator[dict[str, Any]]:
+def _csv_row(report: BenchmarkReport, table: Table, row: TableRow, column: str, scores: RowScores) -> dict[str, Any]:
     def ends(name: str, interval: Interval | None) -> dict[str, float | None]:
         low, high = (None, None) if interval is None else (interval.low, interval.high)
         return {f"{name}_low": low, f"{name}_high": high}
 
-    for row in table.rows:
-        for column, scores in row.scores.items():
-            difference, adjusted = row.differences.get(column, (NOTHING, None))
-            yield {
-                **{"corpus": table.corpus, "synthetic": table.synthetic, "split": table.split},
-                **{"row": row.name, "label": row.label},
-                **{"score": column, "protocol": report.outline.protocol, "mean": scores.mean},
-                **{"deviation_over_runs": scores.deviation, "runs": len(row.seeds)},
-                "seeds": " ".join(str(seed) for seed in row.seeds if seed is not None),
-                **ends("sentences", row.intervals.get(column)),
-                "mark": row.marks.get(column, ""),
-                "difference": None if difference is NOTHING else difference.value,
-                **ends("difference_sentences", difference.sentences),
-                "p_sentences": difference.p_sentences,
-                **ends("difference_runs", difference.runs),
-                "p_runs": difference.p_runs,
-                **ends("difference_both", difference.both),
-                "p": difference.p,
-                "p_corrected": adjusted,
-                "printed": table.published.scores.get(row.name, {}).get(column),
-                **{"frames": table.frames, "sentences": row.clips, "parameters": row.cost.parameters},
-                **{"real_time_factor": row.cost.factor, "training_seconds": row.cost.training},
-                "memory_bytes": row.cost.memory,
-            }
+    difference, adjusted = row.differences.get(column, (NOTHING, None))
+    return {
+        **{"corpus": table.corpus, "synthetic": table.synthetic, "split": table.split},
+        **{"row": row.name, "label": row.label},
+        **{"score": column, "protocol": report.outline.protocol, "mean": scores.mean},
+        **{"deviation_over_runs": scores.deviation, "runs": len(row.seeds)},
+        "seeds": " ".join(str(seed) for seed in row.seeds if seed is not None),
+        **ends("sentences", row.intervals.get(column)),
+        "mark": row.marks.get(column, ""),
+        "difference": None if difference is NOTHING else difference.value,
+        **ends("difference_sentences", difference.sentences),
+        "p_sentences": difference.p_sentences,
+        **ends("difference_runs", difference.runs),
+        "p_runs": difference.p_runs,
+        **ends("difference_both", difference.both),
+        "p": difference.p,
+        "p_corrected": adjusted,
+        "printed": table.published.scores.get(row.name, {}).get(column),
+        **{"frames": table.frames, "sentences": row.clips, "parameters": row.cost.parameters},
+        **{"real_time_factor": row.cost.factor, "training_seconds": row.cost.training},
+        "memory_bytes": row.cost.memory,
+    }
 
 
 def plots(report: BenchmarkReport) -> dict[str, Drawing]:
