@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,16 +37,14 @@ class ScoreTable:
 
     def valued(self) -> list[str]:
         """Clips that have a value in some column."""
-        return [clip for clip, counts in zip(self.clips, (self.weights > 0).any(1), strict=True) if counts]
+        return [self.clips[row] for row in np.flatnonzero((self.weights > 0).any(1))]
 
     def common(self, other: ScoreTable) -> tuple[ScoreTable, ScoreTable]:
         """Both tables with the clips that both have; one that has no value in a column of one counts in neither."""
         clips = [clip for clip in self.clips if clip in set(other.clips)]
         one, two = self.at(clips), other.at(clips)
         both = (one.weights > 0) & (two.weights > 0)
-        return ScoreTable(one.clips, one.values, one.weights * both), ScoreTable(
-            two.clips, two.values, two.weights * both
-        )
+        return replace(one, weights=one.weights * both), replace(two, weights=two.weights * both)
 
     def pool(self) -> Array:
         """The score of each column; NaN where no clip has a value."""

@@ -129,7 +129,7 @@ class Questionnaire:
     def _texts(self, content: Any, place: str, default: Texts) -> Texts:  # noqa: ANN401 - a text or a mapping
         """A text for every language: one for all, or one by language."""
         texts = dict.fromkeys(self.languages, content) if isinstance(content, str) else content or default
-        wanted = {language: texts.get(language) if isinstance(texts, dict) else None for language in self.languages}
+        wanted: dict[str, Any] = {name: texts.get(name) if isinstance(texts, dict) else None for name in self.languages}
         for language, text in wanted.items():
             if not isinstance(text, str) or not text.strip():
                 raise FaceDiffError(
