@@ -116,7 +116,10 @@ class Card:
         if "like" in content:
             other = yaml.safe_load(path.with_name(f"{content['like']}.yaml").read_text(encoding="utf-8"))
             content |= {name: other[name] for name in ("renames", "ignored", "layers")}
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()})
+        fields: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in content.items()
+        }
+        return cls(**fields)
 
     def fits(self, names: Mapping[str, Tensor]) -> bool:
         """Whether tensors are those of this method."""
