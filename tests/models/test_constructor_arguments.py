@@ -55,6 +55,7 @@ NAMED_OTHERWISE = (
         "source",
     ),
     *("sampler", "frame_rate", "n_vertices"),
+    *("speech_guidance", "identity_guidance", "style_guidance"),
 )
 """Arguments that stand for files, folders or names: the sentence names these."""
 
