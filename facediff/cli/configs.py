@@ -27,31 +27,33 @@ def check_config(path: Path | str) -> None:
         raise FaceDiffError(f"{path}: holds no options (key: value); {expected}")
 
 
+def texts_of(path: Path | str) -> dict[str, Any]:
+    """A config that :func:`check_config` has let through, with every value as its text."""
+    content: dict[str, Any] = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506
+    return content
+
+
 def keys_of(path: Path | str) -> set[str]:
-    """The outermost keys of a config that :func:`check_config` has let through."""
-    # The node's tree is neither expanded nor made into objects.
-    root = yaml.compose(Path(path).read_text(encoding="utf-8-sig"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    return {str(key.value) for key, _ in root.value} if isinstance(root, yaml.MappingNode) else set()
+    """The outermost keys of a config."""
+    return set(texts_of(path))
 
 
 def name_of(path: Path | str) -> str | None:
-    """The experiment's name that a config, which :func:`check_config` has let through, states; None for none."""
-    content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only
-    return content.get("name")
+    """The experiment's name that a config states; None for none."""
+    return texts_of(path).get("name")
 
 
 def loggers_of(path: Path | str) -> list[str]:
-    """Class names of the loggers that a config, which :func:`check_config` has let through, states itself."""
-    content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only
-    trainer = content.get("trainer")
+    """Class names of the loggers that a config states itself."""
+    trainer = texts_of(path).get("trainer")
     loggers = trainer.get("logger") if isinstance(trainer, dict) else None
     entries = loggers if isinstance(loggers, list) else [loggers]
     return [str(entry["class_path"]).rpartition(".")[2] for entry in entries if entry and "class_path" in entry]
 
 
 def class_of(path: Path | str) -> str | None:
-    """The class that a config, which :func:`check_config` has let through, states: the model's, or of its only part."""
-    content = yaml.load(Path(path).read_text(encoding="utf-8-sig"), yaml.BaseLoader)  # noqa: S506 - makes texts only
+    """The class that a config states: the model's, or of its only part."""
+    content = texts_of(path)
     model = content.get("model", content)  # a file of one part alone has its class outermost
     if isinstance(model, str) and (part := Path(path).parent / model).is_file():
         check_config(part)
@@ -108,7 +110,12 @@ def guard_configs(mode: str) -> None:
 
     def load(text: str) -> Any:  # noqa: ANN401
         if "\n" in text:  # a file, and not a value
-            check_yaml(text, "--config")
+            try:
+                check_yaml(text, "--config")
+            except FaceDiffError as error:
+                if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries what else it may be
+                    raise error.__cause__ from error
+                raise
         return with_paths(without_removed_options(with_bundled(read(text)), "--config"))
 
     set_loader(mode, load, exceptions=(yaml.YAMLError,))

@@ -93,11 +93,15 @@ def check_model_source(source: str | os.PathLike[str], option: str = "", expecte
     if is_exported(bundled_by_name(source)):
         raise FaceDiffError(f"{shown}: holds graphs, with which one can only animate; {EXPECTED}")
     if os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
-        for name in (CONFIG, WEIGHTS, ASSETS):
-            if not (Path(source) / name).is_file():
-                raise FaceDiffError(f"{shown}: this folder has no {name}, so it holds no model; {expected}")
+        if missing := missing_files(Path(source)):
+            raise FaceDiffError(f"{shown}: this folder has no {missing}, so it holds no model; {expected}")
     elif not os.path.isfile(source) and hub_id(source) is None:  # noqa: PTH113
         raise FaceDiffError(f"{shown}: no such checkpoint; {expected}")
+
+
+def missing_files(folder: Path) -> str:
+    """Names of a model folder's files that are not there; empty if all are."""
+    return ", ".join(name for name in (CONFIG, WEIGHTS, ASSETS) if not (folder / name).is_file())
 
 
 def is_exported(source: str | os.PathLike[str]) -> bool:
@@ -206,12 +210,11 @@ def fetch(name: str, revision: str | None = None) -> Path:
     with _hub_errors(shown, "fetched"), _progress():
         options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
         folder = Path(snapshot_download(name, **options))
-    for part in (CONFIG, WEIGHTS, ASSETS):
-        if not (folder / part).is_file():
-            raise FaceDiffError(
-                f"{shown}: this model of the hub has no {part}, so facediff did not write it; expected a model that "
-                f"`facediff publish --push` has sent there"
-            )
+    if missing := missing_files(folder):
+        raise FaceDiffError(
+            f"{shown}: this model of the hub has no {missing}, so facediff did not write it; expected a model that "
+            f"`facediff publish --push` has sent there"
+        )
     return folder
 
 
