@@ -281,7 +281,7 @@ class FaceDiffCLI(LightningCLI):
             warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
             self.config_init[self.command].ckpt_path = str(path) if content else None
             # The config that is saved describes the whole run.
-            self.options.ckpt_path = None if run is not None else self.checkpoint
+            self.options.ckpt_path = None if run is not None else str(path)
 
     def before_validate(self) -> None:
         """Find the checkpoint, where it is named by a word or by a config."""

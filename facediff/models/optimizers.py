@@ -109,7 +109,8 @@ def parameter_groups(model: LightningModule, options: Mapping[str, Mapping[str, 
             groups[owner]["params"].append(parameter)
     for name, group in groups.items():
         if name and not group["params"]:
-            raise ArgumentError({f"parameter_groups.{name}": ""}, f"nothing to train there: {choices(name, parts)}")
+            named = {f"model.parameter_groups.{name}": ""}
+            raise ArgumentError(named, f"nothing to train there: {choices(name, parts)}", located=True)
     return [group for group in groups.values() if group["params"]]
 
 

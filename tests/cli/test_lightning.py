@@ -262,13 +262,14 @@ NAMED: dict[str, tuple[list[str], str]] = {
     "the option": (["--config", "mine.yaml", "--name=third"], "third"),
     "a name in the file": (["--config", "named.yaml"], "chosen"),
     "the logger's own": (["--config", "mine.yaml", "--trainer.logger.init_args.name=own"], "own"),
+    "an interpolation of 1.x": (["--config", "mine.yaml", "--config", "former.yaml"], "mine"),
     "no file": (["--model=DualPathDiffusion", "--data=Puppet"], "fit"),
     "a list of loggers": (["--config", "configs/experiment/puppet.yaml", "--config", "loggers.yaml"], "puppet"),
     "Weights & Biases": (["--config", "mine.yaml", "--config", "configs/logger/wandb.yaml"], "mine"),
 }
 
 
-QUICK_NAMES = ("the first of several files", "the option", "no file", "a list of loggers")
+QUICK_NAMES = ("the first of several files", "the option", "an interpolation of 1.x", "a list of loggers")
 
 
 @pytest.mark.parametrize(
@@ -283,7 +284,8 @@ def test_runs_carry_the_name_of_their_experiment(
         f"    - class_path: lightning.pytorch.loggers.{kind}Logger\n      init_args: {{save_dir: runs}}\n"
         for kind in ("CSV", "TensorBoard")
     )
-    files = {"mine": mine, "other": mine, "named": f"name: chosen\n{mine}", "loggers": loggers}
+    former = "trainer: {logger: {class_path: CSVLogger, init_args: {save_dir: runs, name: '${experiment_name:}'}}}\n"
+    files = {"former": former, "mine": mine, "other": mine, "named": f"name: chosen\n{mine}", "loggers": loggers}
     for name, text in {**files, "extra": "trainer: {max_epochs: 3}\n"}.items():
         (tmp_path / f"{name}.yaml").write_text(text)
     words, expected = NAMED[case]
