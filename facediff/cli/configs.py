@@ -88,21 +88,22 @@ def as_parts(words: Sequence[str]) -> list[str]:
 
 def with_bundled(content: Any) -> Any:  # noqa: ANN401
     """A config's content with the bundled files that it names, unless the user has files at these places."""
-    from jsonargparse._paths import _current_path_dir
+    from jsonargparse.typing import Path_fr
 
     if isinstance(content, dict):
         return {key: with_bundled(value) for key, value in content.items()}
     if isinstance(content, str) and content.startswith("configs/"):
-        own = Path(_current_path_dir.get() or ".") / content
-        bundled = None if own.is_file() else bundled_config(content)
-        return content if bundled is None else str(bundled)
+        try:
+            Path_fr(content)  # relative to the file that names it, as jsonargparse reads it
+        except TypeError:
+            return str(bundled_config(content) or content)
     return content
 
 
 def guard_configs(mode: str) -> None:
     """Let jsonargparse check every YAML text of a parser mode before it reads it: also files that a config names."""
     from jsonargparse import set_loader
-    from jsonargparse._optionals import get_omegaconf_loader
+    from jsonargparse._optionals import get_omegaconf_loader  # its public get_loader knows the mode after a parse only
 
     from facediff.models.earlier_versions import without_removed_options
 
