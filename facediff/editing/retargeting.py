@@ -481,8 +481,6 @@ SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
 
 def save_correspondence(path: Path, correspondence: Correspondence) -> None:
     """Write a correspondence as .npz, which ``numpy.load`` opens without pickle."""
-    if path.suffix != ".npz":
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a correspondence .npz')
     similarity = correspondence.similarity
     with atomic(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(

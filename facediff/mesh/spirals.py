@@ -40,8 +40,6 @@ def spirals(
         (V, length) vertex indices; column 0 is the vertex itself.
     """
     faces = checked_faces(faces, n_vertices)
-    if length < 1 or dilation < 1:
-        raise FaceDiffError(f"spirals: length {length} and dilation {dilation}; expected at least 1 for both")
     rings = ordered_rings(faces, n_vertices)
     full_length = min(length * dilation, n_vertices)
     table = np.empty((n_vertices, length), np.int64)
@@ -59,10 +57,7 @@ def spirals(
 
 def checked_faces(faces: npt.NDArray[np.integer], n_vertices: int) -> Indices:
     """Faces (F, 3) as int64, without those that name a vertex twice; an index that is not a vertex's is refused."""
-    faces = np.asarray(faces)
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-        raise FaceDiffError(f"faces: {faces.dtype} of shape {faces.shape}; expected integers of shape (F, 3)")
-    corners = faces.astype(np.int64)
+    corners = np.asarray(faces, np.int64).reshape(-1, 3)
     if corners.size and not (corners.min() >= 0 and corners.max() < n_vertices):
         raise FaceDiffError(
             f"faces: indices from {corners.min()} to {corners.max()}, but the template has {n_vertices} vertices; "
