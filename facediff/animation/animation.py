@@ -120,8 +120,8 @@ class Animation:
         ):
             if array is not None and (array.shape != expected or not in_range(array)):
                 raise FaceDiffError(
-                    f"{self.name}: its {name} are {array.shape}, or hold {OUT_OF_RANGE}; expected {expected}: give the "
-                    f"mesh that the motion was made for"
+                    f"{self.name}: its {name} of shape {array.shape} should have {expected}, or holds "
+                    f"{OUT_OF_RANGE}; give the mesh that the motion was made for"
                 )
         if self.faces is not None and len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < count:
             raise FaceDiffError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import runpy
-import shlex
 import sys
 from pathlib import Path
 
@@ -12,8 +11,6 @@ import cv2
 import pytest
 
 from facediff.animation import Animation
-from facediff.cli.export import export
-from facediff.cli.parsing import arguments_of
 from facediff.export import FORMATS, write_animations
 
 ROOT = Path(__file__).parents[2]
@@ -35,13 +32,6 @@ def test_the_table_of_formats_is_complete() -> None:
         assert ("in it" in speech) == (FORMATS[suffix].speech == "in the file")
         assert ("next to it" in speech or "in the folder" in speech) == (FORMATS[suffix].speech == "next to it")
         assert ("y up" in row and "any" not in row) == (FORMATS[suffix].units == "m")
-
-
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_commands_are_understood(command: str) -> None:
-    words = shlex.split(command.partition("#")[0])[2:]
-    output = arguments_of(export, "facediff export", words)["output"]
-    assert output.suffix in FORMATS or "$" in command
 
 
 def test_the_picture_is_drawn_from_the_file_alone(

@@ -44,7 +44,7 @@ def test_formats_are_as_promised() -> None:
     [
         ("a.gltf", {}, ["a.gltf", 'no format ".gltf"', '".glb"?', ".usdc"]),
         ("a.GLB", {}, ['no format ".GLB"', '".glb"?']),
-        ("a", {}, ["suffix", "a.glb"]),
+        ("a", {}, ["no format", ".glb"]),
         ("a.glb", {"output_unit": "cm"}, [".glb", "metres"]),
         ("a.glb", {"up": "z"}, [".glb", "y up"]),
         ("a.npz", {"up": "z"}, [".npz", "y up"]),
@@ -82,7 +82,7 @@ def test_export_accepts_the_unit_that_the_format_prescribes(tmp_path: Path, unit
     ("change", "sentence"),
     [
         ({"vertices": "nan"}, "frame 3 holds NaN"),
-        ({"template": "nan"}, "its template holds NaN"),
+        ({"template": "nan"}, "its template of shape"),
         ({"faces": None}, "comes without a mesh"),
         ({"colours": np.zeros((7, 3), np.uint8)}, "colours of shape (7, 3)"),
         ({"speech": np.full(9, np.nan, np.float32)}, "its speech holds NaN"),

@@ -174,7 +174,7 @@ def test_plain_materials_of_a_glb_colour_what_is_no_glb(
         (["take.npz", "--target-mesh", "flat.obj", "-o", "o.npz"], "flat.obj: target mesh: 3 vertices"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.csv"], "weights need shapes; write .npz"),
         (["take.npz", "--target-mesh", "face.obj", "-o", "o.npz", "--correspondence", "take.npz"], "facediff corresp"),
-        (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "hold NaN"),
+        (["nan.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "holds NaN"),
         (["bare.npy", "--target-mesh", "face.obj", "-o", "o.npz", "--frame-rate", "25"], "error: bare: comes without"),
         (
             ["take.npz", *TARGET, "-o", "o.npz", "--landmarks", "l.csv", "--correspondence", "take.npz"],
