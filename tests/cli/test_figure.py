@@ -158,7 +158,7 @@ def test_what_does_not_fit_is_one_sentence(
     before = sorted(corpus.parent.rglob("*"))
     for wrong, message in (
         ("frames --clip A_e66", 'did you mean "A_e06"'),
-        ("lips --clip B_e01", 'ours has no prediction of clip "B_e01"'),
+        ("lips --clip B_e01", 'ours has no clip "B_e01"'),
         ("frames --phonemes z", '"z": not spoken in clip A_e06: known are m, ɑː, f'),
         ("frames --times 0.1", "either --times or --phonemes"),
         ("error --mesh other.ply", "has 4 vertices, the motion 24"),
@@ -187,7 +187,7 @@ def test_missing_pieces_of_a_corpus(corpus: Path, capsys: pytest.CaptureFixture[
     for figure, message in (
         ("lips", "inner_lip_pairs.txt: no such file; give --lip-pairs"),
         ("frames", "give --phoneme-file"),
-        ("heatmap", "no template of A, needed by clip A_e06; there are templates of B"),
+        ("heatmap", "no template of A, needed by clip A_e06; give --templates FILE"),
     ):
         assert main(words(figure, corpus)) == 2
         assert message in capsys.readouterr().err

@@ -60,7 +60,7 @@ def test_a_plan_names_models_and_motion(tmp_path: Path) -> None:
         with pytest.raises(FaceDiffError, match="models.*; expected"):
             read_models(plan)
     plan.write_text("models: {one: {layout: arkit}}\n")
-    with pytest.raises(FaceDiffError, match="models: one"):
+    with pytest.raises(FaceDiffError, match=r"models\.one"):
         read_models(plan)
     plan.write_text("models: {}\n")
     with pytest.raises(FaceDiffError, match="names no model"):
