@@ -72,7 +72,7 @@ class BlinkMetric(LidMetric):
         self,
         pairs: LipPairsLike,
         *,
-        definition: str,
+        definition: str | None = None,
         closed: float = CLOSED,
         reopened: float = REOPENED,
         **options: Unpack[SequenceOptions],
@@ -80,8 +80,8 @@ class BlinkMetric(LidMetric):
         check_range("closed", closed, 0, 1)
         check_range("reopened", reopened, 0, closed)
         definition = (
-            f"{definition}, a blink being a rise of 1 − opening / median opening of the sequence above {closed:g} "
-            f"after it was below {reopened:g}, an opening the mean distance of {{pairs}}"
+            f"{definition or self.words}, a blink being a rise of 1 − opening / median opening of the sequence above "
+            f"{closed:g} after it was below {reopened:g}, an opening the mean distance of {{pairs}}"
         )
         super().__init__(pairs, definition=definition, **options)
         self.closed = closed
@@ -111,17 +111,7 @@ class BlinkRateRatio(BlinkMetric):
     """
 
     divides_by = "nobody blinks in the truth"
-
-    def __init__(
-        self,
-        pairs: LipPairsLike,
-        *,
-        closed: float = CLOSED,
-        reopened: float = REOPENED,
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        definition = "blinks of the prediction over blinks of the truth"
-        super().__init__(pairs, definition=definition, closed=closed, reopened=reopened, **options)
+    words = "blinks of the prediction over blinks of the truth"
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Blinks of either side of one sequence."""
