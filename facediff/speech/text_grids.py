@@ -42,35 +42,33 @@ def read_text_grid(path: Path) -> dict[str, list[Interval]]:
 
     Tiers of points are left out. The format is that of Praat's manual, "TextGrid file formats".
     """
+    part = "its header"
     try:
         content = path.read_bytes()
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {REMEDY}") from error
-    except UnicodeDecodeError as error:
-        raise FaceDiffError(f"{path}: is no text in UTF-8 or UTF-16; save it in Praat as a text file") from error
-    # Both formats hold the same texts and numbers in the same order; the long one names each of them.
-    tokens = iter(_TOKEN.finditer(text))
-    tier = "its header"
-    try:
-        if (_text(tokens), _text(tokens)) != ("ooTextFile", "TextGrid"):
-            raise FaceDiffError(f"{path}: is no TextGrid; expected a text file that Praat or an aligner has written")
+        # Both formats hold the same texts and numbers in the same order; the long one names each of them.
+        tokens = iter(_TOKEN.finditer(text))
+        whole = (_text(tokens), _text(tokens)) == ("ooTextFile", "TextGrid")
         _number(tokens), _number(tokens), next(tokens)
         tiers: dict[str, list[Interval]] = {}
-        for _ in range(int(_number(tokens))):
-            kind, tier = _text(tokens), f"tier {_text(tokens)}"
+        for _ in range(int(_number(tokens)) if whole else 0):
+            kind, part = _text(tokens), f"tier {_text(tokens)}"
             _number(tokens), _number(tokens)
             intervals = [_interval(tokens, kind) for _ in range(int(_number(tokens)))]
             if kind != "IntervalTier":
                 continue
-            edges = [edge for start, end, _ in intervals for edge in (start, end)]
-            backwards = next((i for i in range(1, len(edges)) if edges[i] < edges[i - 1] - 1e-6), None)
-            if backwards is not None or (edges and edges[0] < 0.0):
-                where = edges[backwards or 0]
-                raise FaceDiffError(f"{path}: {tier} goes back in time at {where:g} s; {REMEDY}")
-            tiers.setdefault(tier.removeprefix("tier "), intervals)
-    except (StopIteration, ValueError) as error:
-        raise FaceDiffError(f"{path}: {tier} is cut short or damaged; {REMEDY}") from error
+            edges = [0.0, *(edge for start, end, _ in intervals for edge in (start, end))]
+            whole = all(later >= edge - 1e-6 for edge, later in zip(edges, edges[1:], strict=False))
+            if not whole:
+                break
+            tiers.setdefault(part.removeprefix("tier "), intervals)
+    except (OSError, StopIteration, ValueError, TypeError, AttributeError):  # a text where a number belongs, or none
+        whole = False
+    if not whole:
+        raise FaceDiffError(
+            f"{path}: {part} cannot be read, is cut short or goes back in time; expected a TextGrid in text format, "
+            f"UTF-8 or UTF-16; {REMEDY}"
+        )
     return tiers
 
 
@@ -80,14 +78,8 @@ def _interval(tokens: Iterator[re.Match[str]], kind: str) -> Interval:
 
 
 def _text(tokens: Iterator[re.Match[str]]) -> str:
-    match = next(tokens)
-    if match[1] is None:
-        raise ValueError(match[0])
-    return match[1].replace('""', '"')
+    return str(next(tokens)[1].replace('""', '"'))
 
 
 def _number(tokens: Iterator[re.Match[str]]) -> float:
-    match = next(tokens)
-    if match[3] is None:
-        raise ValueError(match[0])
-    return float(match[3])
+    return float(next(tokens)[3])

@@ -142,20 +142,14 @@ class WindowPlan:
     ahead: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.seconds <= 600:
-            raise FaceDiffError(f"window: {self.seconds:g} s is impossible; choose e.g. 4")
-        for name in ("past", "ahead"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise FaceDiffError(f"{name}: {getattr(self, name):g} s is impossible; choose 0 s or more")
         # A window that sees motion which does not change any more need not share frames that do.
         fits = 0 <= self.overlap < self.seconds if self.past else 0 < self.overlap <= self.seconds / 2
-        if not fits:
-            choose = "0 s or more, less than a window" if self.past else "more than 0 s, at most half of a window"
+        around = (self.before, self.after, self.past, self.ahead)
+        if not (fits and 0 < self.seconds <= 600 and all(0 <= part < math.inf for part in around) and self.above >= 0):
             raise FaceDiffError(
-                f"overlap: {self.overlap:g} s is impossible with windows of {self.seconds:g} s; choose {choose}"
+                f"window: {self.seconds:g} s with an overlap of {self.overlap:g} s and {around} s around it is "
+                f"impossible; choose e.g. 4 s, of which at most half overlaps"
             )
-        if not (0 <= self.before < math.inf and 0 <= self.after < math.inf and self.above >= 0):
-            raise FaceDiffError("window: the speech before and after a window must last 0 s or more, and end")
 
     def in_frames(self, frame_rate: float) -> FramePlan:
         """The same in whole frames."""
