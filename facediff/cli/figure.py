@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from facediff.cli.options import (
     File,
@@ -76,9 +76,11 @@ class FileOptions:
         from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
         from facediff.evaluation.figures.gather import gather
 
-        names = {"patterns": self.pattern or DEFAULT_PATTERNS, "truth_pattern": self.truth_pattern or TRUTH_PATTERN}
-        others = {name: value for name, value in vars(self).items() if "pattern" not in name and name != "method"}
-        return paper, gather(methods, truth, **names, **others)
+        options: dict[str, Any] = {
+            name: value for name, value in vars(self).items() if name not in ("method", "pattern")
+        }
+        options |= {"patterns": self.pattern or DEFAULT_PATTERNS, "truth_pattern": self.truth_pattern or TRUTH_PATTERN}
+        return paper, gather(methods, truth, **options)
 
 
 @dataclass(frozen=True)

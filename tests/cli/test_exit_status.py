@@ -47,7 +47,7 @@ def test_names_that_are_no_text_are_printed(tmp_path: Path, encoding: str) -> No
     command = [sys.executable, "-m", "facediff", "view", name, "-o", str(tmp_path / "a.html")]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, env=environment, check=False)
     assert run.returncode == 2
-    assert run.stderr.startswith(b"facediff: error: a\\udcff\\n\\x1b[31m")
+    assert run.stderr.startswith(b"facediff: error: animations a\\udcff\\n\\x1b[31m")
     assert len(run.stderr.splitlines()) == 1
 
 
