@@ -167,7 +167,7 @@ def test_what_does_not_fit_is_one_sentence(
         ("error --method truth=ours", "no method is called truth"),
         ("error --identity B", "under the condition B"),
         ("lips --lip-pairs 3-900", "--lip-pairs 3-900"),
-        ("lips --span 0.03 0.05", "the middle of no frame"),
+        ("lips --span 0.03 0.05", "holds no frame"),
         ("training --scalar train/los", 'did you mean "train/loss"'),
         ("frames --lips all", "--lips: has no effect without --close-up"),
     ):
