@@ -144,8 +144,11 @@ def find_clips(
 
     ``subjects`` are the known speakers; ``identity`` is ``own``, or the identity whose predictions are drawn.
     """
-    if identity == ALL or TRUTH in methods:
-        raise FaceDiffError("--identity all: a figure shows one condition, and no method is called truth (NAME=FOLDER)")
+    problem = f'a method cannot be called "{TRUTH}"; name it with NAME=FOLDER' if TRUTH in methods else ""
+    if identity == ALL:
+        problem = "--identity all: a figure shows one condition; expected own or an identity's name"
+    if problem:
+        raise FaceDiffError(problem)
     names, _ = list_names(truth, [NamePattern(truth_pattern, subjects)])
     truths = dict(sorted(index_truths(names).items()))
     readers = [NamePattern(pattern, subjects) for pattern in patterns]
