@@ -99,8 +99,12 @@ def fault_of(option: str, name: str) -> str:
 def subclasses(kind: registry.Kind) -> set[str]:
     """Names of the imported classes that extend a base of the registered ones."""
     bases = {base for entry in kind for base in entry.implementation.__mro__ if base.__module__.startswith("facediff.")}
-    found: list[type] = [cls for base in bases for cls in base.__subclasses__()]
-    return {cls.__name__ for cls in found}
+    cls: type
+    names: set[str] = set()
+    for base in bases:
+        for cls in base.__subclasses__():
+            names.add(cls.__name__)
+    return names
 
 
 def import_fault(option: str, path: str) -> str:
