@@ -7,6 +7,7 @@ import inspect
 import math
 import re
 import typing
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, NoReturn, Self, TypedDict, Unpack, get_args
@@ -511,9 +512,9 @@ class SequenceMetric(ExactMetric):
         """The vertices, or pairs of vertices, that the metric reads; None for all vertices."""
         return self.region
 
+    @abstractmethod
     def clip_value(self, clip: Clip) -> Tensor:
         """The metric of one sequence, a float64 scalar; NaN only if it ``leaves_out`` the sequence."""
-        raise NotImplementedError
 
     def clip_weight(self, clip: Clip) -> int:
         """How many frames the value of a sequence is a mean over: its weight when pooling by frames."""

@@ -6,6 +6,7 @@ are prediction and truth in the formulas, both (frames, D).
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Unpack, cast
 
@@ -306,9 +307,9 @@ class DistributionMetric(ChannelMetric):
         """None of its own."""
         return torch.zeros((), dtype=torch.float64, device=clip.truth.device)
 
+    @abstractmethod
     def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
         """Add frames (frames, D) of both sides to the states."""
-        raise NotImplementedError
 
     def add(self, clips: Clips) -> None:
         """Check aligned sequences and add their frames; nothing is added where one is refused."""

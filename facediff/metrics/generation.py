@@ -7,6 +7,7 @@ calibration compare several samples of each sequence with the one recorded truth
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from itertools import combinations
 from typing import Any, ClassVar, Literal, Unpack
@@ -57,9 +58,9 @@ class RatioMetric(Denominator):
         self.add_state("parts", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
         self._latest_parts: list[Tensor] = []
 
+    @abstractmethod
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Numerator and denominator of one sequence, float64 scalars, or those of several ratios."""
-        raise NotImplementedError
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The ratio of one sequence; infinity where its denominator is zero."""
