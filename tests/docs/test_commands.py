@@ -114,6 +114,8 @@ def test_commands_are_understood_by_their_parsers(workplace: Path) -> None:
             if COMMANDS[name].target.partition(":")[2] not in OWN_PARSERS:
                 arguments_of(load(name), f"facediff {name}", rest)
         except (FaceDiffError, SystemExit, KeyError) as error:
+            if "no such f" in str(error):  # a file of the reader's, of which the parser knows the option
+                continue
             offenders.append(f"{page.name}: facediff {shlex.join(words)}: {error}")
     assert offenders == []
 
