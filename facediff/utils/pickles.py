@@ -27,7 +27,8 @@ class PlainType:
     """In place of a ``numpy.dtype``: its name, from which the type is created once that is known to be plain."""
 
     def __init__(self, name: object) -> None:
-        self.name, self.order = name, "="
+        self.name = name
+        self.order: Any = "="
 
     def __setstate__(self, state: Any) -> None:  # noqa: ANN401
         """Version, byte order, then fields that only structured types have."""
