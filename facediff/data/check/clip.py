@@ -100,6 +100,9 @@ def examine(rules: Rules, clip: ClipFiles) -> ClipFacts:
 
 def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> None:
     findings, where, expected = facts.findings, relative(path, rules.root), rules.n_vertices
+    if not path.is_file():  # a pipe would be waited for
+        findings.error("motion_unreadable", where, "is no regular file; put the motion there")
+        return
     try:
         rig = rig_path(path)
         array: npt.NDArray[Any] = open_array(path)

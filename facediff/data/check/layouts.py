@@ -53,7 +53,7 @@ class CorpusFolder:
         if self.packed is not None:
             return self.packed.record.n_vertices
         counts: Counter[int] = Counter()
-        for path in islice(self.motions.values(), PROBED):
+        for path in islice(filter(Path.is_file, self.motions.values()), PROBED):  # a pipe would be waited for
             try:
                 vertices = vertices_of(open_array(rig_path(path) or path).shape)
             except Exception:  # reported when the clips are checked
