@@ -1,9 +1,10 @@
 """Tables that anyone can regenerate: plans of methods, corpora and seeds, their cells, and what the results say."""
 
 from facediff.benchmark.cells import Cell, cells_of, rows_of
+from facediff.benchmark.outline import ReportOutline
 from facediff.benchmark.plan import BenchmarkPlan, find_plan, read_plan
 from facediff.benchmark.results import Result, read_result
-from facediff.benchmark.tables import BenchmarkReport, ReportOutline, report_of
+from facediff.benchmark.tables import BenchmarkReport, report_of
 
 __all__ = [
     "BenchmarkReport",

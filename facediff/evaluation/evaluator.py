@@ -305,7 +305,7 @@ class CorpusInputs:
         }
         rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": given.frame_rate}
         lids = {"pairs": given.eyelid_pairs, "frames_per_second": given.frame_rate}
-        for need, there, arguments in (
+        needs: list[tuple[str, bool, dict[str, Any]]] = [
             ("upper_face", given.upper_face is not None, {"upper": given.upper_face}),
             ("lip_pairs", given.lip_pairs is not None, {"pairs": given.lip_pairs}),
             ("lid_pairs", given.eyelid_pairs is not None, lids),
@@ -315,9 +315,8 @@ class CorpusInputs:
             ("conditions", given.identity == ALL, {}),
             ("channels", given.files is not None, {}),
             *((need, self._has(need), {}) for need in CONVERSATION),
-        ):
-            if there:
-                has[need] = arguments
+        ]
+        has |= {need: arguments for need, there, arguments in needs if there}
         rate = "" if given.frame_rate else " and give --frame-rate"
         in_test = "is known to `facediff test --model.metrics=[…]` only"
         are_known = in_test.replace("is", "are", 1)
