@@ -11,7 +11,7 @@ from facediff.benchmark.tables import BenchmarkReport, Table
 from facediff.errors import printable
 from facediff.reporting.documents import Drawing
 from facediff.reporting.drawing import GREY, line_style, listed, plot_svg, point_style
-from facediff.reporting.scores import ScoreTable
+from facediff.reporting.scores import ScoreMatrix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,7 +108,7 @@ def scatter_plot(table: Table) -> Drawing | None:
     )
 
 
-def means_of(table: ScoreTable) -> dict[str, float]:
+def means_of(table: ScoreMatrix) -> dict[str, float]:
     """The mean over the runs of each sentence."""
     counts = (table.weights > 0).sum(1)
     return dict(zip(table.clips, (table.values.sum(1) / counts).tolist(), strict=True))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facediff.reporting.scores import ScoreTable
+from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Array, Bootstrap, Interval, holm, sign_flip
 
 
@@ -29,7 +29,7 @@ class RowScores:
     """
 
     runs: Array
-    table: ScoreTable | None = None
+    table: ScoreMatrix | None = None
     fixed: bool = False
 
     @property
@@ -53,13 +53,13 @@ class RowScores:
         return None if resampled is None else bootstrap.intervals(resampled[:, None], 1)[0]
 
 
-def mean_resampled(table: ScoreTable, bootstrap: Bootstrap) -> Array | None:
+def mean_resampled(table: ScoreMatrix, bootstrap: Bootstrap) -> Array | None:
     """The mean over the runs of every resample of the sentences."""
     scores = table.resampled(bootstrap)
     return None if scores is None else np.asarray(scores.mean(1))
 
 
-def shares(table: ScoreTable) -> Array:
+def shares(table: ScoreMatrix) -> Array:
     """What each sentence adds to the mean over the runs; their sum is the score over these sentences."""
     return np.asarray((table.values * table.weights / table.weights.sum(0)).mean(1))
 
@@ -114,7 +114,7 @@ def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Differ
     return Difference(float(gaps.sum()), interval, p_sentences, runs, p_runs, both, p, common)
 
 
-def in_both(one: RowScores, other: RowScores) -> tuple[ScoreTable, ScoreTable] | None:
+def in_both(one: RowScores, other: RowScores) -> tuple[ScoreMatrix, ScoreMatrix] | None:
     """The sentences of which both rows have a value in some run; None if there are none."""
     if one.table is None or other.table is None:
         return None

@@ -13,7 +13,7 @@ from facediff.benchmark.plan import COSTS, MEAN_SUFFIX
 from facediff.benchmark.published import Shown, shown_tables
 from facediff.benchmark.results import Result
 from facediff.benchmark.statistics import Difference, RowScores, compared, hears, marked
-from facediff.reporting.scores import ScoreTable
+from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils import ranges
 
@@ -291,7 +291,7 @@ def _scores(
     # A clip that was scored under several identities is one sentence: the mean of them.
     matrix = np.array([[np.mean(some) if some else np.nan for some in values[clip]] for clip in clips])
     weights = np.array([[frames[clip] if pooling == "frames" else 1.0] for clip in clips])
-    return RowScores(scored, ScoreTable.of(clips, matrix, np.broadcast_to(weights, matrix.shape)), fixed)
+    return RowScores(scored, ScoreMatrix.of(clips, matrix, np.broadcast_to(weights, matrix.shape)), fixed)
 
 
 def _cost(runs: Sequence[Result]) -> Cost:

@@ -11,15 +11,32 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from facediff.errors import FaceDiffError
 from facediff.utils.destinations import protect, refuse_equal, refuse_overwriting
 from facediff.utils.files import check_folder_writable, check_writable
 from facediff.utils.option import Option
 
-if TYPE_CHECKING:
-    from facediff.cli.parsing import Parameter
+
+class Parameter(Protocol):
+    """What a check needs to know of a command's parameter, which facediff.cli.parsing reads from a signature."""
+
+    @property
+    def name(self) -> str:
+        """Its name in Python."""
+
+    @property
+    def option(self) -> Option:
+        """Whether it is read or written, and how it is called."""
+
+    @property
+    def flag(self) -> str:
+        """How it is given on the command line."""
+
+    @property
+    def is_path(self) -> bool:
+        """Whether its values are paths, and not texts that may be one."""
 
 
 def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:

@@ -116,13 +116,13 @@ def retarget(
 
 
 def write_transferred(
-    motion: Animation, target_mesh: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str]
+    motion: Animation, target: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str]
 ) -> None:
     """Transfer a motion by the surface, write it, and say how well it fits.
 
     Args:
         motion: the animation.
-        target_mesh: the other face.
+        target: the other face.
         output: file to write.
         options: of the command.
         dressed: whether a copy of the target's file is written, with materials, skins and targets.
@@ -142,11 +142,11 @@ def write_transferred(
         if options.show is not None:  # the picture shows what is wrong
             draw_correspondence(options.show, motion, transferred, fit)
         if not options.accept_poor:
-            refuse_poor(target_mesh, reports[-1])
+            refuse_poor(target, reports[-1])
 
     transferred, fit = retarget(
         motion,
-        target_mesh,
+        target,
         options.correspondence,
         options.landmarks,
         parts=options.part or (),
@@ -157,11 +157,11 @@ def write_transferred(
     if options.own_shapes:
         notes += driven
     elif dressed and not options.add_to_mesh:
-        notes.append(f"in a copy of {target_mesh.name} with its materials, skins and targets; --bare-face omits them")
-        notes += unused_shapes(target_mesh)
-    notes += surface_notes(target_mesh, output, transferred)
+        notes.append(f"in a copy of {target.name} with its materials, skins and targets; --bare-face omits them")
+        notes += unused_shapes(target)
+    notes += surface_notes(target, output, transferred)
     copied = dressed or options.own_shapes
-    into = target_mesh if copied or hands_on_textures(target_mesh, output) else None
+    into = target if copied or hands_on_textures(target, output) else None
     written = write_animations(
         output, [transferred], ExportOptions(), into=into, own_shapes=options.own_shapes, z_up=has_z_up(fit)
     )
@@ -194,9 +194,7 @@ def check_pick(picked: Path, landmarks: Path | None, correspondence: Path | None
     check_writable(picked)
 
 
-def pick_on_page(
-    animation: Animation, target_mesh: Path, options: TransferOptions, picked: Path, page: PageServer
-) -> None:
+def pick_on_page(animation: Animation, target: Path, options: TransferOptions, picked: Path, page: PageServer) -> None:
     """Serve the page on which landmarks are picked, until they are saved."""
     from facediff.export.viewer.picking import pick_landmarks
     from facediff.mesh import read_mesh
@@ -204,12 +202,12 @@ def pick_on_page(
 
     saved = pick_landmarks(
         animation,
-        read_mesh(target_mesh),
+        read_mesh(target),
         picked,
-        names=(animation.name, target_mesh.name),
+        names=(animation.name, target.name),
         start=options.landmarks,
-        shown=named_triangles(target_mesh, options.part) if options.part else None,
-        parts=mesh_parts(target_mesh),
+        shown=named_triangles(target, options.part) if options.part else None,
+        parts=mesh_parts(target),
         host=page.host,
         port=page.port or 0,
         ready=page.announce("shows both faces: pick the same places and save; Ctrl-C ends the command", "pick"),

@@ -14,7 +14,7 @@ from facediff.errors import FaceDiffError, printable
 from facediff.evaluation.files import Missing, Pair, errors_of
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
-from facediff.reporting.scores import ScoreTable
+from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils.provenance import Provenance, read_provenance
 from facediff.utils.tables import format_table
@@ -204,7 +204,7 @@ class MethodTable:
         by_frames = [column.pooling == "frames" for column in columns]
         weights = np.where(by_frames, np.array([scores.weights for _, scores in self.rows]), 1.0)
         values = np.array([scores.values for _, scores in self.rows])
-        self.table = ScoreTable.of([pair.clip for pair, _ in self.rows], values, weights)
+        self.table = ScoreMatrix.of([pair.clip for pair, _ in self.rows], values, weights)
 
     def _pooled(self, column: Column) -> bool:
         """Whether a score is a mean of the clips'; others are made of the sums of all clips."""

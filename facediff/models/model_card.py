@@ -40,7 +40,7 @@ LONGEST_NAME = 96
 
 
 @dataclass(frozen=True)
-class Facts:
+class CardFacts:
     """What a card says in addition to what the model knows.
 
     Attributes:
@@ -91,7 +91,7 @@ def check_languages(languages: Iterable[str]) -> None:
             raise FaceDiffError(f"--languages {quoted(code)}: expected codes such as en or zh-CN, separated by commas")
 
 
-def card(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) -> str:
+def card(model: CheckpointContent, licences: Sequence[Licence], facts: CardFacts) -> str:
     """The text of a model card: metadata in YAML, then Markdown."""
     import yaml
 
@@ -234,7 +234,7 @@ UNTESTED = (
 )
 
 
-def metadata(model: CheckpointContent, licences: Sequence[Licence], facts: Facts) -> dict[str, Any]:
+def metadata(model: CheckpointContent, licences: Sequence[Licence], facts: CardFacts) -> dict[str, Any]:
     """The metadata of the card, by the hub's names; ``commercial_use`` and ``corpus`` are ours."""
     weights = next((label for label in licences if label.of == "weights"), Licence("weights"))
     identifier = weights.name.lower()
@@ -262,7 +262,7 @@ def metadata(model: CheckpointContent, licences: Sequence[Licence], facts: Facts
     return fields
 
 
-def model_index(model: CheckpointContent, facts: Facts) -> list[dict[str, Any]]:
+def model_index(model: CheckpointContent, facts: CardFacts) -> list[dict[str, Any]]:
     """The model's own scores in the form in which the hub shows them."""
     results = []
     for row in facts.scores:
@@ -298,7 +298,7 @@ def components(model: CheckpointContent) -> dict[str, str]:
     }
 
 
-def score_section(model: CheckpointContent, facts: Facts) -> str:
+def score_section(model: CheckpointContent, facts: CardFacts) -> str:
     """The scores with everything that decides them."""
     if not facts.scores:
         return UNTESTED
@@ -334,7 +334,7 @@ def score_section(model: CheckpointContent, facts: Facts) -> str:
 # Helpers.
 
 
-def languages_of(model: CheckpointContent, facts: Facts) -> Sequence[str]:
+def languages_of(model: CheckpointContent, facts: CardFacts) -> Sequence[str]:
     """The languages that were stated, else those of the corpus."""
     if facts.languages is not None:
         return facts.languages

@@ -28,7 +28,7 @@ from torch import Tensor
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
-from facediff.models.model_card import Facts, card, check_languages, read_scores
+from facediff.models.model_card import CardFacts, card, check_languages, read_scores
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
 from facediff.utils.hints import is_plain_text
@@ -89,7 +89,7 @@ def publish(
         with atomic_folder(folder) as partial:
             write_model(model, partial, half=half)
             sizes = {path.name: path.stat().st_size for path in partial.iterdir()}
-            facts = Facts(name or folder.resolve().name, rows, languages, half, sizes)
+            facts = CardFacts(name or folder.resolve().name, rows, languages, half, sizes)
             (partial / CARD).write_text(card(model, model.licences, facts), encoding="utf-8")
     finally:
         model.licences = before

@@ -11,7 +11,7 @@ from facediff.reporting.statistics import Array, Bootstrap, Interval, pooled
 
 
 @dataclass(frozen=True)
-class ScoreTable:
+class ScoreMatrix:
     """Scores of clips, and how much each counts.
 
     Attributes:
@@ -25,21 +25,21 @@ class ScoreTable:
     weights: Array
 
     @classmethod
-    def of(cls, clips: Sequence[str], values: Array, weights: Array) -> ScoreTable:
+    def of(cls, clips: Sequence[str], values: Array, weights: Array) -> ScoreMatrix:
         """A table of values that are NaN where there is none."""
         lacking = np.isnan(values)
         return cls(tuple(clips), np.where(lacking, 0.0, values), np.where(lacking, 0.0, weights))
 
-    def at(self, clips: Sequence[str]) -> ScoreTable:
+    def at(self, clips: Sequence[str]) -> ScoreMatrix:
         """The rows of some clips."""
         rows = [self.clips.index(clip) for clip in clips]
-        return ScoreTable(tuple(clips), self.values[rows], self.weights[rows])
+        return ScoreMatrix(tuple(clips), self.values[rows], self.weights[rows])
 
     def valued(self) -> list[str]:
         """Clips that have a value in some column."""
         return [self.clips[row] for row in np.flatnonzero((self.weights > 0).any(1))]
 
-    def common(self, other: ScoreTable) -> tuple[ScoreTable, ScoreTable]:
+    def common(self, other: ScoreMatrix) -> tuple[ScoreMatrix, ScoreMatrix]:
         """Both tables with the clips that both have; one that has no value in a column of one counts in neither."""
         clips = [clip for clip in self.clips if clip in set(other.clips)]
         one, two = self.at(clips), other.at(clips)

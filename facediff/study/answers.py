@@ -95,7 +95,7 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class Finish:
+class RatingsEnd:
     """What the page sends when a rater ends."""
 
     rater: Token

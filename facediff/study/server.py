@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.study.answers import (
     MOST_RATERS,
     Answer,
-    Finish,
+    RatingsEnd,
     Registration,
     check_answer,
     check_comments,
@@ -100,7 +100,7 @@ def make_app(
         return {"new": store.save(content["rater"], given)}
 
     def finish(content: dict[str, Any]) -> dict[str, Any]:
-        end = read_record(Finish, content, "request", strict=False)
+        end = read_record(RatingsEnd, content, "request", strict=False)
         number_of(end.rater)
         if not store.finish(end.rater, check_comments(end.comments, study, "request")):
             raise RefusedError(409, "answers are missing; send them first")

@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 from facediff.benchmark.statistics import RowScores, both_chances, compared, difference, marked, welch
-from facediff.reporting.scores import ScoreTable
+from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, holm, sign_flip
 
 BOOTSTRAP = Bootstrap(2000, 0.95, 0)
@@ -21,7 +21,7 @@ def scores(
 ) -> RowScores:
     """Scores of a row from values (runs, sentences)."""
     weights = np.ones(values.shape[1]) if weights is None else weights
-    table = ScoreTable.of(
+    table = ScoreMatrix.of(
         clips or [*map(str, range(len(weights)))], values.T, np.repeat(weights[:, None], len(values), 1)
     )
     return RowScores(table.pool(), table, fixed)
