@@ -96,7 +96,8 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
 
 def _colours(shares: Array) -> npt.NDArray[np.uint8]:
     """Colours (V, 3) that a text says, from 0 to 1 or to 255."""
-    shares = np.nan_to_num(shares)
+    if not np.isfinite(shares).all():
+        raise ValueError("colours are not finite")
     if shares.max(initial=0) >= 2:  # some tools write bytes; a little above 1 is a rounding
         shares = shares / 255
     return np.rint(shares.clip(0, 1) * 255).astype(np.uint8)

@@ -6,6 +6,8 @@ import warnings
 from pathlib import Path
 from typing import Any, cast
 
+import torch
+
 from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
 from facediff.models.checkpoint import misfit, model_of, naming, read_checkpoint
@@ -50,4 +52,20 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
         if difference := misfit(weights, built.state_dict()):
             raise FaceDiffError(difference)
         built.load_state_dict(weights)
-    return cast(AnimationModel, built.eval())  # no other model has what it extends
+        model = cast(AnimationModel, built.eval())  # no other model has what it extends
+        check_styles(model)
+    return model
+
+
+def check_styles(model: AnimationModel) -> None:
+    """Refuse styles of speakers that are not as long as those of the model, of which one number would fill all."""
+    lengths = {len(style.vector) for style in model.person_styles.values()}
+    if not lengths:
+        return
+    still = torch.zeros(1, 1, model.n_vertices, model.dims)
+    with torch.inference_mode():
+        width = model.encode_style(still, torch.ones(1, 1, dtype=torch.bool)).shape[-1]
+    if lengths != {width}:
+        raise FaceDiffError(
+            f"its styles of speakers have {min(lengths)} numbers, those of its model {width}; the file is damaged"
+        )

@@ -26,7 +26,8 @@ from facediff.errors import FaceDiffError, OptionError, needs_extra
 from facediff.speech.pcm import samples_of
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
-from facediff.utils.limits import brief
+from facediff.utils.hints import check_number
+from facediff.utils.limits import SAMPLE_RATES, brief
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -322,6 +323,8 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         else:
             found = speech_of(speech["path"], None, max_seconds)
         return replace(found, name=name)
+    if rate is not None and (isinstance(speech, str | Path) or hasattr(speech, "read")):
+        raise FaceDiffError("rate: a recording has its own; omit it")
     if isinstance(speech, str | Path):
         return read_recording(Path(speech), max_seconds)
     if hasattr(speech, "read"):
@@ -330,6 +333,8 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         with open_sound(file, path) as sound:
             return SpeechRecording.of(*_decoded(sound, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
+        if rate is not None or len(speech) != 2:
+            raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
         first, second = cast("tuple[Any, Any]", speech)
         rate_first = isinstance(first, numbers.Real)  # NumPy's as well
         speech, rate = (second, first) if rate_first else (first, second)
@@ -337,6 +342,7 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         if not hasattr(speech, "detach"):  # a tensor has the models' rate, an array may have any
             raise FaceDiffError("rate: is missing; give the array's sample rate, as in animate(samples, rate=48000)")
         rate = SAMPLE_RATE
+    rate = check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz")
     waveform = mono_waveform(cast("Waveform", speech), "speech")
     _check_length("speech", len(waveform) / rate, max_seconds)
     return SpeechRecording.of(waveform, rate, "speech", "speech")
@@ -368,6 +374,8 @@ def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
 
 def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     """A piece (n,) of a stream, which may be empty."""
+    if isinstance(chunk, bytes) and len(chunk) % 2:
+        raise FaceDiffError("chunks: one has an odd number of bytes; expected 16-bit samples")
     samples = samples_of(chunk) if isinstance(chunk, bytes) else np.asarray(chunk)
     if samples.ndim != 1:
         raise FaceDiffError(f"chunks: one has the shape {np.shape(chunk)}; expected mono samples (n,)")

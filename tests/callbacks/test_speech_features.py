@@ -123,7 +123,7 @@ def test_speech_feature_cache_refuses_an_encoder_without_a_frozen_part(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
     trainer = make_trainer(callbacks=[SpeechFeatureCache(str(tmp_path))])
-    with pytest.raises(FaceDiffError, match="the audio encoder mel has no frozen part"):
+    with pytest.raises(FaceDiffError, match="the audio encoder MelEncoder has no frozen part"):
         trainer.fit(make_model(), datamodule=tiny)
 
 

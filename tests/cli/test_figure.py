@@ -164,7 +164,7 @@ def test_what_does_not_fit_is_one_sentence(
         ("error --mesh other.ply", "has 4 vertices, the motion 24"),
         ("error --topology biwy", 'did you mean "biwi"'),
         ("error --method ours=ours", 'already one called "ours"'),
-        ("error --method truth=ours", "no method is called truth"),
+        ("error --method truth=ours", 'a method cannot be called "truth"'),
         ("error --identity B", "under the condition B"),
         ("lips --lip-pairs 3-900", "--lip-pairs 3-900"),
         ("lips --span 0.03 0.05", "holds no frame"),

@@ -172,7 +172,7 @@ def test_stream_is_the_file_however_it_is_cut(model: facediff.Animator, speech: 
         np.testing.assert_array_equal(np.concatenate(parts), whole)
     assert len(parts) > 1
     heads = []
-    with model.open(model._options(None, **options)) as pipeline:
+    with model.backend.open(model._options(None, **options)) as pipeline:
         stream = pipeline.stream()
         for piece in np.array_split(speech, 5):
             stream.feed(piece)

@@ -12,9 +12,9 @@ from facediff.editing.closures import close_lips
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import closed_times, read_phonemes
-from facediff.synthetic.sentences import SENTENCES
+from facediff.synthetic.sentences import TEST
 
-SENTENCE = SENTENCES[27]
+SENTENCE = TEST[0]
 
 
 def test_times_of_a_transcript_are_those_of_the_corpus(puppet_corpus: Path) -> None:

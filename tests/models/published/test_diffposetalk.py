@@ -258,5 +258,5 @@ def test_statistics_of_a_checkpoint_that_are_not_finite_are_refused(tmp_path: Pa
     content = torch.load(tmp_path / "model.ckpt", weights_only=True)
     content["state_dict"]["motion_mean"][3] = torch.nan
     torch.save(content, tmp_path / "model.ckpt")
-    with pytest.raises(FaceDiffError, match="motion_mean hold NaN"):
+    with pytest.raises(FaceDiffError, match="motion_mean' hold NaN"):
         load_model(tmp_path / "model.ckpt")
