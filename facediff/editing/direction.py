@@ -422,6 +422,8 @@ def _read_key(row: object, frame_rate: float | None) -> Key:
         limits = channel_of(channel).range
         if limits is not None and isinstance(value, str):  # a cell of a table
             value = _read(limits, "value", value)
+        if limits is None and slope is not None:
+            raise FaceDiffError(f"slope {shown(slope)}: {channel} holds texts, which have no slope; omit it")
     if isinstance(slope, str):
         slope = _read(SLOPES, "slope", slope)
     time = _time(row["time"], frame_rate) if "time" in row else _seconds("frame", row["frame"], frame_rate)

@@ -217,9 +217,9 @@ def _check(description: Description) -> None:
     if not (1 <= description.frame_rate <= 1000 and 0 < description.epsilon < 1 and description.faces):
         raise ValueError("frame_rate, epsilon or faces is out of range")
     for steps, table in (("steps", "table"), ("quick_steps", "quick_table")):
-        rows = np.asarray(getattr(description, table), np.float64)
-        expected = [(len(getattr(description, steps)), width) for width in (5, 6)]
-        if len(rows) != expected[0][0] or (len(rows) and rows.shape not in expected) or not (np.abs(rows) < 1e9).all():
+        rows = [np.asarray(row, np.float64) for row in getattr(description, table)]
+        fits = all(row.shape in ((5,), (6,)) and (np.abs(row) < 1e9).all() for row in rows)
+        if len(rows) != len(getattr(description, steps)) or not fits:
             raise ValueError(f"{table} has not five or six numbers below 10^9 for each step")
     if description.generation == "sampled" and not description.steps:
         raise ValueError("steps is empty")

@@ -80,7 +80,7 @@ def unpack(function: griffe.Function) -> None:
         options = function.package[path.removeprefix("facediff.")]
         del function.parameters[packed.name]
         if function.docstring:  # what it says of the parameter as a whole describes none that is shown
-            line = re.compile(rf"^ +{packed.name}: .*\n(?: {{8,}}.*\n)*", re.MULTILINE)
+            line = re.compile(rf"^ +{packed.name}: .*(?:\n|\Z)(?: {{8,}}.*(?:\n|\Z))*", re.MULTILINE)
             function.docstring.value = line.sub("", function.docstring.value)
         for option in options.all_members.values():
             if option.is_attribute and option.name not in function.parameters:

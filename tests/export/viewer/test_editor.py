@@ -20,11 +20,11 @@ from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, c
 from facediff.errors import FaceDiffError
 from facediff.export.format import linear_colours
 from facediff.speech.phonemes import TimedPhoneme, phonemes_text
+from facediff.synthetic.known_faces import built_in_shapes
 from tests.fakes.chromium import Page
 from tests.fakes.clicks import FRAMES, RATE, SAMPLE_RATE, clicks
 from tests.fakes.contrasts import CONTRASTS
 from tests.fakes.glb_reader import Reader
-from tests.fakes.small_face import CONTROLS, F1, build_face, build_rig
 from tests.fakes.waiting import wait_until
 
 Show = Callable[..., Page]
@@ -349,16 +349,15 @@ def test_lanes_are_magnified_and_several_keys_are_moved_copied_and_pasted(show: 
 
 def test_shapes_brows_and_lids_are_previewed_and_acting_becomes_keys(show: Show, tmp_path: Path) -> None:
     """Within 0.1 mm of what the command makes of the same keys, from the take that was made with other ones."""
-    rig, frames = build_rig(F1), 60
-    weights = np.zeros((frames, len(CONTROLS)))
-    weights[:, 0] = 0.5 + 0.5 * np.sin(np.arange(frames) / 4)
+    (neutral, faces, shapes), frames = built_in_shapes("F1"), 60
+    opening = (0.25 + 0.25 * np.sin(np.arange(frames) / 4))[:, None, None] * (shapes["jawOpen"] - neutral)
     loud = np.sin(np.arange(frames * 640) / 12) * (np.sin(np.arange(frames * 640) / 2500) > 0)
     bare = Animation(
         "puppet",
-        rig.pose(weights).astype(np.float32),
-        rig.neutral.astype(np.float32),
+        (neutral + opening).astype(np.float32),
+        neutral.astype(np.float32),
         RATE,
-        faces=build_face().faces.astype(np.int32),
+        faces=faces.astype(np.int32),
         speech=loud.astype(np.float32),
         metadata={"options": json.dumps(["--blinks", "40", "--acting", "prosody", "--controls-seed", "3"])},
     )
@@ -400,7 +399,8 @@ def test_shapes_brows_and_lids_are_previewed_and_acting_becomes_keys(show: Show,
     assert {"brows", "lids", "head.pitch", "head.yaw", "head.roll"} <= set(turned.channels)
     edited = bare.control(direction=turned)
     assert furthest(edited, numbers) < 0.1
-    assert np.linalg.norm(edited.vertices - changed.vertices, axis=2).max() < 0.0003
+    # Keys are thinned out by amounts, which are more millimetres on the built-in head than on the mask of before.
+    assert np.linalg.norm(edited.vertices - changed.vertices, axis=2).max() < 0.00035
     assert len(turned.channels["lids"]) < frames / 2
     assert turned.instead_of == ("acting", "blinks")
     press(page, "z", 2)
